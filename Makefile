@@ -1,0 +1,49 @@
+# Daily commands. `make` builds .venv at the repository's root; everything else uses it.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.DEFAULT_GOAL := venv
+.PHONY: venv demo test tests style format types imports fuzz bench ros clean
+
+$(STAMP): pyproject.toml constraints.txt scripts/bootstrap
+	scripts/bootstrap $(PYTHON) $(VENV)
+	touch $(STAMP)
+
+venv: $(STAMP)  ## build .venv with everything that the commands below need
+
+demo: $(STAMP)  ## the paper's set-up (Fig. 7) on this machine: make demo [SECONDS=30] [JOYSTICK=/dev/input/js0]
+	$(BIN)/python examples/turtlebot/demo.py $(if $(SECONDS),--seconds $(SECONDS)) $(if $(JOYSTICK),--joystick $(JOYSTICK))
+
+test: $(STAMP) ros style types imports tests  ## everything, with Debian's ROS 1 where it can be installed
+
+ros:  ## install Debian's ROS 1 for the interop tests (only where apt and root are there; else says so)
+	scripts/install-ros
+
+tests: $(STAMP)  ## pytest
+	$(BIN)/python -m pytest $(ARGS)
+
+style: $(STAMP)  ## ruff: lint and format
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+format: $(STAMP)  ## rewrite the files as `make style` wants them
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+types: $(STAMP)  ## mypy, strict
+	$(BIN)/mypy
+
+imports: $(STAMP)  ## the rooms import one way only; pure rooms stay pure
+	$(BIN)/lint-imports
+
+fuzz: $(STAMP)  ## every fuzz target for longer: make fuzz [SECONDS=60]
+	$(BIN)/python -m tests.fuzz --seconds $(or $(SECONDS),60)
+
+bench: $(STAMP) ros  ## the measurements, as ratios in one run; results in bench/results
+	$(BIN)/python -m bench $(ARGS)
+
+clean:  ## remove what the commands above made
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

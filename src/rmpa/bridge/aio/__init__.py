@@ -1,0 +1,1 @@
+"""The bridge, driven by asyncio."""

@@ -1,0 +1,1 @@
+"""The program `rmpa`: one file a command."""

@@ -1,0 +1,1 @@
+"""The words every room shares: identities, names, errors, limits, clocks, figures and settings."""

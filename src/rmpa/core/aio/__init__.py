@@ -1,0 +1,1 @@
+"""asyncio, sockets and the system clock for the rooms above."""

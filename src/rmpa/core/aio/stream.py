@@ -1,0 +1,208 @@
+"""A connected TCP socket on the data path: one growing read buffer, one ``sendmsg`` a write, a bounded outbox.
+
+asyncio's own transports join or copy what they cannot send at once and have no bound with a policy; this one
+keeps to ``core.outbox`` and costs one system call a message each way.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import socket
+from collections.abc import Callable
+from typing import Final
+
+from rmpa.core import limits
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.outbox import URGENT, Outbox
+
+_log = logging.getLogger(__name__)
+
+_FIRST_BUFFER: Final = 64 * limits.KIB
+_KEPT_BUFFER: Final = 4 * limits.MIB
+_IOV: Final = 64
+
+Buffer = bytes | bytearray | memoryview
+OnBytes = Callable[[memoryview], tuple[int, int]]
+OnClose = Callable[[Exception | None], None]
+
+
+class Stream:
+    """Reads and writes one socket by the loop's readiness callbacks.
+
+    Args:
+        sock: Connected, non-blocking; owned by the stream from here on.
+        on_bytes: Called with all bytes not yet consumed; returns ``(consumed, wanted)``: how many it took, and
+            how many there must be in all before it can take more (0 if it cannot say). The view is only valid
+            during the call. A ``RemoteProtocolError`` raised here closes the stream with it.
+        on_close: Called once, from the loop, when the socket is gone: with ``None`` after an orderly end, with
+            the error otherwise. Not called after ``close()``.
+        outbox: The bounds for what waits.
+    """
+
+    def __init__(self, sock: socket.socket, *, on_bytes: OnBytes, on_close: OnClose, outbox: Outbox) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._sock = sock
+        self._on_bytes = on_bytes
+        self._on_close = on_close
+        self._outbox = outbox
+        self._buffer = bytearray(_FIRST_BUFFER)
+        self._view = memoryview(self._buffer)
+        self._filled = 0
+        self._wanted = 0
+        self._writing = False
+        self._closed = False
+        self._drained: asyncio.Future[None] | None = None
+        self.bytes_in = 0
+        self.bytes_out = 0
+        self._fd = sock.fileno()
+        self._loop.add_reader(self._fd, self._readable)
+
+    @property
+    def closed(self) -> bool:
+        """Whether the socket is gone."""
+        return self._closed
+
+    @property
+    def pending_bytes(self) -> int:
+        """Bytes that wait for the socket."""
+        return self._outbox.pending_bytes
+
+    @property
+    def outbox(self) -> Outbox:
+        """What waits, and what was dropped."""
+        return self._outbox
+
+    def feed(self, data: bytes) -> None:
+        """Take bytes that somebody else read from the socket before the stream had it."""
+        self._reserve(self._filled + len(data))
+        self._view[self._filled : self._filled + len(data)] = data
+        self._filled += len(data)
+        self._deliver()
+
+    def send(self, parts: list[Buffer], key: int) -> int:
+        """Send one message made of ``parts``, or queue what the socket does not take.
+
+        Args:
+            parts: In order; not kept after the call.
+            key: Which flow it belongs to, for the overflow policy; ``URGENT`` is never dropped.
+
+        Returns:
+            How many older messages of the key were dropped to make room.
+        """
+        if self._closed:
+            return 0
+        if self._writing:
+            joined = b"".join(parts)
+            if key == URGENT:
+                self._outbox.push_urgent(joined)
+                return 0
+            return self._outbox.push(joined, key)
+        try:
+            sent = self._sock.sendmsg(parts) if len(parts) > 1 else self._sock.send(parts[0])
+        except (BlockingIOError, InterruptedError):
+            sent = 0
+        except OSError as error:
+            self._lost(error)
+            return 0
+        self.bytes_out += sent
+        if sent == sum(map(len, parts)):
+            return 0
+        rest = b"".join(parts)[sent:]
+        self._writing = True
+        self._loop.add_writer(self._fd, self._writable)
+        if sent:
+            self._outbox.push_rest(rest, key)
+        elif key == URGENT:
+            self._outbox.push_urgent(rest)
+        else:
+            return self._outbox.push(rest, key)
+        return 0
+
+    def close(self) -> None:
+        """Close at once; what still waits is lost. ``on_close`` is not called."""
+        if self._closed:
+            return
+        self._closed = True
+        self._loop.remove_reader(self._fd)
+        if self._writing:
+            self._loop.remove_writer(self._fd)
+        self._sock.close()
+        self._view = memoryview(b"")
+        self._buffer = bytearray()
+        if self._drained is not None and not self._drained.done():
+            self._drained.set_result(None)
+
+    async def drained(self, timeout: float = limits.DRAIN_TIMEOUT) -> None:
+        """Wait until all that was sent has left, the stream is closed, or ``timeout`` seconds are over."""
+        if self._closed or not self._writing:
+            return
+        self._drained = self._loop.create_future()
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._drained, timeout)
+
+    def _lost(self, error: Exception | None) -> None:
+        if not self._closed:
+            self.close()
+            self._on_close(error)
+
+    def _reserve(self, size: int) -> None:
+        if size > len(self._buffer):
+            buffer = bytearray(size)
+            buffer[: self._filled] = self._view[: self._filled]
+            self._buffer = buffer
+            self._view = memoryview(buffer)
+
+    def _readable(self) -> None:
+        try:
+            count = self._sock.recv_into(self._view[self._filled :])
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError as error:
+            self._lost(error)
+            return
+        if count == 0:
+            self._lost(None)
+            return
+        self.bytes_in += count
+        self._filled += count
+        if self._filled >= self._wanted or self._filled == len(self._buffer):
+            self._deliver()
+
+    def _deliver(self) -> None:
+        try:
+            consumed, wanted = self._on_bytes(self._view[: self._filled])
+        except RemoteProtocolError as error:
+            self._lost(error)
+            return
+        if self._closed:
+            return
+        rest = self._filled - consumed
+        if consumed and rest:
+            # Forwards within one buffer: bytearray slicing copies first, so an overlap is safe.
+            self._buffer[:rest] = self._buffer[consumed : self._filled]
+        self._filled = rest
+        self._wanted = wanted
+        if rest == len(self._buffer) or wanted > len(self._buffer):
+            # What a peer only claims is not allocated: the buffer grows with what has really come.
+            self._reserve(min(max(wanted, 2 * rest), max(4 * rest, _FIRST_BUFFER)))
+        elif rest == 0 and wanted <= _FIRST_BUFFER and len(self._buffer) > _KEPT_BUFFER:
+            self._buffer = bytearray(_FIRST_BUFFER)
+            self._view = memoryview(self._buffer)
+
+    def _writable(self) -> None:
+        try:
+            sent = self._sock.sendmsg(self._outbox.head(_IOV))
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError as error:
+            self._lost(error)
+            return
+        self.bytes_out += sent
+        self._outbox.consumed(sent)
+        if not self._outbox:
+            self._writing = False
+            self._loop.remove_writer(self._fd)
+            if self._drained is not None and not self._drained.done():
+                self._drained.set_result(None)

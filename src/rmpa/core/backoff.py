@@ -1,0 +1,34 @@
+"""Capped, jittered exponential back-off (retry for ever, never in step with the others)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+class Backoff:
+    """Delays that double from ``first`` to ``cap`` seconds, each spread over 50 % to 100 % of its value.
+
+    Args:
+        first: The first delay.
+        cap: The longest delay before the spread.
+        rng: Uniform numbers in [0, 1); seeded by simulations.
+    """
+
+    def __init__(self, first: float, cap: float, rng: Callable[[], float]) -> None:
+        self._first = first
+        self._cap = cap
+        self._rng = rng
+        self._next = first
+
+    def delay(self) -> float:
+        """The next delay in seconds."""
+        base = self._next
+        self._next = min(self._cap, base * 2)
+        return base * (0.5 + 0.5 * self._rng())
+
+    def reset(self) -> None:
+        """Start again at ``first``: the last attempt was good."""
+        self._next = self._first

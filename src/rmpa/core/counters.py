@@ -1,0 +1,67 @@
+"""Counting what is refused or dropped, and logging it without flooding the log."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter, OrderedDict
+from typing import Final
+
+from rmpa.core import limits
+
+
+class Counters:
+    """Named counts of one room, shown in snapshots: ``beacon.malformed``, ``link.refused.version`` …"""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+
+    def add(self, name: str, amount: int = 1) -> None:
+        """Add to a count; a new name starts at 0."""
+        self._counts[name] += amount
+
+    def __getitem__(self, name: str) -> int:
+        return self._counts[name]
+
+    def as_dict(self) -> dict[str, int]:
+        """All counts, by name in order."""
+        return dict(sorted(self._counts.items()))
+
+
+class RefusalLog:
+    """Counts each refusal and logs each kind at most once in ``limits.LOG_INTERVAL``.
+
+    Args:
+        logger: Where the lines go, at WARNING.
+        counters: Where every refusal is counted, logged or not.
+    """
+
+    _SUPPRESSED: Final = " (%d more like this since the last line)"
+
+    def __init__(self, logger: logging.Logger, counters: Counters) -> None:
+        self._logger = logger
+        self._counters = counters
+        self._last: OrderedDict[tuple[str, str], tuple[float, int]] = OrderedDict()
+
+    def refuse(self, now: float, name: str, who: str, text: str) -> None:
+        """Count ``name`` and perhaps log ``text``.
+
+        Args:
+            now: Monotonic seconds.
+            name: The count's name; with ``who`` it makes the kind.
+            who: The address it came from, without the port (a port scanner has many).
+            text: What happened and what to do, ready to read.
+        """
+        self._counters.add(name)
+        kind = (name, who)
+        last, suppressed = self._last.get(kind, (float("-inf"), 0))
+        if now - last < limits.LOG_INTERVAL:
+            self._last[kind] = (last, suppressed + 1)
+            return
+        self._last[kind] = (now, 0)
+        self._last.move_to_end(kind)
+        if len(self._last) > limits.LOG_KINDS_MAX:
+            self._last.popitem(last=False)
+        if suppressed:
+            self._logger.warning("! %s" + self._SUPPRESSED, text, suppressed)
+        else:
+            self._logger.warning("! %s", text)

@@ -1,0 +1,117 @@
+"""The one error tree.
+
+::
+
+    RmpaError
+    ├── ConfigError            a flag, variable or file says something that cannot be
+    ├── StartError             this machine does not allow what was asked (port taken, name taken)
+    ├── LocalProtocolError     our own code broke a protocol: a bug here
+    ├── RemoteProtocolError    the other side broke a protocol: close that connection, count it
+    │   └── LimitExceeded      … by claiming more than ``core.limits`` allows
+    ├── PeerRefused            a peer said no, with its reason
+    └── UnreachableError       nobody answers where somebody should
+
+Errors hold fields and build their text in ``__str__``. A text says what happened, where, and what to do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class RmpaError(Exception):
+    """Root of every error that this package raises on purpose."""
+
+
+@dataclass
+class ConfigError(RmpaError):
+    """A setting cannot be used.
+
+    Args:
+        source: Where it was written: a flag (``--port``), a variable (``RMPA_PORT``) or a key (``mesh.port``).
+        problem: What is wrong with it.
+        remedy: What to write instead; may be empty.
+        path: The file, for a key in a file.
+        line: The line in that file, counted from 1, if known.
+    """
+
+    source: str
+    problem: str
+    remedy: str = ""
+    path: Path | None = None
+    line: int | None = None
+
+    def __str__(self) -> str:
+        """Say ``file:line: key: problem; remedy``."""
+        where = ""
+        if self.path is not None:
+            where = f"{self.path}:{self.line}: " if self.line is not None else f"{self.path}: "
+        remedy = f"; {self.remedy}" if self.remedy else ""
+        return f"{where}{self.source}: {self.problem}{remedy}"
+
+
+@dataclass
+class StartError(RmpaError):
+    """The agent, or a part of it, cannot start on this machine as asked."""
+
+    what: str
+    problem: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        """Say ``what: problem; remedy``."""
+        remedy = f"; {self.remedy}" if self.remedy else ""
+        return f"{self.what}: {self.problem}{remedy}"
+
+
+class LocalProtocolError(RmpaError):
+    """Our side used a protocol machine in a way that its state does not allow."""
+
+
+class RemoteProtocolError(RmpaError):
+    """The other side sent bytes that its protocol does not allow."""
+
+
+@dataclass
+class LimitExceeded(RemoteProtocolError):  # noqa: N818 - the name says what happened, as in websockets
+    """The other side claimed a size beyond a limit; nothing of it was stored."""
+
+    what: str
+    claimed: int
+    limit: int
+
+    def __str__(self) -> str:
+        """Say what was claimed and what is allowed."""
+        return f"{self.what} of {self.claimed} bytes exceeds the limit of {self.limit}"
+
+
+@dataclass
+class PeerRefused(RmpaError):  # noqa: N818 - an event's name
+    """A peer answered, and the answer was no."""
+
+    peer: str
+    reason: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        """Say who refused, why, and what to do."""
+        remedy = f"; {self.remedy}" if self.remedy else ""
+        return f"{self.peer} refused: {self.reason}{remedy}"
+
+
+@dataclass
+class UnreachableError(RmpaError):
+    """Nobody answers at an address where somebody should."""
+
+    what: str
+    where: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        """Say what was looked for, where, and what to do."""
+        remedy = f"; {self.remedy}" if self.remedy else ""
+        return f"no {self.what} answers at {self.where}{remedy}"

@@ -1,0 +1,78 @@
+"""What a peer says of itself, in beacons and in the mesh's handshake."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+
+if TYPE_CHECKING:
+    from ipaddress import IPv4Address
+
+    from rmpa.core.guid import Guid
+
+_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+
+
+def peer_name_problem(name: str) -> str | None:
+    """Say what is wrong with a peer's name, or ``None``.
+
+    A peer's name becomes a part of its proxies' names in the ROS graph, so it is a ROS base name (REP 144).
+    """
+    if not name:
+        return "a peer's name cannot be empty"
+    if len(name) > limits.PEER_NAME_MAX:
+        return f"a peer's name has at most {limits.PEER_NAME_MAX} characters"
+    if not _NAME.fullmatch(name):
+        return f"{name!r} is not a ROS base name (a letter, then letters, digits and _)"
+    return None
+
+
+def peer_name_from(text: str) -> str:
+    """Make the nearest valid peer name of a host name: ``my-robot.local`` gives ``my_robot``."""
+    name = re.sub(r"[^A-Za-z0-9_]", "_", text.split(".")[0])[: limits.PEER_NAME_MAX - 2]
+    if not name or not name[0].isalpha():
+        name = f"m_{name}" if name else "module"
+    return name
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """One run of one agent.
+
+    Args:
+        guid: Its GUID; the address and port in it are where it wants to be reached.
+        instance: 128 random bits (16 bytes), new at each start; tells two peers with one GUID apart.
+        name: Its name, a ROS base name, unique among its peers.
+        domain: Only peers of the same domain join.
+        addresses: Its other numeric IPv4 addresses, best first; may be empty.
+
+    Raises:
+        ValueError: A part is out of its range.
+    """
+
+    guid: Guid
+    instance: bytes
+    name: str
+    domain: int = 0
+    addresses: tuple[IPv4Address, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.instance) != limits.INSTANCE_ID_BYTES:
+            raise ValueError(f"an instance id has {limits.INSTANCE_ID_BYTES} bytes, not {len(self.instance)}")
+        if problem := peer_name_problem(self.name):
+            raise ValueError(problem)
+        if not 0 <= self.domain <= limits.DOMAIN_MAX:
+            raise ValueError(f"a domain id is between 0 and {limits.DOMAIN_MAX}, not {self.domain}")
+
+    @property
+    def endpoints(self) -> tuple[tuple[str, int], ...]:
+        """Where to dial, best first, each once: the GUID's own address, then the others."""
+        port = self.guid.port
+        return tuple(dict.fromkeys([self.guid.endpoint, *((str(a), port) for a in self.addresses)]))
+
+    def __str__(self) -> str:
+        """``base (10.0.0.1:40001#7)``."""
+        return f"{self.name} ({self.guid})"

@@ -1,0 +1,137 @@
+"""Every cap and time-out, with its unit and its reason. Seconds and bytes unless the name says otherwise.
+
+A room that needs a new number adds it to its own part here, never in its own code.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+KIB: Final = 1024
+MIB: Final = 1024 * KIB
+
+# --- identity -------------------------------------------------------------------------------------------------
+INSTANCE_ID_BYTES: Final = 16
+"""Random id of one run of one agent: 128 bits, so that two runs never share one."""
+PEER_NAME_MAX: Final = 64
+"""Characters in a peer's name: a host name's label is at most 63."""
+DOMAIN_MAX: Final = 232
+"""Highest domain id: ROS 2's own bound, so that the same ROS_DOMAIN_ID works for both."""
+
+# --- discovery ------------------------------------------------------------------------------------------------
+MULTICAST_GROUP: Final = "239.255.82.77"
+"""Administratively scoped (RFC 2365), so routers keep it on site; 82.77 is "RM"."""
+MULTICAST_PORT: Final = 11411
+"""Of domain 0; domain n uses this plus n."""
+MULTICAST_TTL: Final = 1
+"""Hops: the own sub-network only."""
+BEACON_MAX_BYTES: Final = 1200
+"""One beacon fits one packet on every link (IPv6 minimum MTU 1280 less headers)."""
+BEACON_ADDRESSES_MAX: Final = 8
+"""Addresses that a beacon carries: a robot with more interfaces announces the first eight."""
+BEACON_GOSSIP_MAX: Final = 64
+"""Peers that one beacon passes on; more are passed on in turn."""
+BURST_OFFSETS: Final = (0.0, 0.1, 0.3, 0.7)
+"""When a starting peer announces itself: Wi-Fi loses multicast, one beacon is not enough."""
+HEARTBEAT_INTERVAL: Final = 5.0
+"""Paper, section 4.3: "each five seconds a heartbeat will check that network is still alive"."""
+ROSTER_LEASE: Final = 16.0
+"""A peer that has no link and was silent for three heartbeats and a second is gone."""
+ROSTER_PEERS_MAX: Final = 512
+"""Peers in a roster: a hostile sender of invented GUIDs cannot fill the memory."""
+CONFLICT_AFTER: Final = 2.0
+"""A replaced instance that still speaks after this long is not a late packet: two live peers share one GUID."""
+ANSWER_INTERVAL: Final = 0.2
+"""At most one unicast answer to one address in this time."""
+INTERFACE_SETTLE: Final = 0.2
+"""After a change of interfaces the kernel reports several more; they are read once."""
+
+# --- mesh -----------------------------------------------------------------------------------------------------
+LINK_LEASE: Final = 1.0
+"""A link on which nothing arrived for this long is dead (TCP alone would take two hours)."""
+KEEPALIVE_INTERVAL: Final = 0.25
+"""A quarter of the lease: three keepalives may be late before the link falls."""
+HANDSHAKE_TIMEOUT: Final = 3.0
+"""From connect to welcome; whoever takes longer is a port scanner or stuck."""
+DIAL_TIMEOUT: Final = 2.0
+"""For the TCP connect itself."""
+DIAL_FALLBACK: Final = 2.0
+"""The higher GUID waits this long for the lower one's call, then dials itself (NAT, firewall)."""
+BACKOFF_FIRST: Final = 0.1
+"""Before the second attempt to dial."""
+BACKOFF_MAX: Final = 2.0
+"""Between attempts at the most: a peer that comes back is linked within this time."""
+FRAME_HEADER_BYTES: Final = 24
+"""See docs/design/protocol.md."""
+FRAME_PAYLOAD_MAX: Final = 256 * MIB
+"""A frame carries one whole ROS message for now; the largest point clouds and images stay below this."""
+CONTROL_PAYLOAD_MAX: Final = 16 * MIB
+"""A control frame: the graph of a peer with a few thousand topics and their message definitions."""
+HELLO_PAYLOAD_MAX: Final = 4 * KIB
+"""Before a peer has said who it is, nothing larger is read from it."""
+PENDING_LINKS_MAX: Final = 64
+"""Accepted connections that have not finished their handshake."""
+LINK_QUEUE_BYTES: Final = 64 * MIB
+"""Data that waits for one slow link, over all topics; the oldest of the same topic is dropped beyond it."""
+ROUTE_QUEUE_MESSAGES: Final = 1000
+"""Messages of one topic that wait for one slow link."""
+DRAIN_TIMEOUT: Final = 1.0
+"""How long an agent that ends waits for its last bytes to leave."""
+
+# --- ROS ------------------------------------------------------------------------------------------------------
+TCPROS_HEADER_MAX: Final = 4 * MIB
+"""A connection header: the longest message definitions are some 100 KB; roscpp would accept 1 GB."""
+TCPROS_MESSAGE_MAX: Final = FRAME_PAYLOAD_MAX - 4
+"""One message, so that it still fits a frame with its length."""
+TCPROS_HANDSHAKE_TIMEOUT: Final = 10.0
+"""For the other side's header; rospy and roscpp wait for ever, and hang for ever."""
+TCPROS_CONNECT_TIMEOUT: Final = 3.0
+"""For the TCP connect to a local node."""
+SUBSCRIBER_QUEUE_MESSAGES: Final = 1000
+"""Messages that wait for one slow local subscriber; the oldest is dropped beyond it."""
+SUBSCRIBER_QUEUE_BYTES: Final = 32 * MIB
+"""The same in bytes; one message always fits."""
+HTTP_BODY_MAX: Final = 8 * MIB
+"""An XML-RPC call: parameters with maps and URDFs reach a few MB."""
+HTTP_HEADERS_MAX: Final = 64 * KIB
+"""A request's headers, all together."""
+HTTP_CONNECTIONS_MAX: Final = 512
+"""Open connections to one XML-RPC server: rospy keeps one per thread alive."""
+HTTP_IDLE_TIMEOUT: Final = 60.0
+"""A kept-alive connection without a call; rospy and roscpp reconnect without a word."""
+HTTP_REQUEST_TIMEOUT: Final = 10.0
+"""From a request's first byte to its last."""
+SLAVE_CALL_TIMEOUT: Final = 3.0
+"""For one XML-RPC call to a node; a stopped node must not hold the others up."""
+NODE_CHECK_INTERVAL: Final = 5.0
+"""How often the core looks whether a registered node still listens."""
+ROSOUT_QUEUE: Final = 1000
+"""Log messages waiting for a slow reader of /rosout_agg."""
+
+# --- bridge ---------------------------------------------------------------------------------------------------
+ROUTE_OPEN_TIMEOUT: Final = 5.0
+"""From asking a peer for a topic to its answer; then the route is asked for again."""
+ROUTE_LINGER: Final = 1.0
+"""A route stays open this long after its last local subscriber left: reconnecting nodes flap."""
+ROUTES_PER_LINK_MAX: Final = 8192
+"""Open routes that one peer may hold with us."""
+TOPICS_PER_PEER_MAX: Final = 16384
+"""(topic, node) pairs that one peer may advertise."""
+RECONCILE_INTERVAL: Final = 5.0
+"""The plan is compared with what is really open this often, so that nothing stays stuck."""
+
+# --- monitor --------------------------------------------------------------------------------------------------
+CONTROL_REQUEST_MAX: Final = 1 * MIB
+"""One request on the control socket."""
+CONTROL_REPLY_MAX: Final = 64 * MIB
+"""One reply: the snapshot of a very large graph."""
+CONTROL_CLIENTS_MAX: Final = 32
+"""Simultaneous clients of the control socket."""
+CONTROL_IDLE_TIMEOUT: Final = 60.0
+"""A client that asks nothing for this long is closed."""
+
+# --- logging --------------------------------------------------------------------------------------------------
+LOG_INTERVAL: Final = 5.0
+"""A refusal of one kind from one address is logged at most once in this time; the rest are counted."""
+LOG_KINDS_MAX: Final = 1024
+"""Kinds of refusal remembered for that; the oldest is forgotten first."""

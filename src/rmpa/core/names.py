@@ -1,0 +1,81 @@
+"""ROS graph names (wiki.ros.org/Names, REP 144) and the globs that rules are written in."""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+from typing import Final
+
+_LEGAL: Final = re.compile(r"[~/A-Za-z][\w/]*", re.ASCII)
+_TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*")
+
+
+def is_legal_name(name: str) -> bool:
+    """Whether a graph resource may have this name, before it is resolved (empty is legal: the namespace)."""
+    return name == "" or (_LEGAL.fullmatch(name) is not None and "//" not in name)
+
+
+def is_global_name(name: str) -> bool:
+    """Whether this is a resolved name, ``/like/this``."""
+    return name.startswith("/") and is_legal_name(name) and (name == "/" or not name.endswith("/"))
+
+
+def is_type_name(name: str) -> bool:
+    """Whether this is a message or service type, ``package/Name``."""
+    return _TYPE.fullmatch(name) is not None
+
+
+def join_names(namespace: str, name: str) -> str:
+    """``/ns`` and ``name`` to ``/ns/name``; a global ``name`` stays as it is."""
+    if name.startswith("/"):
+        return name
+    return f"{namespace.rstrip('/')}/{name}" if namespace else name
+
+
+def namespace_of(name: str) -> str:
+    """The namespace of a global name, with its trailing slash: ``/a/b`` gives ``/a/``, ``/a`` gives ``/``."""
+    stripped = name.rstrip("/")
+    return stripped[: stripped.rfind("/") + 1] or "/"
+
+
+def resolve_name(name: str, namespace: str = "/", node: str = "") -> str:
+    """Resolve a graph name as a client library does.
+
+    Args:
+        name: As written: ``/global``, ``relative``, ``~private`` or empty (the namespace itself).
+        namespace: The namespace to resolve relative names in.
+        node: The node's own global name, for private names.
+
+    Returns:
+        A global name without a trailing slash.
+
+    Raises:
+        ValueError: ``name`` is not a legal name.
+    """
+    if not is_legal_name(name):
+        raise ValueError(
+            f"{name!r} is not a ROS name; allowed are letters, digits, _ and /, after a letter, / or ~"
+        )
+    if name.startswith("~"):
+        resolved = join_names(node or namespace, name[1:].lstrip("/"))
+    else:
+        resolved = join_names(namespace, name)
+    return "/" + "/".join(part for part in resolved.split("/") if part)
+
+
+@lru_cache(maxsize=4096)
+def _compile_glob(pattern: str) -> re.Pattern[str]:
+    parts = []
+    for piece in re.split(r"(\*\*|\*|\?)", pattern):
+        parts.append({"**": ".*", "*": "[^/]*", "?": "[^/]"}.get(piece, re.escape(piece)))
+    return re.compile("".join(parts))
+
+
+def matches(pattern: str, name: str) -> bool:
+    """Whether a name fits a glob: ``*`` and ``?`` stay within one part of the name, ``**`` crosses slashes.
+
+    ``/camera/**`` also fits ``/camera`` itself, as people expect of a namespace.
+    """
+    if pattern.endswith("/**") and pattern[:-3] and _compile_glob(pattern[:-3]).fullmatch(name):
+        return True
+    return _compile_glob(pattern).fullmatch(name) is not None

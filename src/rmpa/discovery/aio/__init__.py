@@ -1,0 +1,1 @@
+"""Sockets, interfaces and timers that drive the roster."""

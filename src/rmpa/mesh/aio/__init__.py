@@ -1,0 +1,1 @@
+"""Dialling, accepting and driving links with asyncio."""

@@ -1,0 +1,1 @@
+"""The agent, seen from outside: snapshots and the control socket."""

@@ -1,0 +1,1 @@
+"""The ROS 1 side: master, parameter server, slave API, TCPROS and message types."""

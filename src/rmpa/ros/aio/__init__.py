@@ -1,0 +1,1 @@
+"""The ROS core, nodes and TCPROS connections on asyncio."""
