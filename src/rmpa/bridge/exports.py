@@ -1,0 +1,190 @@
+"""Which local sources are offered to which peers, and which are flowing (one copy a peer, on demand).
+
+Sans-I/O: the driver tells what the local graph holds, what peers ask for and what became of the connections to
+local publishers; it gets back actions.
+
+A source is connected while at least one peer wants it::
+
+    idle ──open──► connecting ──described──► live
+      ▲               │ refused, lost          │ lost, restarted, gone
+      └───────────────┴────────────────────────┘  every route of it: Closed(reason)
+
+Who lost a route asks again: the one that wants the data is the one that retries.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, Warn
+from rmpa.bridge.messages import Advertise, Close, Closed, Description, Offer, Open, Opened, Source
+from rmpa.core import limits
+from rmpa.core.names import is_type_name
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rmpa.bridge.policy import Policy
+
+
+@dataclass(frozen=True, slots=True)
+class LocalSource:
+    """A source of the local graph: its message type and its node's slave API."""
+
+    type: str
+    uri: str
+
+
+@dataclass(slots=True)
+class _Flow:
+    """A source that some peer wants."""
+
+    uri: str
+    routes: dict[tuple[int, int], bool] = field(default_factory=dict)
+    """(peer, route), and whether data goes there yet."""
+    description: Description | None = None
+
+
+class Exports:
+    """The outbound half of the bridge.
+
+    Args:
+        policy: What may cross.
+    """
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy = policy
+        self._local: dict[Source, LocalSource] = {}
+        self._peers: dict[int, dict[int, Source]] = {}
+        self._flows: dict[Source, _Flow] = {}
+
+    @property
+    def offered(self) -> Mapping[Source, LocalSource]:
+        """What peers are told of."""
+        return self._local
+
+    def flowing(self, source: Source) -> tuple[int, ...]:
+        """The peers that a source goes to now."""
+        flow = self._flows.get(source)
+        return tuple(peer for (peer, _), live in flow.routes.items() if live) if flow else ()
+
+    def description(self, source: Source) -> Description | None:
+        """What is known of a source's messages, while it flows."""
+        flow = self._flows.get(source)
+        return flow.description if flow else None
+
+    def graph(self, sources: Mapping[Source, LocalSource]) -> list[Action]:
+        """The local graph changed: ``sources`` is all that it publishes now, proxies left out."""
+        crossing = [
+            source
+            for source, local in sources.items()
+            if is_type_name(local.type) and self._policy.judge(source.topic, local.type, source.node).allowed
+        ]
+        actions: list[Action] = []
+        if len(crossing) > limits.TOPICS_PER_PEER_MAX:
+            crossing = sorted(crossing)[: limits.TOPICS_PER_PEER_MAX]
+            text = f"more than {limits.TOPICS_PER_PEER_MAX} sources would cross; the rest stays home: deny some"
+            actions.append(Warn("sources.too_many", "local", text))
+        new = {source: sources[source] for source in crossing}
+        old, self._local = self._local, new
+        removed = tuple(s for s in old if s not in new)
+        # A type that changed is removed and offered again; a new address alone is nobody's business but ours.
+        added = tuple(
+            Offer(s.topic, s.node, local.type)
+            for s, local in new.items()
+            if s not in old or old[s].type != local.type
+        )
+        for source in [s for s, flow in self._flows.items() if s not in new or new[s].uri != flow.uri]:
+            why = "the node has gone" if source not in new else "the node has restarted"
+            actions += self._end(source, why)
+        if added or removed:
+            actions += [Send(peer, Advertise(added=added, removed=removed)) for peer in self._peers]
+        return actions
+
+    def link_up(self, peer: int) -> list[Action]:
+        """A link is up: tell all we have."""
+        self._peers[peer] = {}
+        offers = tuple(Offer(s.topic, s.node, local.type) for s, local in self._local.items())
+        return [Send(peer, Advertise(added=offers, full=True))]
+
+    def link_down(self, peer: int) -> list[Action]:
+        """A link is gone, and all its routes."""
+        actions: list[Action] = []
+        for route, source in self._peers.pop(peer, {}).items():
+            actions += self._remove(source, peer, route)
+        return actions
+
+    def opened(self, peer: int, message: Open) -> list[Action]:
+        """A peer asks for a source."""
+        routes = self._peers[peer]
+        if message.route in routes:
+            return [
+                Warn("route.doubled", str(peer), f"a peer opens route {message.route} twice; the second is ignored")
+            ]
+        if len(routes) >= limits.ROUTES_PER_LINK_MAX:
+            return [Send(peer, Closed(message.route, f"more than {limits.ROUTES_PER_LINK_MAX} routes on one link"))]
+        source = message.source
+        local = self._local.get(source)
+        if local is None:
+            return [Send(peer, Closed(message.route, f"{source}: not published here, or policy keeps it home"))]
+        routes[message.route] = source
+        flow = self._flows.get(source)
+        if flow is None:
+            flow = self._flows[source] = _Flow(local.uri)
+            flow.routes[peer, message.route] = False
+            return [Connect(source, local.type, local.uri)]
+        flow.routes[peer, message.route] = False
+        if flow.description is None:
+            return []
+        return self._start(source, flow, flow.description)
+
+    def closed(self, peer: int, message: Close) -> list[Action]:
+        """A peer wants no more of a route; one that is not open is none of our worry (it crossed ours)."""
+        source = self._peers[peer].pop(message.route, None)
+        return self._remove(source, peer, message.route) if source is not None else []
+
+    def described(self, source: Source, description: Description) -> list[Action]:
+        """The local publisher has answered with its header."""
+        flow = self._flows.get(source)
+        if flow is None:
+            return []
+        flow.description = description
+        return self._start(source, flow, description)
+
+    def lost(self, source: Source, reason: str) -> list[Action]:
+        """The local publisher hung up, refused or does not answer."""
+        return self._end(source, reason, connected=False)
+
+    def _start(self, source: Source, flow: _Flow, description: Description) -> list[Action]:
+        actions: list[Action] = []
+        for (peer, route), live in flow.routes.items():
+            if not live:
+                flow.routes[peer, route] = True
+                actions += [Send(peer, Opened(route, description)), AddRoute(source, peer, route)]
+        return actions
+
+    def _remove(self, source: Source, peer: int, route: int) -> list[Action]:
+        flow = self._flows.get(source)
+        if flow is None:
+            return []
+        live = flow.routes.pop((peer, route), False)
+        actions: list[Action] = [RemoveRoute(source, peer, route)] if live else []
+        if not flow.routes:
+            del self._flows[source]
+            actions.append(Disconnect(source))
+        return actions
+
+    def _end(self, source: Source, reason: str, *, connected: bool = True) -> list[Action]:
+        flow = self._flows.pop(source, None)
+        if flow is None:
+            return []
+        actions: list[Action] = []
+        for (peer, route), live in flow.routes.items():
+            self._peers[peer].pop(route, None)
+            if live:
+                actions.append(RemoveRoute(source, peer, route))
+            actions.append(Send(peer, Closed(route, reason)))
+        if connected:
+            actions.append(Disconnect(source))
+        return actions

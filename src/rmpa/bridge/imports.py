@@ -1,0 +1,334 @@
+"""Which sources of the peers appear in the local graph, and which routes are open for them.
+
+Sans-I/O: the driver tells what peers say and whether somebody local listens; it gets back actions. Each source
+of each peer is in one state of this table::
+
+    idle ──wanted──► opening ──opened──► open ──unwanted──► lingering ──time──► idle
+      ▲                 │ closed, time      │ closed             │ wanted
+      │ unwanted        ▼                   ▼                    ▼
+      └────────────── waiting ◄────────────────                 open
+                        │ time ──► opening
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import TYPE_CHECKING, Final
+
+from rmpa.bridge.actions import Action, Describe, Detach, Publish, Retract, Send, Warn
+from rmpa.bridge.messages import Advertise, Close, Closed, Mismatch, Offer, Open, Opened, Source
+from rmpa.core import limits
+from rmpa.core.backoff import Backoff
+from rmpa.core.clock import earliest
+from rmpa.core.errors import LocalProtocolError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from rmpa.bridge.messages import Description
+    from rmpa.bridge.policy import Policy
+
+
+class RouteState(Enum):
+    """Where a remote source's route stands."""
+
+    IDLE = auto()
+    """Visible in the local graph, nobody listens."""
+    OPENING = auto()
+    """Asked for, not answered."""
+    OPEN = auto()
+    """Data flows."""
+    LINGERING = auto()
+    """Data flows, though nobody listens; perhaps somebody comes back."""
+    WAITING = auto()
+    """It was closed although somebody listens; it will be asked for again."""
+
+
+_S = RouteState
+TRANSITIONS: Final[Mapping[RouteState, frozenset[RouteState]]] = {
+    _S.IDLE: frozenset({_S.OPENING}),
+    _S.OPENING: frozenset({_S.OPEN, _S.WAITING, _S.IDLE}),
+    _S.OPEN: frozenset({_S.LINGERING, _S.WAITING}),
+    _S.LINGERING: frozenset({_S.OPEN, _S.IDLE}),
+    _S.WAITING: frozenset({_S.OPENING, _S.IDLE}),
+}
+
+
+@dataclass(slots=True)
+class Import:
+    """One source of one peer, as we see it.
+
+    Args:
+        type: Its message type.
+        backoff: Delays between attempts.
+        shown: Whether it is in the local graph.
+        hidden: Why it is not, or empty.
+        state: Where its route stands.
+        route: The route's id while it is asked for or open, else 0.
+        timer: When the state is looked at again, monotonic seconds.
+        description: What its messages are, once known.
+        problem: Why the last attempt failed, or empty.
+        wanted: Whether somebody local listens.
+    """
+
+    type: str
+    backoff: Backoff
+    shown: bool = False
+    hidden: str = ""
+    state: RouteState = RouteState.IDLE
+    route: int = 0
+    timer: float | None = None
+    description: Description | None = None
+    problem: str = ""
+    wanted: bool = False
+
+
+class Imports:
+    """The inbound half of the bridge.
+
+    Args:
+        policy: What may cross; the receiving side judges too.
+        rng: Uniform numbers in [0, 1) for the back-off's jitter.
+    """
+
+    def __init__(self, policy: Policy, rng: Callable[[], float]) -> None:
+        self._policy = policy
+        self._rng = rng
+        self._peers: dict[int, dict[Source, Import]] = {}
+        self._routes: dict[int, dict[int, Source]] = {}
+        self._next_route: dict[int, int] = {}
+        self._local_types: dict[str, str] = {}
+        self._timed: set[tuple[int, Source]] = set()
+
+    def __iter__(self) -> Iterator[tuple[int, Source, Import]]:
+        """Every known source, with its peer."""
+        for peer, sources in self._peers.items():
+            for source, entry in sources.items():
+                yield peer, source, entry
+
+    def get(self, peer: int, source: Source) -> Import | None:
+        """One known source."""
+        return self._peers.get(peer, {}).get(source)
+
+    def local_types(self, types: Mapping[str, str]) -> list[Action]:
+        """The types of the topics that local nodes publish; a remote source of another type stays hidden."""
+        if self._local_types == types:
+            return []
+        self._local_types = dict(types)
+        actions: list[Action] = []
+        for peer, source, entry in self:
+            shown = entry.shown
+            actions += self._show_or_hide(peer, source, entry)
+            if shown and not entry.shown:
+                actions += self._report_conflict(peer, source, entry)
+        return actions
+
+    def link_up(self, peer: int) -> list[Action]:
+        """A link is up; its first message will be a full advertisement."""
+        self._peers[peer] = {}
+        self._routes[peer] = {}
+        self._next_route[peer] = 1
+        return []
+
+    def link_down(self, peer: int) -> list[Action]:
+        """A link is gone: all that came over it leaves the local graph."""
+        actions: list[Action] = []
+        sources = self._peers.pop(peer, {})
+        for source, entry in sources.items():
+            self._timed.discard((peer, source))
+            if entry.route:
+                actions.append(Detach(peer, source, entry.route))
+            if entry.shown:
+                actions.append(Retract(peer, source))
+        self._routes.pop(peer, None)
+        self._next_route.pop(peer, None)
+        return actions
+
+    def advertised(self, peer: int, message: Advertise) -> list[Action]:
+        """A peer says what it publishes."""
+        known = self._peers[peer]
+        removed = list(message.removed)
+        if message.full:
+            offered = {offer.source for offer in message.added}
+            removed += [source for source in known if source not in offered]
+        actions: list[Action] = []
+        for source in removed:
+            actions += self._forget(peer, source)
+        for offer in message.added:
+            actions += self._learn(peer, offer)
+        return actions
+
+    def opened(self, peer: int, message: Opened, now: float) -> list[Action]:
+        """A route that we asked for is open; one that we closed meanwhile is ignored."""
+        source = self._routes[peer].get(message.route)
+        entry = self._peers[peer].get(source) if source is not None else None
+        if source is None or entry is None or entry.state is not RouteState.OPENING:
+            return []
+        if message.description.type != entry.type:
+            self._routes[peer].pop(message.route)
+            why = f"it is offered as {entry.type}, but its publisher sends {message.description.type}"
+            fail = self._fail(peer, source, entry, why, now)
+            return [Send(peer, Close(message.route)), Warn("mismatch.type", str(source), f"{source}: {why}"), *fail]
+        self._move(peer, source, entry, RouteState.OPEN)
+        entry.problem = ""
+        entry.backoff.reset()
+        entry.description = message.description
+        return [Describe(peer, source, message.route, message.description)]
+
+    def closed(self, peer: int, message: Closed, now: float) -> list[Action]:
+        """The other side has no such route, or no longer."""
+        source = self._routes[peer].pop(message.route, None)
+        entry = self._peers[peer].get(source) if source is not None else None
+        if source is None or entry is None:
+            return []
+        return self._fail(peer, source, entry, message.reason, now)
+
+    def demand(self, peer: int, source: Source, now: float, *, wanted: bool) -> list[Action]:
+        """Somebody local listens to a source, or nobody does any more."""
+        entry = self.get(peer, source)
+        if entry is None:
+            return []
+        entry.wanted = wanted
+        if wanted:
+            if entry.state is RouteState.IDLE:
+                return self._open(peer, source, entry, now)
+            if entry.state is RouteState.LINGERING:
+                self._move(peer, source, entry, RouteState.OPEN)
+            return []
+        if entry.state is RouteState.OPEN:
+            self._move(peer, source, entry, RouteState.LINGERING, now + limits.ROUTE_LINGER)
+            return []
+        if entry.state in {RouteState.OPENING, RouteState.WAITING}:
+            return self._close(peer, source, entry)
+        return []
+
+    def mismatched(self, peer: int, source: Source, subscriber: str, text: str) -> list[Action]:
+        """A local node was refused because its definition is another one: say so here and over there."""
+        return [
+            Warn("mismatch.md5", str(source), text),
+            Send(peer, Mismatch(source.topic, source.node, subscriber, text)),
+        ]
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is due."""
+        return earliest(*(self._peers[peer][source].timer for peer, source in self._timed))
+
+    def handle_timer(self, now: float) -> list[Action]:
+        """Do what is due."""
+        actions: list[Action] = []
+        for peer, source in sorted(self._timed):
+            entry = self._peers[peer][source]
+            if entry.timer is None or entry.timer > now:
+                continue
+            if entry.state is RouteState.LINGERING:
+                actions += self._close(peer, source, entry)
+            elif entry.state is RouteState.OPENING:
+                self._routes[peer].pop(entry.route, None)
+                actions.append(Send(peer, Close(entry.route)))
+                actions += self._fail(peer, source, entry, "the peer has not answered", now)
+            elif entry.state is RouteState.WAITING:
+                actions += self._open(peer, source, entry, now)
+        return actions
+
+    def _learn(self, peer: int, offer: Offer) -> list[Action]:
+        known = self._peers[peer]
+        source = offer.source
+        actions: list[Action] = []
+        if source in known:
+            if known[source].type == offer.type:
+                return []
+            actions += self._forget(peer, source)
+        elif len(known) >= limits.TOPICS_PER_PEER_MAX:
+            return [
+                Warn("topics.too_many", str(peer), f"a peer offers more than {limits.TOPICS_PER_PEER_MAX} topics")
+            ]
+        backoff = Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng)
+        entry = known[source] = Import(offer.type, backoff)
+        actions += self._show_or_hide(peer, source, entry)
+        return actions + self._report_conflict(peer, source, entry)
+
+    def _show_or_hide(self, peer: int, source: Source, entry: Import) -> list[Action]:
+        entry.hidden = self._why_hidden(source, entry.type)
+        if entry.shown is not bool(entry.hidden):
+            return []
+        if not entry.hidden:
+            entry.shown = True
+            return [Publish(peer, source, entry.type)]
+        entry.shown = False
+        entry.wanted = False
+        return [*self._close(peer, source, entry), Retract(peer, source)]
+
+    def _report_conflict(self, peer: int, source: Source, entry: Import) -> list[Action]:
+        """Say loudly, on both sides, that a local topic of another type is in the way."""
+        if entry.shown or not self._policy.judge(source.topic, entry.type, source.node).allowed:
+            return []
+        return [
+            Warn("mismatch.type", str(source), f"{source}: {entry.hidden}"),
+            Send(peer, Mismatch(source.topic, source.node, "", entry.hidden)),
+        ]
+
+    def _why_hidden(self, source: Source, type_name: str) -> str:
+        decision = self._policy.judge(source.topic, type_name, source.node)
+        if not decision.allowed:
+            return decision.rule
+        local = self._local_types.get(source.topic, type_name)
+        if local != type_name:
+            return (
+                f"its type is {type_name}, but a local node publishes {source.topic} as {local}; "
+                "rename one of the topics or use one type"
+            )
+        return ""
+
+    def _forget(self, peer: int, source: Source) -> list[Action]:
+        entry = self._peers[peer].get(source)
+        if entry is None:
+            return []
+        actions = self._close(peer, source, entry)
+        if entry.shown:
+            actions.append(Retract(peer, source))
+        del self._peers[peer][source]
+        return actions
+
+    def _move(self, peer: int, source: Source, entry: Import, state: RouteState, timer: float | None = None) -> None:
+        """Change a state as the table allows."""
+        if state not in TRANSITIONS[entry.state]:
+            raise LocalProtocolError(f"{entry.state.name} does not lead to {state.name}")
+        entry.state = state
+        entry.timer = timer
+        if timer is None:
+            self._timed.discard((peer, source))
+        else:
+            self._timed.add((peer, source))
+
+    def _open(self, peer: int, source: Source, entry: Import, now: float) -> list[Action]:
+        route = self._next_route[peer]
+        self._next_route[peer] = route + 1
+        self._routes[peer][route] = source
+        entry.route = route
+        self._move(peer, source, entry, RouteState.OPENING, now + limits.ROUTE_OPEN_TIMEOUT)
+        return [Send(peer, Open(route, source.topic, source.node))]
+
+    def _close(self, peer: int, source: Source, entry: Import) -> list[Action]:
+        """Leave a source alone, whatever its state."""
+        actions: list[Action] = []
+        if entry.route:
+            self._routes[peer].pop(entry.route, None)
+            actions += [Send(peer, Close(entry.route)), Detach(peer, source, entry.route)]
+        entry.route = 0
+        entry.backoff.reset()
+        if entry.state is RouteState.OPEN:
+            self._move(peer, source, entry, RouteState.LINGERING)
+        if entry.state is not RouteState.IDLE:
+            self._move(peer, source, entry, RouteState.IDLE)
+        return actions
+
+    def _fail(self, peer: int, source: Source, entry: Import, reason: str, now: float) -> list[Action]:
+        actions: list[Action] = [Detach(peer, source, entry.route)]
+        entry.route = 0
+        entry.problem = reason
+        if entry.state is RouteState.LINGERING:
+            self._move(peer, source, entry, RouteState.IDLE)
+        else:
+            self._move(peer, source, entry, RouteState.WAITING, now + entry.backoff.delay())
+        return actions

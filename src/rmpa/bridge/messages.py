@@ -1,0 +1,168 @@
+"""What two bridges say to each other: one JSON object a control frame, its kind in ``op``.
+
+JSON because it is rare (never on the data path), bounded by ``limits.CONTROL_PAYLOAD_MAX`` and readable in a
+packet capture. ``docs/design/protocol.md`` lists the messages with examples.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import msgspec
+
+from rmpa.core import limits
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.core.names import is_global_name, is_type_name
+
+
+class Source(msgspec.Struct, frozen=True, order=True):
+    """One stream of messages: a topic as one node publishes it. Sources are never mixed.
+
+    Args:
+        topic: Global name of the topic, in the publishing module.
+        node: Global name of the publishing node, in the publishing module.
+    """
+
+    topic: str
+    node: str
+
+    def __str__(self) -> str:
+        """``/cmd from /joy_node``."""
+        return f"{self.topic} from {self.node}"
+
+
+class Offer(msgspec.Struct, frozen=True):
+    """A source that the sender's graph has, and its message type."""
+
+    topic: str
+    node: str
+    type: str
+
+    @property
+    def source(self) -> Source:
+        """The stream that is offered."""
+        return Source(self.topic, self.node)
+
+
+class Description(msgspec.Struct, frozen=True):
+    """What the publisher's own connection header says; known only once somebody is connected to it.
+
+    Args:
+        type: Message type.
+        md5: Its MD5 sum, never ``*``.
+        definition: The full text of its definition, byte for byte as the publisher sent it.
+        latching: Whether each new subscriber gets the last message.
+    """
+
+    type: str
+    md5: str
+    definition: str
+    latching: bool
+
+
+class Advertise(msgspec.Struct, frozen=True, tag_field="op", tag="advertise"):
+    """What the sender's graph publishes: all of it (``full``, first on each link) or what changed."""
+
+    added: tuple[Offer, ...] = ()
+    removed: tuple[Source, ...] = ()
+    full: bool = False
+
+
+class Open(msgspec.Struct, frozen=True, tag_field="op", tag="open"):
+    """Send me this source; its data frames shall bear this route's id, which I chose."""
+
+    route: int
+    topic: str
+    node: str
+
+    @property
+    def source(self) -> Source:
+        """The stream that is asked for."""
+        return Source(self.topic, self.node)
+
+
+class Opened(msgspec.Struct, frozen=True, tag_field="op", tag="opened"):
+    """The route is open; data follows."""
+
+    route: int
+    description: Description
+
+
+class Close(msgspec.Struct, frozen=True, tag_field="op", tag="close"):
+    """I want no more of this route."""
+
+    route: int
+
+
+class Closed(msgspec.Struct, frozen=True, tag_field="op", tag="closed"):
+    """The route is not, or no longer, open on my side; ``reason`` is for people."""
+
+    route: int
+    reason: str
+
+
+class Mismatch(msgspec.Struct, frozen=True, tag_field="op", tag="mismatch"):
+    """A node of mine wants your source with another definition; it was refused. For your log and users."""
+
+    topic: str
+    node: str
+    subscriber: str
+    text: str
+
+    @property
+    def source(self) -> Source:
+        """The stream that did not fit."""
+        return Source(self.topic, self.node)
+
+
+Message = Advertise | Open | Opened | Close | Closed | Mismatch
+
+_ENCODER: Final = msgspec.json.Encoder()
+_DECODER: Final = msgspec.json.Decoder(Message)
+_ROUTE_MAX: Final = (1 << 32) - 1
+
+
+def encode(message: Message) -> bytes:
+    """One message as the payload of a control frame."""
+    return _ENCODER.encode(message)
+
+
+def decode(payload: bytes | bytearray | memoryview) -> Message:
+    """Read and validate one message.
+
+    Raises:
+        LimitExceeded: It is longer than ``limits.CONTROL_PAYLOAD_MAX``, or offers too many topics.
+        RemoteProtocolError: It is not a message of this version, or holds what is not a ROS name or type.
+    """
+    if len(payload) > limits.CONTROL_PAYLOAD_MAX:
+        raise LimitExceeded("control message", len(payload), limits.CONTROL_PAYLOAD_MAX)
+    try:
+        message: Message = _DECODER.decode(payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise RemoteProtocolError(f"control message: {error}") from error
+    _validate(message)
+    return message
+
+
+def _validate(message: Message) -> None:
+    if not isinstance(message, Advertise | Mismatch) and not 0 < message.route <= _ROUTE_MAX:
+        raise RemoteProtocolError(f"route {message.route} is not a 32-bit number above 0")
+    if isinstance(message, Advertise):
+        if len(message.added) > limits.TOPICS_PER_PEER_MAX:
+            raise LimitExceeded("advertisement (in topics)", len(message.added), limits.TOPICS_PER_PEER_MAX)
+        for offer in message.added:
+            _check_names(offer.topic, offer.node)
+            if not is_type_name(offer.type):
+                raise RemoteProtocolError(f"{offer.type!r}, offered for {offer.topic}, is not a message type")
+        for source in message.removed:
+            _check_names(source.topic, source.node)
+    elif isinstance(message, Open | Mismatch):
+        _check_names(message.topic, message.node)
+    elif isinstance(message, Opened) and not is_type_name(message.description.type):
+        raise RemoteProtocolError(f"{message.description.type!r} is not a message type")
+
+
+def _check_names(topic: str, node: str) -> None:
+    for name in (topic, node):
+        if not is_global_name(name):
+            raise RemoteProtocolError(f"{name[:200]!r} is not a global ROS name")

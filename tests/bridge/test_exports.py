@@ -1,0 +1,148 @@
+from __future__ import annotations
+
+import pytest
+
+from rmpa.bridge.actions import AddRoute, Connect, Disconnect, RemoveRoute, Send, Warn
+from rmpa.bridge.exports import Exports, LocalSource
+from rmpa.bridge.messages import Advertise, Close, Closed, Description, Offer, Open, Opened, Source
+from rmpa.bridge.policy import Policy
+from rmpa.core import limits
+from rmpa.core.config import PolicySettings
+
+CMD = Source("/cmd", "/joy")
+JOY = LocalSource("sensor_msgs/Joy", "http://127.0.0.1:4000/")
+ABOUT = Description("sensor_msgs/Joy", "5a9ea5f83505693b71e785041e67a8bb", "Header header\n", False)
+
+
+@pytest.fixture
+def exports() -> Exports:
+    return Exports(Policy(PolicySettings(deny=("/secret",))))
+
+
+def test_a_new_link_is_told_all_that_policy_lets_cross(exports: Exports) -> None:
+    exports.graph(
+        {
+            CMD: JOY,
+            Source("/secret", "/joy"): JOY,
+            Source("/rosout", "/joy"): LocalSource("rosgraph_msgs/Log", "http://127.0.0.1:4000/"),
+            Source("/odd", "/joy"): LocalSource("*", "http://127.0.0.1:4000/"),
+        }
+    )
+    assert exports.link_up(1) == [
+        Send(1, Advertise(added=(Offer("/cmd", "/joy", "sensor_msgs/Joy"),), full=True)),
+    ]
+
+
+def test_changes_are_told_to_every_link_and_only_changes(exports: Exports) -> None:
+    exports.link_up(1)
+    exports.link_up(2)
+    change = Advertise(added=(Offer("/cmd", "/joy", "sensor_msgs/Joy"),))
+    assert exports.graph({CMD: JOY}) == [Send(1, change), Send(2, change)]
+    assert exports.graph({CMD: JOY}) == []
+    assert exports.graph({}) == [Send(1, Advertise(removed=(CMD,))), Send(2, Advertise(removed=(CMD,)))]
+
+
+def test_a_changed_type_is_offered_again_and_a_changed_address_is_not(exports: Exports) -> None:
+    exports.link_up(1)
+    exports.graph({CMD: JOY})
+    assert exports.graph({CMD: LocalSource("sensor_msgs/Joy", "http://127.0.0.1:5000/")}) == []
+    assert exports.graph({CMD: LocalSource("std_msgs/Empty", "http://127.0.0.1:5000/")}) == [
+        Send(1, Advertise(added=(Offer("/cmd", "/joy", "std_msgs/Empty"),)))
+    ]
+
+
+def test_nothing_is_connected_before_somebody_asks_and_one_connection_serves_all(exports: Exports) -> None:
+    exports.graph({CMD: JOY})
+    exports.link_up(1)
+    exports.link_up(2)
+    assert exports.opened(1, Open(7, "/cmd", "/joy")) == [Connect(CMD, JOY.type, JOY.uri)]
+    assert exports.opened(2, Open(9, "/cmd", "/joy")) == []
+    assert exports.described(CMD, ABOUT) == [
+        Send(1, Opened(7, ABOUT)),
+        AddRoute(CMD, 1, 7),
+        Send(2, Opened(9, ABOUT)),
+        AddRoute(CMD, 2, 9),
+    ]
+    assert exports.flowing(CMD) == (1, 2)
+    assert exports.closed(1, Close(7)) == [RemoveRoute(CMD, 1, 7)]
+    assert exports.closed(2, Close(9)) == [RemoveRoute(CMD, 2, 9), Disconnect(CMD)]
+    assert exports.flowing(CMD) == ()
+
+
+def test_a_late_peer_gets_the_known_description_at_once(exports: Exports) -> None:
+    exports.graph({CMD: JOY})
+    exports.link_up(1)
+    exports.link_up(2)
+    exports.opened(1, Open(1, "/cmd", "/joy"))
+    exports.described(CMD, ABOUT)
+    assert exports.opened(2, Open(1, "/cmd", "/joy")) == [Send(2, Opened(1, ABOUT)), AddRoute(CMD, 2, 1)]
+
+
+@pytest.mark.parametrize("topic", ["/nothing", "/secret", "/rosout"])
+def test_what_is_not_offered_is_not_opened(exports: Exports, topic: str) -> None:
+    exports.graph({Source(topic, "/joy"): JOY} if topic != "/nothing" else {})
+    exports.link_up(1)
+    [action] = exports.opened(1, Open(7, topic, "/joy"))
+    assert isinstance(action, Send)
+    assert isinstance(action.message, Closed)
+    assert "policy" in action.message.reason
+
+
+def test_a_lost_publisher_closes_every_route_and_forgets_them(exports: Exports) -> None:
+    exports.graph({CMD: JOY})
+    exports.link_up(1)
+    exports.opened(1, Open(7, "/cmd", "/joy"))
+    exports.described(CMD, ABOUT)
+    assert exports.lost(CMD, "it hung up") == [RemoveRoute(CMD, 1, 7), Send(1, Closed(7, "it hung up"))]
+    assert exports.lost(CMD, "it hung up") == []
+    assert exports.closed(1, Close(7)) == []
+    assert exports.opened(1, Open(7, "/cmd", "/joy")) == [Connect(CMD, JOY.type, JOY.uri)]
+
+
+def test_a_restarted_node_is_left_at_its_old_address(exports: Exports) -> None:
+    exports.graph({CMD: JOY})
+    exports.link_up(1)
+    exports.opened(1, Open(7, "/cmd", "/joy"))
+    exports.described(CMD, ABOUT)
+    assert exports.graph({CMD: LocalSource(JOY.type, "http://127.0.0.1:5000/")}) == [
+        RemoveRoute(CMD, 1, 7),
+        Send(1, Closed(7, "the node has restarted")),
+        Disconnect(CMD),
+    ]
+
+
+def test_a_link_that_falls_takes_its_routes_along(exports: Exports) -> None:
+    exports.graph({CMD: JOY})
+    exports.link_up(1)
+    exports.link_up(2)
+    exports.opened(1, Open(7, "/cmd", "/joy"))
+    exports.opened(2, Open(7, "/cmd", "/joy"))
+    exports.described(CMD, ABOUT)
+    assert exports.link_down(1) == [RemoveRoute(CMD, 1, 7)]
+    assert exports.link_down(2) == [RemoveRoute(CMD, 2, 7), Disconnect(CMD)]
+    assert exports.link_down(2) == []
+
+
+def test_a_route_opened_twice_is_ignored_and_said(exports: Exports) -> None:
+    exports.graph({CMD: JOY})
+    exports.link_up(1)
+    exports.opened(1, Open(7, "/cmd", "/joy"))
+    [action] = exports.opened(1, Open(7, "/cmd", "/joy"))
+    assert isinstance(action, Warn)
+
+
+def test_the_number_of_routes_is_bounded(exports: Exports, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "ROUTES_PER_LINK_MAX", 1)
+    exports.graph({CMD: JOY})
+    exports.link_up(1)
+    exports.opened(1, Open(7, "/cmd", "/joy"))
+    [action] = exports.opened(1, Open(8, "/cmd", "/joy"))
+    assert isinstance(action, Send)
+    assert isinstance(action.message, Closed)
+
+
+def test_too_many_sources_are_cut_and_said(exports: Exports, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "TOPICS_PER_PEER_MAX", 2)
+    actions = exports.graph({Source(f"/t{i}", "/n"): JOY for i in range(3)})
+    assert [type(action) for action in actions] == [Warn]
+    assert len(exports.offered) == 2

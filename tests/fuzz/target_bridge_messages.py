@@ -1,0 +1,23 @@
+"""Control messages between bridges."""
+
+from __future__ import annotations
+
+from rmpa.bridge.messages import decode, encode
+from rmpa.core.errors import RemoteProtocolError
+
+SEEDS: list[bytes] = [
+    b'{"op":"advertise","added":[{"topic":"/cmd","node":"/joy","type":"sensor_msgs/Joy"}],"removed":[],"full":true}',
+    b'{"op":"open","route":7,"topic":"/cmd","node":"/joy"}',
+    b'{"op":"opened","route":7,"description":{"type":"a/B","md5":"5a","definition":"x","latching":true}}',
+    b'{"op":"closed","route":7,"reason":"the node has gone"}',
+    b'{"op":"mismatch","topic":"/cmd","node":"/joy","subscriber":"/base","text":"md5"}',
+]
+
+
+def fuzz(data: bytes) -> None:
+    """Decode; what decodes must survive the way back."""
+    try:
+        message = decode(data)
+    except RemoteProtocolError:
+        return
+    assert decode(encode(message)) == message
