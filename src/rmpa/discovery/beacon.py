@@ -1,0 +1,221 @@
+"""The beacon: what a peer shouts so that others know it is there (docs/design/protocol.md, "Beacons").
+
+Errors that ``Beacon.parse`` raises, all of them the sender's fault::
+
+    RemoteProtocolError
+    ├── LimitExceeded        longer than one packet may be
+    ├── BeaconMalformed      not a beacon, or one that contradicts itself
+    ├── BeaconOtherDomain    of another domain: several may share a network, so this is no fault at all
+    └── BeaconOtherVersion   of another version of this protocol
+
+The first eight bytes are the same in every version, so the last two are told before the rest is looked at.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from ipaddress import IPv4Address
+from typing import Final
+
+from rmpa.core import limits
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+
+MAGIC: Final = b"RMPA"
+VERSION: Final = 1
+
+_PREFIX: Final = struct.Struct(">4sBBH")
+_FIXED: Final = struct.Struct(">4sBBHQ16sIIB")
+_GUID: Final = struct.Struct(">Q")
+_U32: Final = 0xFFFF_FFFF
+
+
+class BeaconKind(IntEnum):
+    """Why a beacon was sent."""
+
+    ANNOUNCE = 1
+    """The sender has just started, or greets an address that it was told of: answer, please."""
+    HEARTBEAT = 2
+    """The sender is still there."""
+    ANSWER = 3
+    """By unicast, to somebody who announced itself; it is not answered."""
+    GOODBYE = 4
+    """The sender leaves."""
+
+
+@dataclass
+class BeaconMalformed(RemoteProtocolError):  # noqa: N818 - the name says what happened, as in core.errors
+    """Bytes that are no beacon."""
+
+    problem: str
+
+    def __str__(self) -> str:
+        """Say what is wrong with it."""
+        return f"malformed beacon: {self.problem}"
+
+
+@dataclass
+class BeaconOtherVersion(RemoteProtocolError):  # noqa: N818
+    """A peer of another version of the protocol."""
+
+    version: int
+
+    def __str__(self) -> str:
+        """Say both versions and what to do."""
+        return f"speaks version {self.version} of the protocol, we speak {VERSION}: update the older one"
+
+
+@dataclass
+class BeaconOtherDomain(RemoteProtocolError):  # noqa: N818
+    """A peer of another domain; counted, and nothing else."""
+
+    domain: int
+
+    def __str__(self) -> str:
+        """Say which domain."""
+        return f"is of domain {self.domain}"
+
+
+def dialable(address: IPv4Address, port: int) -> bool:
+    """Whether one peer can be reached there: no multicast, broadcast or "any" address, no port 0.
+
+    A beacon that named such an address could make its readers shout at a whole network.
+    """
+    high = int(address) >> 24
+    return 0 < high < 224 and port != 0
+
+
+@dataclass(frozen=True, slots=True)
+class Beacon:
+    """One beacon.
+
+    Args:
+        kind: Why it was sent.
+        identity: Who sent it.
+        lease_ms: Milliseconds after which the sender is gone if it is silent and has no link; 32 bits.
+        sequence: Counts the beacons of this instance; 32 bits, wraps.
+        gossip: Peers that the sender knows to be alive, at most ``limits.BEACON_GOSSIP_MAX``.
+
+    Raises:
+        ValueError: A part is out of its range.
+    """
+
+    kind: BeaconKind
+    identity: Identity
+    lease_ms: int
+    sequence: int
+    gossip: tuple[Guid, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.lease_ms <= _U32 and 0 <= self.sequence <= _U32):
+            raise ValueError("lease and sequence have 32 bits")
+        if len(self.identity.addresses) > limits.BEACON_ADDRESSES_MAX:
+            raise ValueError(f"a beacon carries at most {limits.BEACON_ADDRESSES_MAX} addresses")
+        if len(self.gossip) > limits.BEACON_GOSSIP_MAX:
+            raise ValueError(f"a beacon carries at most {limits.BEACON_GOSSIP_MAX} gossiped peers")
+        port = self.identity.guid.port
+        for address in (self.identity.guid.address, *self.identity.addresses):
+            if not dialable(address, port):
+                raise ValueError(f"no peer can be reached at {address}:{port}")
+        for guid in self.gossip:
+            if not dialable(guid.address, guid.port):
+                raise ValueError(f"no gossiped peer can be reached at {guid}")
+
+    @classmethod
+    def parse(cls, data: bytes, domain: int) -> Beacon:
+        """Read one packet.
+
+        Args:
+            data: The whole packet; bytes behind the beacon are for later versions and ignored.
+            domain: The reader's domain id.
+
+        Raises:
+            LimitExceeded: The packet is longer than ``limits.BEACON_MAX_BYTES``.
+            BeaconOtherDomain: The sender is of another domain, whatever its version.
+            BeaconOtherVersion: The sender is of this domain and speaks another version.
+            BeaconMalformed: Anything else is wrong.
+        """
+        _check_prefix(data, domain)
+        if len(data) < _FIXED.size:
+            raise BeaconMalformed(f"only {len(data)} bytes")
+        _, _, kind, _, guid, instance, lease, sequence, name_length = _FIXED.unpack_from(data)
+        name, offset = _take(data, _FIXED.size, name_length, "name")
+        count, offset = _take(data, offset, 1, "number of addresses")
+        if count[0] > limits.BEACON_ADDRESSES_MAX:
+            raise BeaconMalformed(f"{count[0]} addresses")
+        addresses, offset = _take(data, offset, 4 * count[0], "addresses")
+        count, offset = _take(data, offset, 1, "number of gossiped peers")
+        if count[0] > limits.BEACON_GOSSIP_MAX:
+            raise BeaconMalformed(f"{count[0]} gossiped peers")
+        gossip, _ = _take(data, offset, 8 * count[0], "gossip")
+        try:
+            return cls(
+                BeaconKind(kind),
+                Identity(
+                    Guid(guid),
+                    instance,
+                    name.decode("ascii"),
+                    domain,
+                    tuple(IPv4Address(addresses[i : i + 4]) for i in range(0, len(addresses), 4)),
+                ),
+                lease,
+                sequence,
+                tuple(Guid(value) for (value,) in _GUID.iter_unpack(gossip)),
+            )
+        except ValueError as error:
+            raise BeaconMalformed(str(error)) from error
+
+    def serialize(self) -> bytes:
+        """The packet; never longer than ``limits.BEACON_MAX_BYTES``."""
+        identity = self.identity
+        name = identity.name.encode("ascii")
+        return b"".join(
+            (
+                _FIXED.pack(
+                    MAGIC,
+                    VERSION,
+                    self.kind,
+                    identity.domain,
+                    identity.guid.value,
+                    identity.instance,
+                    self.lease_ms,
+                    self.sequence,
+                    len(name),
+                ),
+                name,
+                bytes((len(identity.addresses),)),
+                *(address.packed for address in identity.addresses),
+                bytes((len(self.gossip),)),
+                *(_GUID.pack(guid.value) for guid in self.gossip),
+            )
+        )
+
+    def __str__(self) -> str:
+        """``announce 3 of base (10.0.0.1:40001#7), 2 gossiped``; names are ROS names, so no byte can hurt a log."""
+        gossip = f", {len(self.gossip)} gossiped" if self.gossip else ""
+        return f"{self.kind.name.lower()} {self.sequence} of {self.identity}{gossip}"
+
+
+def _check_prefix(data: bytes, domain: int) -> None:
+    """Refuse by size, magic, domain and version, in this order."""
+    if len(data) > limits.BEACON_MAX_BYTES:
+        raise LimitExceeded("a beacon", len(data), limits.BEACON_MAX_BYTES)
+    if len(data) < _PREFIX.size:
+        raise BeaconMalformed(f"only {len(data)} bytes")
+    magic, version, _, its_domain = _PREFIX.unpack_from(data)
+    if magic != MAGIC:
+        raise BeaconMalformed("does not begin with RMPA")
+    if its_domain != domain:
+        raise BeaconOtherDomain(its_domain)
+    if version != VERSION:
+        raise BeaconOtherVersion(version)
+
+
+def _take(data: bytes, offset: int, length: int, what: str) -> tuple[bytes, int]:
+    end = offset + length
+    if end > len(data):
+        raise BeaconMalformed(f"ends inside its {what}")
+    return data[offset:end], end
