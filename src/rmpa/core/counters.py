@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import logging
 from collections import Counter, OrderedDict
-from typing import Final
+from typing import TYPE_CHECKING
 
 from rmpa.core import limits
 
+if TYPE_CHECKING:
+    import logging
+
 
 class Counters:
-    """Named counts of one room, shown in snapshots: ``beacon.malformed``, ``link.refused.version`` …"""
+    """Named counts of one room, shown in snapshots (``beacon.malformed``, ``link.refused.version``)."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
@@ -34,8 +36,6 @@ class RefusalLog:
         logger: Where the lines go, at WARNING.
         counters: Where every refusal is counted, logged or not.
     """
-
-    _SUPPRESSED: Final = " (%d more like this since the last line)"
 
     def __init__(self, logger: logging.Logger, counters: Counters) -> None:
         self._logger = logger
@@ -62,6 +62,6 @@ class RefusalLog:
         if len(self._last) > limits.LOG_KINDS_MAX:
             self._last.popitem(last=False)
         if suppressed:
-            self._logger.warning("! %s" + self._SUPPRESSED, text, suppressed)
+            self._logger.warning("! %s (%d more like this since the last line)", text, suppressed)
         else:
             self._logger.warning("! %s", text)

@@ -32,7 +32,7 @@ def peer_name_problem(name: str) -> str | None:
 
 def peer_name_from(text: str) -> str:
     """Make the nearest valid peer name of a host name: ``my-robot.local`` gives ``my_robot``."""
-    name = re.sub(r"[^A-Za-z0-9_]", "_", text.split(".")[0])[: limits.PEER_NAME_MAX - 2]
+    name = re.sub(r"[^A-Za-z0-9_]", "_", text.partition(".")[0])[: limits.PEER_NAME_MAX - 2]
     if not name or not name[0].isalpha():
         name = f"m_{name}" if name else "module"
     return name

@@ -53,9 +53,7 @@ def resolve_name(name: str, namespace: str = "/", node: str = "") -> str:
         ValueError: ``name`` is not a legal name.
     """
     if not is_legal_name(name):
-        raise ValueError(
-            f"{name!r} is not a ROS name; allowed are letters, digits, _ and /, after a letter, / or ~"
-        )
+        raise ValueError(f"{name!r} is not a ROS name; allowed are letters, digits, _ and /, after a letter, / or ~")
     if name.startswith("~"):
         resolved = join_names(node or namespace, name[1:].lstrip("/"))
     else:
@@ -65,10 +63,8 @@ def resolve_name(name: str, namespace: str = "/", node: str = "") -> str:
 
 @lru_cache(maxsize=4096)
 def _compile_glob(pattern: str) -> re.Pattern[str]:
-    parts = []
-    for piece in re.split(r"(\*\*|\*|\?)", pattern):
-        parts.append({"**": ".*", "*": "[^/]*", "?": "[^/]"}.get(piece, re.escape(piece)))
-    return re.compile("".join(parts))
+    wild = {"**": ".*", "*": "[^/]*", "?": "[^/]"}
+    return re.compile("".join(wild.get(piece) or re.escape(piece) for piece in re.split(r"(\*\*|\*|\?)", pattern)))
 
 
 def matches(pattern: str, name: str) -> bool:
