@@ -18,6 +18,10 @@ PEER_NAME_MAX: Final = 64
 DOMAIN_MAX: Final = 232
 """Highest domain id: ROS 2's own bound, so that the same ROS_DOMAIN_ID works for both."""
 
+# --- settings -------------------------------------------------------------------------------------------------
+CONFIG_FILE_MAX: Final = 256 * KIB
+"""A settings file; ours is some 4 KB, and finding a line in a huge one takes long."""
+
 # --- discovery ------------------------------------------------------------------------------------------------
 MULTICAST_GROUP: Final = "239.255.82.77"
 """Administratively scoped (RFC 2365), so routers keep it on site; 82.77 is "RM"."""
@@ -101,6 +105,10 @@ HTTP_IDLE_TIMEOUT: Final = 60.0
 """A kept-alive connection without a call; rospy and roscpp reconnect without a word."""
 HTTP_REQUEST_TIMEOUT: Final = 10.0
 """From a request's first byte to its last."""
+XMLRPC_DEPTH_MAX: Final = 256
+"""XML elements inside each other: some eighty arrays in arrays; nobody's parameters come near."""
+XMLRPC_ELEMENTS_MAX: Final = 1_000_000
+"""XML elements in one body: what 8 MiB of short numbers have, at some hundred bytes of memory each."""
 SLAVE_CALL_TIMEOUT: Final = 3.0
 """For one XML-RPC call to a node; a stopped node must not hold the others up."""
 NODE_CHECK_INTERVAL: Final = 5.0
@@ -129,6 +137,13 @@ CONTROL_CLIENTS_MAX: Final = 32
 """Simultaneous clients of the control socket."""
 CONTROL_IDLE_TIMEOUT: Final = 60.0
 """A client that asks nothing for this long is closed."""
+
+CONTROL_CALL_TIMEOUT: Final = 10.0
+"""For one call over the control socket; a stopped agent must not hang the command line."""
+CONTROL_HANDLER_TIMEOUT: Final = 30.0
+"""For the agent's own part of a call."""
+CONTROL_PATH_MAX: Final = 107
+"""Bytes in a UNIX socket's path: Linux's sun_path less its final zero."""
 
 # --- logging --------------------------------------------------------------------------------------------------
 LOG_INTERVAL: Final = 5.0
