@@ -49,6 +49,54 @@ ANSWER_INTERVAL: Final = 0.2
 """At most one unicast answer to one address in this time."""
 INTERFACE_SETTLE: Final = 0.2
 """After a change of interfaces the kernel reports several more; they are read once."""
+INTERFACE_LOOK: Final = 5.0
+"""How often interfaces are read where the kernel does not report changes."""
+BURST_AGAIN_OFFSETS: Final = (0.0, 0.2, 0.6)
+"""The shorter burst after a change of interfaces: most listeners know the peer already."""
+BURST_JITTER: Final = 0.05
+"""Added at random to all but the first beacon of a burst: modules on one power switch start together."""
+HEARTBEAT_JITTER: Final = 0.1
+"""The part of the interval by which a heartbeat may come early, for the same reason."""
+HEARTBEAT_LATE: Final = 6.0
+"""A peer not heard for a heartbeat and a second has missed one: it may be the dead one of two instances."""
+MULTICAST_SILENCE: Final = 11.0
+"""A peer not heard by multicast for two heartbeats and a second gets its heartbeats by unicast."""
+ROSTER_LEASE_MIN: Final = 2.0
+"""A peer that asks for less would come and go with every lost packet."""
+ROSTER_LEASE_MAX: Final = 120.0
+"""A peer that asks for more would haunt the roster."""
+SEAT_VOICES_MAX: Final = 4
+"""Instances remembered for one (address, port): the present one, the last one and two rivals."""
+ANSWER_ADDRESSES_MAX: Final = 1024
+"""Addresses remembered for ``ANSWER_INTERVAL``; the oldest is forgotten first."""
+ANSWERS_PER_SECOND: Final = 500
+"""Over all addresses: forged beacons must not turn a peer into an amplifier; a start of 100 peers stays below."""
+GREETINGS_MAX: Final = 256
+"""Addresses known only by hearsay; further ones wait until there is room."""
+GREETING_FIRST: Final = 0.5
+"""Before the second greeting to an address known by hearsay; then it doubles."""
+GREETING_MAX: Final = 10.0
+"""Between two greetings at the most."""
+GREETING_ATTEMPTS: Final = 6
+"""Unanswered greetings (over some 15 s) after which an address is left alone …"""
+GREETING_FORGET: Final = 60.0
+"""… for this long, even if others still speak of it."""
+SPREAD_INTERVAL: Final = 0.5
+"""News of found peers are gathered this long for those that hear no multicast; the first goes out at once."""
+BEACONS_PER_WAKE: Final = 64
+"""Packets handled before the loop gets its turn again: a flood must not delay data."""
+BEACONS_PER_SOURCE: Final = 200
+"""Packets a second from one address; a host with twenty agents that all start at once stays below."""
+BEACON_SOURCES_MAX: Final = 1024
+"""Source addresses counted for that; the oldest is forgotten first."""
+BEACON_REPEATS: Final = 128
+"""Last packets remembered: one that came over two interfaces is read once."""
+SEED_RESOLVE_INTERVAL: Final = 60.0
+"""A seed's host name is looked up again this often: addresses change."""
+SEED_RETRY_FIRST: Final = 1.0
+"""Before a failed look-up is repeated; then it doubles, for there may be no name server yet."""
+SEED_RETRY_MAX: Final = 30.0
+"""Between two failed look-ups at the most."""
 
 # --- mesh -----------------------------------------------------------------------------------------------------
 LINK_LEASE: Final = 1.0
@@ -91,12 +139,32 @@ TCPROS_HANDSHAKE_TIMEOUT: Final = 10.0
 """For the other side's header; rospy and roscpp wait for ever, and hang for ever."""
 TCPROS_CONNECT_TIMEOUT: Final = 3.0
 """For the TCP connect to a local node."""
+TCPROS_CONNECTIONS_MAX: Final = 1024
+"""Accepted connections of one node: as many subscribers, with room for those that reconnect."""
+TCPROS_HANDSHAKES_MAX: Final = 128
+"""Of these, connections whose header has not come yet (port scanners, stuck nodes)."""
+TCPROS_BACKLOG: Final = 128
+"""Connections that the kernel holds until we accept them: all subscribers of a restarted node come at once."""
+TCPROS_ACCEPT_PAUSE: Final = 0.2
+"""Without accepting, when the process has run out of file descriptors."""
+TCPROS_RETRY_FIRST: Final = 0.1
+"""Before the second attempt to reach a publisher; roscpp's own value."""
+TCPROS_RETRY_MAX: Final = 2.0
+"""Between attempts at the most, as long as the graph lists the publisher."""
+TCP_KEEPALIVE_IDLE: Final = 60
+"""Seconds of silence before the kernel asks whether the other side lives; with the next two roscpp's own values."""
+TCP_KEEPALIVE_INTERVAL: Final = 10
+"""Seconds between such questions."""
+TCP_KEEPALIVE_COUNT: Final = 9
+"""Unanswered questions before the connection is dead."""
 SUBSCRIBER_QUEUE_MESSAGES: Final = 1000
 """Messages that wait for one slow local subscriber; the oldest is dropped beyond it."""
 SUBSCRIBER_QUEUE_BYTES: Final = 32 * MIB
 """The same in bytes; one message always fits."""
 HTTP_BODY_MAX: Final = 8 * MIB
 """An XML-RPC call: parameters with maps and URDFs reach a few MB."""
+HTTP_BODY_INLINE: Final = 256 * KIB
+"""Bodies above this are parsed in a thread: 8 MiB of numbers would hold the loop for seconds."""
 HTTP_HEADERS_MAX: Final = 64 * KIB
 """A request's headers, all together."""
 HTTP_CONNECTIONS_MAX: Final = 512
