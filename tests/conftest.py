@@ -1,0 +1,98 @@
+"""What every test gets: leaks fail the test that made them; what cannot run here is skipped and counted."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import inspect
+import os
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import pytest
+from blockbuster import blockbuster_ctx
+
+from tests.interop import namespaces, ros
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterator
+
+_SETTLE_ROUNDS: Final = 10
+"""Turns of the loop that cancelled tasks and closed transports get before they count as leaked."""
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Put the guards around every coroutine test: named first, they are set up first and torn down last."""
+    if not isinstance(item, pytest.Function) or not inspect.iscoroutinefunction(item.function):
+        return
+    if "aio" in item.path.parts and "no_blocking" not in item.fixturenames:
+        item.fixturenames.insert(0, "no_blocking")
+    item.fixturenames.insert(0, "no_leaks")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip what cannot run here; the probes run only if something asks for them."""
+    for marker, probe in (("ros", ros.why_not), ("netns", namespaces.why_not)):
+        marked = [item for item in items if item.get_closest_marker(marker)]
+        if marked and (reason := probe()):
+            for item in marked:
+                item.add_marker(pytest.mark.skip(reason=reason))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say how many tests were skipped, and why, where nobody overlooks it."""
+    reasons: Counter[str] = Counter()
+    for report in terminalreporter.getreports("skipped"):
+        where = report.longrepr
+        text = where[2] if isinstance(where, tuple) else str(where)
+        reasons[str(text).removeprefix("Skipped: ")] += 1
+    if reasons:
+        terminalreporter.section("not run on this machine", sep="-", yellow=True)
+        for reason, count in reasons.most_common():
+            terminalreporter.line(f"{count} test{'s' if count > 1 else ''} skipped: {reason}")
+
+
+def _open_sockets() -> dict[int, str]:
+    """The inode of each socket that this process holds, by file descriptor."""
+    sockets: dict[int, str] = {}
+    for entry in Path("/proc/self/fd").iterdir():
+        try:
+            target = str(entry.readlink())
+        except OSError:
+            continue
+        if target.startswith("socket:"):
+            sockets[int(entry.name)] = target
+    return sockets
+
+
+@pytest.fixture
+async def no_leaks() -> AsyncIterator[None]:
+    """Fail the test if it leaves a task running or a socket open."""
+    tasks = asyncio.all_tasks()
+    sockets = set(_open_sockets().values())
+    yield
+    for _ in range(_SETTLE_ROUNDS):
+        await asyncio.sleep(0)
+    leaked = [task for task in asyncio.all_tasks() - tasks if task is not asyncio.current_task() and not task.done()]
+    gc.collect()
+    open_still = {fd: inode for fd, inode in _open_sockets().items() if inode not in sockets}
+    if leaked:
+        pytest.fail(f"{len(leaked)} task(s) left running: {[f'{t.get_name()}: {t.get_coro()}' for t in leaked]}")
+    if open_still:
+        pytest.fail(f"{len(open_still)} socket(s) left open: {open_still}")
+
+
+@pytest.fixture
+def no_blocking() -> Iterator[None]:
+    """Raise ``BlockingError`` where code of rmpa blocks the event loop; used by itself in folders named ``aio``."""
+    with blockbuster_ctx("rmpa"):
+        yield
+
+
+@pytest.fixture(autouse=True)
+def clean_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take the user's ROS and rmpa settings away, so that no test depends on them."""
+    for name in list(os.environ):
+        if name.startswith(("ROS_", "RMPA_")) or name == "NOTIFY_SOCKET":
+            monkeypatch.delenv(name)

@@ -1,0 +1,59 @@
+"""Fixtures against real ROS and several hosts; see ``ros``, ``namespaces``, ``agents`` and ``processes``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.interop import namespaces
+from tests.interop.agents import Agent
+from tests.interop.namespaces import MACHINE, Host, Lab
+from tests.interop.ros import Ros, free_port
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+ShellFactory = Callable[..., Ros]
+AgentFactory = Callable[..., Agent]
+
+
+@pytest.fixture(scope="session")
+def _no_stale_namespaces() -> None:
+    namespaces.remove_stale()
+
+
+@pytest.fixture
+def lab(_no_stale_namespaces: None) -> Iterator[Lab]:
+    """An empty set of hosts and networks, gone after the test. Mark the test ``netns``."""
+    with Lab() as made:
+        yield made
+
+
+@pytest.fixture
+def shell(tmp_path: Path) -> Iterator[ShellFactory]:
+    """Make ROS users' shells: ``shell(host)`` or, on the real machine, ``shell(port=...)``. Mark the test ``ros``."""
+    with ExitStack() as stack:
+
+        def make(host: Host = MACHINE, port: int = 0) -> Ros:
+            port = port or (11311 if host.namespace else free_port())
+            return stack.enter_context(Ros(host, tmp_path, port))
+
+        yield make
+
+
+@pytest.fixture
+def agent(tmp_path: Path) -> Iterator[AgentFactory]:
+    """Start agents: ``agent(host, name="base")`` returns when it is ready; options as of ``Agent``."""
+    with ExitStack() as stack:
+
+        def make(host: Host = MACHINE, *, ready: bool = True, **options: object) -> Agent:
+            made = stack.enter_context(Agent(host, tmp_path, **options))  # type: ignore[arg-type]
+            made.start()
+            if ready:
+                made.wait_ready()
+            return made
+
+        yield make

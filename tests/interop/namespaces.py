@@ -1,0 +1,259 @@
+"""Several machines on one: each a network namespace, joined by switches of their own.
+
+::
+
+    with Lab() as lab:
+        a, b = lab.hosts("a", "b")         # 10.77.0.1 and 10.77.0.2 on one switch
+        Process(a.command(["rmpa", "up"]))
+        a.cut()                            # the cable is out
+        a.restore()
+
+A switch lives in a namespace of its own, so that nothing ever appears in the machine's own network and parallel
+runs cannot meet. Names carry our process id; those of dead processes are removed by ``remove_stale``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import itertools
+import os
+import shutil
+import signal
+import subprocess
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Self
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_PREFIX: Final = "rmpa"
+_labs = itertools.count(1)
+
+
+@functools.cache
+def why_not() -> str:
+    """Why network namespaces cannot be made here, or an empty string."""
+    if shutil.which("ip") is None:
+        return "no iproute2 here (apt install iproute2)"
+    if os.geteuid() != 0:
+        return "network namespaces need root"
+    name = f"{_PREFIX}-{os.getpid()}-probe"
+    try:
+        _ip("netns", "add", name)
+        _ip("netns", "del", name)
+    except NetworkError as error:
+        return f"this machine allows no network namespaces ({error})"
+    return ""
+
+
+class NetworkError(RuntimeError):
+    """``ip`` or ``tc`` refused a command."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cable:
+    """One host's connection to one network.
+
+    Args:
+        interface: Its name inside the host.
+        address: Its IPv4 address.
+        switch: The namespace of the network's switch.
+        port: The switch's end.
+    """
+
+    interface: str
+    address: str
+    switch: str
+    port: str
+
+
+@dataclass(slots=True)
+class Host:
+    """A machine: a network namespace, or (with ``namespace`` empty) the real one.
+
+    Args:
+        name: Short, unique in its lab.
+        namespace: The name of its network namespace.
+        cables: Its connections, first the one made first.
+    """
+
+    name: str
+    namespace: str = ""
+    cables: list[Cable] = field(default_factory=list)
+
+    @property
+    def address(self) -> str:
+        """Its first address; 127.0.0.1 for the real machine."""
+        return self.cables[0].address if self.cables else "127.0.0.1"
+
+    def command(self, argv: Sequence[str | Path]) -> list[str]:
+        """The command line that runs ``argv`` on this host; the process becomes ``argv``, its id stays."""
+        inside = [str(part) for part in argv]
+        return ["ip", "netns", "exec", self.namespace, *inside] if self.namespace else inside
+
+    def ip(self, *args: str) -> str:
+        """Run ``ip`` in this host."""
+        return _ip("-n", self.namespace, *args)
+
+    def cut(self, cable: int = 0) -> None:
+        """Pull the cable out at the switch: the host sees its carrier go, as with a real one."""
+        wire = self.cables[cable]
+        _ip("-n", wire.switch, "link", "set", wire.port, "down")
+
+    def restore(self, cable: int = 0) -> None:
+        """Put the cable in again."""
+        wire = self.cables[cable]
+        _ip("-n", wire.switch, "link", "set", wire.port, "up")
+
+    def switch_off(self, cable: int = 0) -> None:
+        """Take the interface down inside the host (its routes go with it)."""
+        self.ip("link", "set", self.cables[cable].interface, "down")
+
+    def switch_on(self, cable: int = 0) -> None:
+        """Take the interface up again."""
+        self.ip("link", "set", self.cables[cable].interface, "up")
+
+    def shape(self, rate: str, *, burst: str = "32kb", latency: str = "50ms", cable: int = 0) -> None:
+        """Limit what this host sends to ``rate`` (as ``tc`` writes it: ``100mbit``) by a token bucket."""
+        device = self.cables[cable].interface
+        limits = ["rate", rate, "burst", burst, "latency", latency]
+        _run(["tc", "-n", self.namespace, "qdisc", "replace", "dev", device, "root", "tbf", *limits])
+
+    def unshape(self, cable: int = 0) -> None:
+        """Take the limit away."""
+        _run(["tc", "-n", self.namespace, "qdisc", "del", "dev", self.cables[cable].interface, "root"])
+
+
+MACHINE: Final = Host("machine")
+"""The real machine, for tests without namespaces."""
+
+
+@dataclass(slots=True)
+class Network:
+    """A switch and the addresses 10.77.``number``.0/24 on it."""
+
+    number: int
+    switch: str
+    _next: int = 1
+
+    def plug(self, host: Host, *, octet: int | None = None) -> Cable:
+        """Connect a host; its interface is ``eth`` with the number of its cable."""
+        octet = octet or self._next
+        self._next = max(self._next, octet) + 1
+        interface, port = f"eth{len(host.cables)}", f"port{octet}"
+        cable = Cable(interface, f"10.77.{self.number}.{octet}", self.switch, port)
+        names = ["link", "add", interface, "netns", host.namespace]
+        _ip(*names, "type", "veth", "peer", "name", port, "netns", self.switch)
+        _ip("-n", self.switch, "link", "set", port, "master", "switch", "up")
+        host.ip("address", "add", f"{cable.address}/24", "brd", "+", "dev", interface)
+        host.ip("link", "set", interface, "up")
+        host.cables.append(cable)
+        return cable
+
+    @property
+    def broadcast(self) -> str:
+        """Its broadcast address."""
+        return f"10.77.{self.number}.255"
+
+
+class Lab:
+    """Hosts and networks that vanish at the end, whatever happened in between, with all that still runs in them."""
+
+    def __init__(self) -> None:
+        self._prefix = f"{_PREFIX}-{os.getpid()}-{next(_labs)}"
+        self._namespaces: list[str] = []
+        self._networks: dict[int, Network] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def network(self, number: int = 0) -> Network:
+        """Network 10.77.``number``.0/24, made when first asked for."""
+        if number not in self._networks:
+            switch = self._namespace(f"switch{number}")
+            _ip("-n", switch, "link", "add", "switch", "type", "bridge", "forward_delay", "0", "mcast_snooping", "0")
+            _ip("-n", switch, "link", "set", "switch", "up")
+            self._networks[number] = Network(number, switch)
+        return self._networks[number]
+
+    def host(self, name: str, *networks: int) -> Host:
+        """A new host, plugged into the networks with these numbers (none: unplugged; see ``hosts``)."""
+        host = Host(name, self._namespace(name))
+        host.ip("link", "set", "lo", "up")
+        for number in networks:
+            self.network(number).plug(host)
+        return host
+
+    def hosts(self, *names: str, network: int = 0) -> list[Host]:
+        """Several hosts on one network."""
+        return [self.host(name, network) for name in names]
+
+    def router(self, first: int, second: int, name: str = "router") -> Host:
+        """A host that forwards between two networks; tell the hosts there by ``route``. No multicast crosses."""
+        router = Host(name, self._namespace(name))
+        router.ip("link", "set", "lo", "up")
+        for number in (first, second):
+            self.network(number).plug(router, octet=254)
+        _run(router.command(["sysctl", "-qw", "net.ipv4.ip_forward=1"]))
+        return router
+
+    def route(self, host: Host, via: Host) -> None:
+        """Make ``via`` the default gateway of ``host``: the router's address on a network they share."""
+        mine = {cable.switch for cable in host.cables}
+        gateway = next(cable.address for cable in via.cables if cable.switch in mine)
+        host.ip("route", "replace", "default", "via", gateway)
+
+    def close(self) -> None:
+        """End what still runs in the namespaces and remove them."""
+        while self._namespaces:
+            _remove(self._namespaces.pop())
+        self._networks.clear()
+
+    def _namespace(self, name: str) -> str:
+        full = f"{self._prefix}-{name}"
+        _ip("netns", "add", full)
+        self._namespaces.append(full)
+        return full
+
+
+def remove_stale() -> list[str]:
+    """Remove namespaces left behind by test runs whose process is gone; return their names."""
+    stale = []
+    for line in _ip("netns", "list").splitlines():
+        name = line.split()[0] if line.strip() else ""
+        prefix, _, rest = name.partition("-")
+        pid = rest.partition("-")[0]
+        if prefix == _PREFIX and pid.isdecimal() and not Path(f"/proc/{pid}").exists():
+            _remove(name)
+            stale.append(name)
+    return stale
+
+
+def _remove(namespace: str) -> None:
+    """Delete one of our namespaces and end the processes inside: a namespace lives on while one is in it."""
+    deadline = time.monotonic() + 5.0
+    with contextlib.suppress(NetworkError):
+        while (pids := _ip("netns", "pids", namespace).split()) and time.monotonic() < deadline:
+            for pid in pids:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(int(pid), signal.SIGKILL)
+            time.sleep(0.02)
+    with contextlib.suppress(NetworkError):
+        _ip("netns", "del", namespace)
+
+
+def _ip(*args: str) -> str:
+    return _run(["ip", *args])
+
+
+def _run(argv: Sequence[str]) -> str:
+    done = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=20)
+    if done.returncode:
+        raise NetworkError(f"{' '.join(argv)}: {done.stderr.strip()}")
+    return done.stdout

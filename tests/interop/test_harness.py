@@ -1,0 +1,210 @@
+"""The harness itself: nodes, shells and labs do what the other tests take for granted."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.interop import namespaces
+from tests.interop.agents import NotifySocket
+from tests.interop.namespaces import Lab
+from tests.interop.processes import Deadline, Process, run
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from tests.interop.conftest import ShellFactory
+
+CLIENTS = ["rospy", "roscpp"]
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("talker", CLIENTS)
+@pytest.mark.parametrize("listener", CLIENTS)
+def test_nodes_agree_on_the_payload(shell: ShellFactory, talker: str, listener: str) -> None:
+    ros = shell()
+    ros.master()
+    heard = ros.node(listener, "listener", topic="/chatter", count=50)
+    heard.wait_event("up")
+    ros.node(talker, "talker", topic="/chatter", rate=200, count=50, size=5000, wait=1)
+    report = heard.wait_event("done")
+    assert (report["bad"], report["gaps"], report["doubled"], report["last"]) == (0, 0, 0, 50)
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("client", CLIENTS)
+def test_echo_node_answers(shell: ShellFactory, client: str) -> None:
+    ros = shell()
+    ros.master()
+    ros.node(client, "echo", topic="/ask", reply="/answer", nodelay=True).wait_event("up")
+    heard = ros.roscpp("listener", topic="/answer", count=5)
+    ros.roscpp("talker", topic="/ask", rate=50)
+    assert heard.wait_event("done")["bad"] == 0
+
+
+@pytest.mark.ros
+def test_latched_talker_reaches_a_late_listener(shell: ShellFactory) -> None:
+    ros = shell()
+    ros.master()
+    ros.rospy("talker", topic="/map", count=1, latch=True).wait_event("done")
+    assert ros.roscpp("listener", topic="/map", count=1).wait_event("done")["last"] == 1
+
+
+@pytest.mark.ros
+def test_roscore_and_tools(shell: ShellFactory) -> None:
+    ros = shell()
+    ros.roscore()
+    assert "/rosout" in ros.tool("rosnode", "list").split()
+
+
+@pytest.mark.netns
+def test_hosts_of_a_lab_reach_each_other_until_the_cable_is_cut(lab: Lab) -> None:
+    a, b = lab.hosts("a", "b")
+    run(a.command(["ping", "-c1", "-W2", b.address])) if _has("ping") else _connect(a, b)
+    b.cut()
+    assert "NO-CARRIER" in b.ip("link", "show", "eth0")
+    b.restore()
+    _connect(a, b)
+
+
+@pytest.mark.netns
+def test_router_joins_two_networks(lab: Lab) -> None:
+    a = lab.host("a", 0)
+    b = lab.host("b", 1)
+    router = lab.router(0, 1)
+    lab.route(a, router)
+    lab.route(b, router)
+    _connect(a, b)
+
+
+@pytest.mark.netns
+def test_shaping_is_set_and_taken_away(lab: Lab) -> None:
+    (a,) = lab.hosts("a")
+    a.shape("10mbit")
+    assert "tbf" in run(a.command(["tc", "qdisc", "show", "dev", "eth0"]))
+    a.unshape()
+    assert "tbf" not in run(a.command(["tc", "qdisc", "show", "dev", "eth0"]))
+
+
+@pytest.mark.netns
+def test_lab_vanishes_with_what_runs_in_it() -> None:
+    with Lab() as lab:
+        (a,) = lab.hosts("a")
+        process = Process(a.command(["sleep", "1000"]))
+    assert process.wait() == -9
+    process.end()
+    assert (
+        a.namespace not in subprocess.run(["ip", "netns", "list"], capture_output=True, text=True, check=True).stdout
+    )
+
+
+@pytest.mark.netns
+def test_stale_namespaces_are_removed_but_not_ours() -> None:
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    stale = f"rmpa-{gone.pid}-1-a"
+    subprocess.run(["ip", "netns", "add", stale], check=True)
+    with Lab() as lab:
+        (mine,) = lab.hosts("mine")
+        removed = namespaces.remove_stale()
+        assert stale in removed
+        assert mine.namespace not in removed
+        mine.ip("link")
+
+
+def test_process_waits_with_a_deadline_and_shows_its_last_lines() -> None:
+    with Process(["sh", "-c", 'echo one; echo \'@ {"event": "up", "n": 3}\'; sleep 100'], name="child") as child:
+        child.wait_for("^one$")
+        assert child.wait_event("up") == {"event": "up", "n": 3}
+        with pytest.raises(Deadline, match=r"child\| one"):
+            child.wait_for("two", timeout=0.05)
+    assert child.returncode == -15
+
+
+def test_process_that_ends_early_fails_the_wait_at_once() -> None:
+    with Process(["sh", "-c", "exit 3"]) as child, pytest.raises(Deadline, match="ended with status 3"):
+        child.wait_for("never")
+
+
+def test_group_of_a_process_ends_with_it() -> None:
+    with Process(["sh", "-c", "sleep 1000 & echo $!; trap '' TERM; wait; wait"]) as child:
+        grandchild = int(child.wait_for(r"^(\d+)$").group(1))
+    state = Path(f"/proc/{grandchild}/stat")
+    assert not state.exists() or state.read_text().split()[2] == "Z"
+
+
+async def test_waits_leave_the_loop_running() -> None:
+    with Process(["sh", "-c", "sleep 0.05; echo late"]) as child:
+        await child.expect("late")
+        assert await child.ended() == 0
+
+
+def test_notify_socket_hears_ready() -> None:
+    notify = NotifySocket()
+    say = f"import socket as s; s.socket(s.AF_UNIX, s.SOCK_DGRAM).sendto(b'READY=1\\nSTATUS=x', {str(notify.path)!r})"
+    with Process(["python3", "-c", f"{say}; import time; time.sleep(60)"]) as child:
+        notify.wait_for("READY=1", child)
+    notify.close()
+
+
+@pytest.mark.parametrize("leak", ["asyncio.get_running_loop().create_task(asyncio.sleep(100))", "made()"])
+def test_leaks_fail_the_test_that_made_them(pytester_like: Callable[[str], str], leak: str) -> None:
+    body = f"""
+        import asyncio, socket
+        kept = []
+        def made():
+            kept.append(socket.socket())
+        async def test_leaking():
+            x = {leak}
+    """
+    assert "left" in pytester_like(body)
+
+
+@pytest.fixture
+def pytester_like(tmp_path: Path) -> Callable[[str], str]:
+    """Run one test file under this tree's conftest in a process of its own; return its output, which must fail."""
+
+    def outcome(body: str) -> str:
+        root = Path(__file__).parents[2]
+        path = tmp_path / "test_probe.py"
+        path.write_text(textwrap.dedent(body), encoding="utf-8")
+        argv: list[str | Path] = [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-q",
+            "-c",
+            root / "pyproject.toml",
+            "--rootdir",
+            root,
+        ]
+        done = subprocess.run(
+            [*argv, "-p", "tests.conftest", "-p", "no:cacheprovider", path],
+            cwd=root,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 1, done.stdout + done.stderr
+        return done.stdout
+
+    return outcome
+
+
+def _has(word: str) -> bool:
+    return shutil.which(word) is not None
+
+
+def _connect(a: namespaces.Host, b: namespaces.Host) -> None:
+    """Open a TCP connection from one host to the other."""
+    serve = "import socket; s = socket.create_server(('', 7000)); print('ready', flush=True); s.accept()"
+    dial = f"import socket; socket.create_connection(('{b.address}', 7000), 10).close()"
+    with Process(b.command(["python3", "-c", serve])) as server:
+        server.wait_for("ready")
+        run(a.command(["python3", "-c", dial]))
