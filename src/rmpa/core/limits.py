@@ -129,6 +129,34 @@ ROUTE_QUEUE_MESSAGES: Final = 1000
 """Messages of one topic that wait for one slow link."""
 DRAIN_TIMEOUT: Final = 1.0
 """How long an agent that ends waits for its last bytes to leave."""
+LINK_LEASE_MIN: Final = 0.1
+"""A peer that claims a shorter lease is held to this one: no network keeps less."""
+LINK_LEASE_MAX: Final = 60.0
+"""A peer that claims a longer lease is held to this one."""
+GHOST_QUIET: Final = 0.5
+"""Two keepalives: a link that was silent for this long does not keep a new instance of its peer out."""
+LINKS_MAX: Final = 512
+"""Peers that are linked at once; as many as a roster holds."""
+LINK_STABLE: Final = 5.0
+"""A link that was up for this long was good: the next loss is retried from the shortest delay."""
+REFUSED_RETRY: Final = 5.0
+"""Before a peer is called again that said no for a reason which waiting seldom mends (version, domain)."""
+FORGET_UNANNOUNCED: Final = ROSTER_LEASE
+"""A peer known by its link alone is called again for this long after the link fell."""
+LINK_URGENT_BYTES: Final = 32 * MIB
+"""Control frames that wait for one link: two of the longest. Beyond it the link is closed: they are never dropped."""
+CLOCK_SAMPLES: Final = 16
+"""Exchanges remembered for a peer's clock: 4 s of keepalives, so a step is seen soon."""
+CLOCK_DRIFT: Final = 15e-6
+"""Seconds a second that clocks drift apart (PHI of RFC 5905)."""
+CLOCK_STEP: Final = 0.001
+"""Seconds by which a wall clock must disagree with the monotonic one to count as set (scheduling makes less)."""
+CLOCK_INTERVAL: Final = 1.0
+"""Between pings on a link whose pongs alone keep it alive."""
+PENDING_PER_ADDRESS: Final = 8
+"""Of the connections without a handshake, those from one address: one scanner must not shut the others out."""
+ACCEPT_PAUSE: Final = 0.5
+"""Before accepting again when the process has no file descriptors left."""
 
 # --- ROS ------------------------------------------------------------------------------------------------------
 TCPROS_HEADER_MAX: Final = 4 * MIB

@@ -48,6 +48,11 @@ class Outbox:
     def __bool__(self) -> bool:
         return bool(self._started or self._urgent or self._by_key)
 
+    def set_bounds(self, max_entries: int, max_bytes: int) -> None:
+        """Change the bounds; they count from the next ``push()`` on."""
+        self._max_entries = max_entries
+        self._max_bytes = max_bytes
+
     @property
     def pending_bytes(self) -> int:
         """Bytes that still wait, urgent ones included."""

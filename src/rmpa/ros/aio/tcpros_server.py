@@ -1,0 +1,192 @@
+"""The listening TCPROS socket of one node: it accepts, reads the header and hands over to the publication."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import itertools
+import logging
+import socket
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.aio.clock import SystemClock
+from rmpa.core.counters import Counters, RefusalLog
+from rmpa.core.errors import StartError
+from rmpa.ros.aio.inbound import Inbound
+from rmpa.ros.tcpros import check_request, printable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from rmpa.core.clock import Clock
+    from rmpa.ros.aio.publication import Publication
+    from rmpa.ros.tcpros import Header
+
+_log = logging.getLogger(__name__)
+_OUT_OF_FILES: Final = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
+
+
+class TcprosServer:
+    """Accepts subscribers for the publications of one node.
+
+    Args:
+        name: The node's name, for the texts.
+        publications: By topic; read at each header, so the owner just changes it.
+        counters: Counts ``tcpros.refused.*``.
+        numbers: Gives each connection its number; shared with the node's outgoing ones.
+        on_service: Takes a connection whose header names a service; without it such a header gets an error.
+        clock: For the rate limit of the log.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        publications: Mapping[str, Publication],
+        *,
+        counters: Counters | None = None,
+        numbers: Iterator[int] | None = None,
+        on_service: Callable[[Inbound], None] | None = None,
+        clock: Clock | None = None,
+    ) -> None:
+        self._name = name
+        self._publications = publications
+        self._refusals = RefusalLog(_log, counters if counters is not None else Counters())
+        self._numbers = numbers if numbers is not None else itertools.count(1)
+        self._on_service = on_service
+        self._clock = clock if clock is not None else SystemClock()
+        self._socket: socket.socket | None = None
+        self._listening = False
+        self._waiting: dict[Inbound, asyncio.TimerHandle] = {}
+        self._accepted: set[Inbound] = set()
+        self._forget_at = 16
+        self._resume: asyncio.TimerHandle | None = None
+        self.address: tuple[str, int] = ("", 0)
+        """Where the socket listens."""
+
+    def start(self, host: str = "127.0.0.1", port: int = 0) -> None:
+        """Listen; ``port`` 0 lets the system choose.
+
+        Raises:
+            StartError: The address cannot be used.
+        """
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        sock = socket.socket(family, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
+        try:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            sock.bind((host, port))
+            sock.listen(limits.TCPROS_BACKLOG)
+        except OSError as error:
+            sock.close()
+            raise StartError(f"TCPROS server of {self._name} at {host}:{port}", str(error)) from error
+        self._socket = sock
+        self.address = sock.getsockname()[:2]
+        self._listen()
+
+    def close(self) -> None:
+        """Stop listening, and close what has not reached a publication; the rest is the publications' own."""
+        self._pause()
+        if self._resume is not None:
+            self._resume.cancel()
+            self._resume = None
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+        waiting, self._waiting = self._waiting, {}
+        for link, timer in waiting.items():
+            timer.cancel()
+            link.close()
+
+    def _listen(self) -> None:
+        self._resume = None
+        if self._socket is not None and not self._listening:
+            asyncio.get_running_loop().add_reader(self._socket.fileno(), self._acceptable)
+            self._listening = True
+
+    def _pause(self) -> None:
+        if self._socket is not None and self._listening:
+            asyncio.get_running_loop().remove_reader(self._socket.fileno())
+            self._listening = False
+
+    def _acceptable(self) -> None:
+        for _ in range(limits.TCPROS_BACKLOG):
+            if self._socket is None:
+                return
+            try:
+                sock, _address = self._socket.accept()
+            except (BlockingIOError, InterruptedError):
+                return
+            except OSError as error:
+                if error.errno in _OUT_OF_FILES:
+                    self._refuse("accept", "", f"cannot accept connections for a moment: {error}")
+                    self._pause()
+                    loop = asyncio.get_running_loop()
+                    self._resume = loop.call_later(limits.TCPROS_ACCEPT_PAUSE, self._listen)
+                    return
+                continue  # that one left before it was accepted
+            self._take(sock)
+
+    def _take(self, sock: socket.socket) -> None:
+        sock.setblocking(False)
+        try:
+            link = Inbound(sock, next(self._numbers), on_header=self._header, on_end=self._ended)
+        except OSError:  # it is gone already
+            sock.close()
+            return
+        if len(self._accepted) >= self._forget_at:
+            self._forget_closed()
+        if len(self._accepted) >= limits.TCPROS_CONNECTIONS_MAX or len(self._waiting) >= limits.TCPROS_HANDSHAKES_MAX:
+            self._refuse("full", link.peer[0], f"{self._name}: too many connections, one from {link.peer[0]} closed")
+            link.close()
+            return
+        self._accepted.add(link)
+        self._waiting[link] = asyncio.get_running_loop().call_later(
+            limits.TCPROS_HANDSHAKE_TIMEOUT, self._timed_out, link
+        )
+
+    def _forget_closed(self) -> None:
+        """Publications do not report back who left, so the closed ones are sorted out each time they may be half."""
+        self._accepted = {link for link in self._accepted if not link.stream.closed}
+        self._forget_at = min(2 * len(self._accepted) + 16, limits.TCPROS_CONNECTIONS_MAX)
+
+    def _header(self, link: Inbound, fields: Header) -> None:
+        timer = self._waiting.pop(link, None)
+        if timer is not None:
+            timer.cancel()
+        if "service" in fields and self._on_service is not None:
+            self._on_service(link)
+            return
+        problem = check_request(fields)
+        if problem is None and "service" in fields:
+            problem = f"[{self._name}] does not offer the service [{printable(fields['service'])}]"
+        if problem is not None:
+            self._refuse("header", link.peer[0], f"{self._name}: a connection from {link.peer[0]}: {problem}")
+            link.refuse(problem)
+            return
+        publication = self._publications.get(fields["topic"])
+        if publication is None:
+            # Quiet: a subscriber that was told of a publisher which left in the meantime.
+            _log.debug("! %s: no publication %s", self._name, printable(fields["topic"]))
+            link.refuse(f"[{self._name}] is not a publisher of [{printable(fields['topic'])}]")
+            return
+        publication.attach(link)
+
+    def _ended(self, link: Inbound, error: Exception | None) -> None:
+        """It left, or broke the protocol, before its header was there; leaving is normal for rospy."""
+        timer = self._waiting.pop(link, None)
+        if timer is not None:
+            timer.cancel()
+        if error is not None and not isinstance(error, OSError):
+            self._refuse("malformed", link.peer[0], f"{self._name}: a connection from {link.peer[0]}: {error}")
+
+    def _timed_out(self, link: Inbound) -> None:
+        del self._waiting[link]
+        link.close()
+        self._refuse(
+            "silent",
+            link.peer[0],
+            f"{self._name}: {link.peer[0]} sent no header within {limits.TCPROS_HANDSHAKE_TIMEOUT:g} s; closed",
+        )
+
+    def _refuse(self, kind: str, who: str, text: str) -> None:
+        self._refusals.refuse(self._clock.now(), f"tcpros.refused.{kind}", who, text)
