@@ -1,0 +1,282 @@
+"""Where settings come from, each source stronger than the one before it.
+
+::
+
+    defaults < ROS environment < rmpa.toml < RMPA_* < flags
+
+Every source gives raw values with the place where they were written; ``core.config_values`` reads them. A
+setting that cannot be used is a ``ConfigError`` that names that place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from ipaddress import AddressValueError, IPv4Address
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+from urllib.parse import urlsplit
+
+from rmpa.core import config_values as values
+from rmpa.core.config import PolicySettings, Settings
+from rmpa.core.config_file import Key, line_of, parse_config
+from rmpa.core.config_values import BadValue, Multicast
+from rmpa.core.errors import ConfigError
+from rmpa.core.identity import peer_name_from
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+FILE_NAME: Final = "rmpa.toml"
+
+
+@dataclass(frozen=True, slots=True)
+class Flags:
+    """What the command line says, as written; ``None`` and empty tuples are flags that were not given."""
+
+    name: str | None = None
+    core_host: str | None = None
+    core_port: str | None = None
+    port: str | None = None
+    domain: str | None = None
+    interfaces: tuple[str, ...] = ()
+    seeds: tuple[str, ...] = ()
+    multicast: str | None = None
+    config: str | None = None
+    log_level: str | None = None
+    log_json: bool | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Loaded:
+    """Settings, and what the user should know about how they came to be (for the log, at warning)."""
+
+    settings: Settings
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Option:
+    """One setting: how it is read, and its name in each source."""
+
+    read: Callable[[object], object]
+    key: Key = ()
+    variable: str = ""
+    flag: str = ""
+    flag_field: str = ""
+
+
+def _list_of(item: Callable[[object], object]) -> Callable[[object], object]:
+    return lambda raw: values.read_list(raw, item)
+
+
+_OPTIONS: Final[Mapping[str, _Option]] = {
+    "name": _Option(values.read_name, ("name",), "RMPA_NAME", "--name", "name"),
+    "domain": _Option(values.read_domain, ("domain",), "RMPA_DOMAIN", "--domain", "domain"),
+    "core_host": _Option(values.read_host, ("core", "host"), "RMPA_CORE_HOST", "--core-host", "core_host"),
+    "core_port": _Option(values.read_port, ("core", "port"), "RMPA_CORE_PORT", "--core-port", "core_port"),
+    "port": _Option(values.read_port_or_any, ("mesh", "port"), "RMPA_PORT", "--port", "port"),
+    "interfaces": _Option(
+        _list_of(values.read_interface), ("discovery", "interfaces"), "RMPA_INTERFACES", "--interface", "interfaces"
+    ),
+    "seeds": _Option(_list_of(values.read_host_port), ("discovery", "seeds"), "RMPA_SEEDS", "--seed", "seeds"),
+    "multicast": _Option(
+        values.read_multicast, ("discovery", "multicast"), "RMPA_MULTICAST", "--multicast", "multicast"
+    ),
+    "allow": _Option(_list_of(values.read_topic_glob), ("bridge", "allow"), "RMPA_ALLOW"),
+    "deny": _Option(_list_of(values.read_topic_glob), ("bridge", "deny"), "RMPA_DENY"),
+    "allow_types": _Option(_list_of(values.read_type_glob), ("bridge", "allow_types"), "RMPA_ALLOW_TYPES"),
+    "deny_types": _Option(_list_of(values.read_type_glob), ("bridge", "deny_types"), "RMPA_DENY_TYPES"),
+    "log_level": _Option(values.read_level, ("log", "level"), "RMPA_LOG_LEVEL", "--log-level", "log_level"),
+    "log_json": _Option(values.read_bool, ("log", "json"), "RMPA_LOG_JSON", "--log-json", "log_json"),
+    "runtime_dir": _Option(values.read_text, variable="RMPA_RUNTIME_DIR"),
+}
+VARIABLES: Final = ("RMPA_CONFIG", "RMPA_AGENT", *(o.variable for o in _OPTIONS.values()))
+"""Every variable of ours."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Given:
+    """A raw value and where it was written; ``text`` is the file's, for a value of a file."""
+
+    raw: object
+    source: str
+    path: Path | None = None
+    text: str = field(default="", repr=False)
+    key: Key = ()
+
+    def read(self, option: _Option) -> object:
+        """Read it, or say what is wrong and where."""
+        try:
+            return option.read(self.raw)
+        except BadValue as error:
+            remedy = error.remedy
+            if error.better is not None:
+                remedy = f"{remedy}; " if remedy else ""
+                remedy += f"did you mean {self._written(error.better)}?"
+            line = None
+            if self.path is not None:
+                line = line_of(self.text, self.key if error.index is None else (*self.key, error.index))
+            raise ConfigError(self.source, error.problem, remedy, self.path, line) from None
+
+    def _written(self, value: str) -> str:
+        if self.path is not None:
+            return f'"{value}"'
+        return f"{self.source} {value}" if self.source.startswith("--") else value
+
+
+_Layer = dict[str, _Given]
+
+
+def load_settings(
+    flags: Flags,
+    environ: Mapping[str, str],
+    *,
+    host_name: str,
+    cwd: Path | None = None,
+) -> Loaded:
+    """Join all sources.
+
+    Args:
+        flags: The command line's.
+        environ: The environment's variables.
+        host_name: This machine's name: the default for the peer's, and to tell whether ROS_MASTER_URI is local.
+        cwd: Where ``rmpa.toml`` is looked for first; the working directory by default.
+
+    Raises:
+        ConfigError: A setting cannot be used, or the file that was named cannot be read.
+    """
+    notes: list[str] = []
+    path = find_config_file(flags.config, environ, cwd or Path())
+    file_layer = _file_layer(path) if path is not None else {}
+    for name, given in file_layer.items():
+        given.read(_OPTIONS[name])  # a mistake in the file is told even where a flag outweighs it
+    layers = [_ros_layer(environ, host_name, notes), file_layer, _variable_layer(environ, notes), _flag_layer(flags)]
+    strongest: _Layer = {}
+    for layer in layers:
+        strongest |= layer
+    chosen = {name: given.read(_OPTIONS[name]) for name, given in strongest.items()}
+    chosen.setdefault("name", peer_name_from(host_name))
+    settings = _assemble(chosen, path)
+    if settings.discovery_port > 65535:
+        source = strongest["multicast"].source if "multicast" in strongest else "domain"
+        problem = f"port {settings.group_port} plus domain {settings.domain} is beyond 65535"
+        raise ConfigError(source, problem, "choose a lower port")
+    return Loaded(settings, tuple(notes))
+
+
+def find_config_file(flag: str | None, environ: Mapping[str, str], cwd: Path) -> Path | None:
+    """The file to read: the one that was named, or the first that is there, or ``None``.
+
+    Raises:
+        ConfigError: A file was named and is not there.
+    """
+    for source, named in (("--config", flag), ("RMPA_CONFIG", environ.get("RMPA_CONFIG"))):
+        if named:
+            path = Path(named).expanduser()
+            if not path.is_file():
+                problem = "is a directory" if path.is_dir() else "no such file"
+                raise ConfigError(source, f"{named}: {problem}", "name a file in TOML, like examples/rmpa.toml")
+            return path
+    config_home = environ.get("XDG_CONFIG_HOME") or (f"{environ['HOME']}/.config" if environ.get("HOME") else "")
+    places = [cwd / FILE_NAME]
+    if config_home:
+        places.append(Path(config_home) / "rmpa" / FILE_NAME)
+    places.append(Path("/etc/rmpa") / FILE_NAME)
+    return next((place for place in places if place.is_file()), None)
+
+
+def _assemble(chosen: dict[str, object], path: Path | None) -> Settings:
+    multicast = chosen.pop("multicast", Multicast())
+    assert isinstance(multicast, Multicast)  # noqa: S101 - what its reader returns
+    policy = {key: chosen.pop(key) for key in ("allow", "deny", "allow_types", "deny_types") if key in chosen}
+    return Settings(
+        **chosen,  # type: ignore[arg-type] # each value came from the reader that its name has in _OPTIONS
+        group=multicast.group,
+        group_port=multicast.port,
+        multicast=multicast.enabled,
+        policy=PolicySettings(**policy),  # type: ignore[arg-type] # likewise
+        config_file=path,
+    )
+
+
+def _file_layer(path: Path) -> _Layer:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ConfigError("the file", f"cannot be read: {error.strerror}", "", path) from None
+    found = parse_config(data, path)
+    text = data.decode("utf-8-sig")
+    return {
+        name: _Given(found[option.key], ".".join(option.key), path, text, option.key)
+        for name, option in _OPTIONS.items()
+        if option.key in found
+    }
+
+
+def _variable_layer(environ: Mapping[str, str], notes: list[str]) -> _Layer:
+    for variable in sorted(environ):
+        if variable.startswith("RMPA_") and variable not in VARIABLES:
+            near = values.did_you_mean(variable, VARIABLES)
+            notes.append(f"{variable} is not a variable of ours" + (f"; did you mean {near}?" if near else ""))
+    return {
+        name: _Given(environ[option.variable], option.variable)
+        for name, option in _OPTIONS.items()
+        if environ.get(option.variable)
+    }
+
+
+def _flag_layer(flags: Flags) -> _Layer:
+    layer: _Layer = {}
+    for name, option in _OPTIONS.items():
+        raw = getattr(flags, option.flag_field) if option.flag_field else None
+        if raw is not None and raw != ():
+            layer[name] = _Given(raw, option.flag)
+    return layer
+
+
+def _ros_layer(environ: Mapping[str, str], host_name: str, notes: list[str]) -> _Layer:
+    layer: _Layer = {}
+    if environ.get("ROS_DOMAIN_ID"):
+        layer["domain"] = _Given(environ["ROS_DOMAIN_ID"], "ROS_DOMAIN_ID")
+    reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
+    known = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
+    if reach and reach not in known:
+        near = values.did_you_mean(reach, known)
+        remedy = f"did you mean {near}?" if near else f"it is one of {', '.join(known)}"
+        raise ConfigError("ROS_AUTOMATIC_DISCOVERY_RANGE", f"{reach!r} is not a range", remedy)
+    if reach == "OFF":
+        layer["multicast"] = _Given(False, "ROS_AUTOMATIC_DISCOVERY_RANGE")
+    elif reach == "LOCALHOST":
+        layer["interfaces"] = _Given(["lo"], "ROS_AUTOMATIC_DISCOVERY_RANGE")
+    static = environ.get("ROS_STATIC_PEERS", "")
+    if static and reach == "OFF":
+        notes.append("ROS_STATIC_PEERS is ignored, as in ROS 2: ROS_AUTOMATIC_DISCOVERY_RANGE is OFF")
+    elif static:
+        layer["seeds"] = _Given([p.strip() for p in static.split(";") if p.strip()], "ROS_STATIC_PEERS")
+    uri = environ.get("ROS_MASTER_URI", "")
+    if uri:
+        port = _local_master_port(uri, environ, host_name, notes)
+        if port is not None:
+            layer["core_port"] = _Given(port, "ROS_MASTER_URI")
+    return layer
+
+
+def _local_master_port(uri: str, environ: Mapping[str, str], host_name: str, notes: list[str]) -> int | None:
+    """The port of ROS_MASTER_URI where its host is this machine."""
+    parts = urlsplit(uri) if "://" in uri else None
+    try:
+        host, port = (parts.hostname, parts.port) if parts else (None, None)
+    except ValueError:
+        host, port = None, None
+    if not host or port is None:
+        notes.append(f"ROS_MASTER_URI={uri} is ignored: one looks like http://localhost:11311")
+        return None
+    own = {"localhost", host_name.lower(), host_name.partition(".")[0].lower()}
+    own |= {environ[name].lower() for name in ("ROS_HOSTNAME", "ROS_IP") if environ.get(name)}
+    try:
+        local = IPv4Address(host).is_loopback or host in own
+    except AddressValueError:
+        local = host in own
+    if not local:
+        notes.append(f"ROS_MASTER_URI={uri} names another machine and is ignored: this one gets a core of its own")
+    return port if local else None
