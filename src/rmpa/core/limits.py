@@ -146,11 +146,12 @@ FORGET_UNANNOUNCED: Final = ROSTER_LEASE
 LINK_URGENT_BYTES: Final = 32 * MIB
 """Control frames that wait for one link: two of the longest. Beyond it the link is closed: they are never dropped."""
 CLOCK_SAMPLES: Final = 16
-"""Exchanges remembered for a peer's clock: 4 s of keepalives, so a step is seen soon."""
+"""Exchanges remembered for a peer's clock: 4 to 16 s of keepalives; an old one says little (CLOCK_DRIFT)."""
 CLOCK_DRIFT: Final = 15e-6
 """Seconds a second that clocks drift apart (PHI of RFC 5905)."""
-CLOCK_STEP: Final = 0.001
-"""Seconds by which a wall clock must disagree with the monotonic one to count as set (scheduling makes less)."""
+CLOCK_STEP: Final = 0.05
+"""Seconds by which our wall clock must disagree with the monotonic one to count as set; less shows as a
+contradiction between two exchanges."""
 CLOCK_INTERVAL: Final = 1.0
 """Between pings on a link whose pongs alone keep it alive."""
 PENDING_PER_ADDRESS: Final = 8

@@ -1,0 +1,186 @@
+"""What the roster tells (events) and what it wants sent (outputs)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rmpa.core.guid import Guid
+    from rmpa.core.identity import Identity
+    from rmpa.discovery.beacon import Beacon
+
+Address = tuple[str, int]
+"""A numeric IPv4 address and a UDP port, as sockets want it."""
+
+
+class Heard(Enum):
+    """How a peer was heard."""
+
+    MULTICAST = "multicast"
+    UNICAST = "unicast"
+    GOSSIP = "gossip"
+    """It answered a greeting to an address that another peer had passed on."""
+    LINK = "link"
+
+
+class LossReason(Enum):
+    """Why a peer left the roster."""
+
+    SILENCE = "silent for its lease"
+    GOODBYE = "said goodbye"
+    CONFLICT = "another live peer has its GUID address"
+
+
+class ConflictKind(Enum):
+    """What two live peers have in common though they must not."""
+
+    GUID = "guid"
+    OWN_GUID = "own guid"
+    NAME = "name"
+
+
+@dataclass(frozen=True, slots=True)
+class PeerFound:
+    """A peer is in the roster now.
+
+    Args:
+        identity: What it says of itself.
+        source: Where its first packet came from; ``None`` if a link brought it.
+        heard: How it was found.
+    """
+
+    identity: Identity
+    source: Address | None
+    heard: Heard
+
+    @property
+    def guid(self) -> Guid:
+        """The peer's GUID."""
+        return self.identity.guid
+
+
+@dataclass(frozen=True, slots=True)
+class PeerChanged:
+    """The same run of a peer says something else of itself: addresses, name."""
+
+    identity: Identity
+    previous: Identity
+
+    @property
+    def guid(self) -> Guid:
+        """The peer's GUID as it is now."""
+        return self.identity.guid
+
+
+@dataclass(frozen=True, slots=True)
+class PeerRestarted:
+    """Another run of an agent has the place of ``previous``, which is gone."""
+
+    identity: Identity
+    previous: Identity
+    source: Address | None
+
+    @property
+    def guid(self) -> Guid:
+        """The new run's GUID."""
+        return self.identity.guid
+
+
+@dataclass(frozen=True, slots=True)
+class PeerLost:
+    """A peer is no longer in the roster."""
+
+    identity: Identity
+    reason: LossReason
+
+    @property
+    def guid(self) -> Guid:
+        """The GUID it had."""
+        return self.identity.guid
+
+
+@dataclass(frozen=True, slots=True)
+class Conflict:
+    """Two live peers claim one thing. ``str`` says what to do; told once until it clears.
+
+    Args:
+        kind: What they share.
+        identity: The one heard now.
+        other: The one that was there; our own identity for ``OWN_GUID`` and perhaps for ``NAME``.
+    """
+
+    kind: ConflictKind
+    identity: Identity
+    other: Identity
+
+    def __str__(self) -> str:
+        """What happened, where, and what to do."""
+        host, port = self.identity.guid.endpoint
+        if self.kind is ConflictKind.NAME:
+            return (
+                f"two peers are named {self.identity.name}: {self.identity.guid} and {self.other.guid}; "
+                "rename one: --name"
+            )
+        if self.kind is ConflictKind.OWN_GUID:
+            what = f"the live peer {self.identity.name} has our own GUID address {host}:{port}"
+        else:
+            what = f"two live peers share one GUID address {host}:{port}: {self.identity.name} and {self.other.name}"
+        return f"{what}; give one of them another --port, or fix the NAT between them"
+
+
+@dataclass(frozen=True, slots=True)
+class ConflictCleared:
+    """Only one of the two peers of a ``Conflict`` over a GUID address is left."""
+
+    kind: ConflictKind
+    identity: Identity
+
+
+Event = PeerFound | PeerChanged | PeerRestarted | PeerLost | Conflict | ConflictCleared
+
+
+@dataclass(frozen=True, slots=True)
+class SendMulticast:
+    """Send to the group, on every usable interface."""
+
+    beacon: Beacon
+
+
+@dataclass(frozen=True, slots=True)
+class SendUnicast:
+    """Send to one address."""
+
+    beacon: Beacon
+    address: Address
+
+
+Output = SendMulticast | SendUnicast
+
+
+@dataclass(frozen=True, slots=True)
+class PeerView:
+    """One line of the roster, for people.
+
+    Args:
+        identity: What the peer says of itself.
+        since: When it was found, in seconds of the roster's clock.
+        heard: When it was last heard by beacon or had a link, on the same clock.
+        found_by: How it was found.
+        heard_by: How it was last heard.
+        source: Where its last packet came from, if there was one.
+        linked: Whether it has a link.
+        conflicts: What it shares with others though it must not, ready to read.
+        present: ``False`` while a conflict keeps it out.
+    """
+
+    identity: Identity
+    since: float
+    heard: float
+    found_by: Heard
+    heard_by: Heard
+    source: Address | None
+    linked: bool
+    conflicts: tuple[str, ...]
+    present: bool

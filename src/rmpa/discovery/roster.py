@@ -1,0 +1,512 @@
+"""The roster machine: who is there, told from beacons and links alone (paper, section 4.3). Pure.
+
+Feed it with ``start``, ``receive``, ``link_up``, ``link_down``, ``interfaces_changed``, ``set_seeds`` and
+``handle_timer``; after each of them take ``outputs()`` (what to send) and ``events()`` (what to tell).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.clock import earliest
+from rmpa.core.counters import Counters
+from rmpa.core.identity import Identity
+from rmpa.discovery.beacon import Beacon, BeaconKind
+from rmpa.discovery.events import (
+    Address,
+    Conflict,
+    ConflictCleared,
+    ConflictKind,
+    Event,
+    Heard,
+    LossReason,
+    Output,
+    PeerChanged,
+    PeerFound,
+    PeerLost,
+    PeerRestarted,
+    PeerView,
+    SendMulticast,
+    SendUnicast,
+)
+from rmpa.discovery.greeting import AnswerLimit, Greetings
+from rmpa.discovery.seat import Seat, Verdict, Voice
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+    from ipaddress import IPv4Address
+
+    from rmpa.core.guid import Guid
+
+_NEVER: Final = float("-inf")
+
+
+class Roster:
+    """Who is there.
+
+    Args:
+        identity: Our own.
+        rng: Uniform numbers in [0, 1), for jitter; seeded by simulations.
+        multicast: Whether to send to the group at all.
+        lease: Seconds after which others may count us as gone.
+        counters: Where refusals are counted.
+    """
+
+    def __init__(
+        self,
+        identity: Identity,
+        *,
+        rng: Callable[[], float],
+        multicast: bool = True,
+        lease: float = limits.ROSTER_LEASE,
+        counters: Counters | None = None,
+    ) -> None:
+        self.counters = counters if counters is not None else Counters()
+        self._own = identity
+        self._rng = rng
+        self._multicast = multicast
+        self._lease_ms = round(lease * 1000)
+        self._seats: dict[int, Seat] = {}
+        self._answers = AnswerLimit()
+        self._greetings = Greetings(rng)
+        self._seeds: tuple[Address, ...] = ()
+        self._burst: list[float] = []
+        self._heartbeat_at: float | None = None
+        self._spread_at: float | None = None
+        self._spread_last = _NEVER
+        self._sequence = 0
+        self._gossip_turn = 0
+        self._closed = False
+        self._outputs: list[Output] = []
+        self._events: list[Event] = []
+
+    # --- what drives it ---------------------------------------------------------------------------------------
+
+    def start(self, now: float) -> None:
+        """Announce ourselves: a burst, then silence but for the heartbeat."""
+        own = Voice(self._own, now, now, limits.ROSTER_LEASE, Heard.LINK, Heard.LINK, linked=True)
+        self._seats[_key(self._own.guid)] = Seat(own, own=True)
+        self._burst = self._burst_times(now, limits.BURST_OFFSETS)
+        self._heartbeat_at = self._next_heartbeat(now)
+        self.handle_timer(now)
+
+    def receive(self, beacon: Beacon, source: Address, now: float, *, multicast: bool) -> None:
+        """Take in one beacon.
+
+        Args:
+            beacon: As parsed; of our domain.
+            source: The packet's source address and port.
+            now: Monotonic seconds.
+            multicast: Whether it came to the group (else: to our own port).
+        """
+        identity = beacon.identity
+        if self._closed or identity.instance == self._own.instance:
+            self.counters.add("beacon.echo")
+            return
+        key = _key(identity.guid)
+        seat = self._seats.get(key)
+        if seat is None:
+            if len(self._seats) >= limits.ROSTER_PEERS_MAX:
+                self.counters.add("roster.full")
+                return
+            seat = self._seats[key] = Seat()
+        previous = seat.current.identity if seat.current is not None else None
+        verdict = seat.hear(beacon, now, source, multicast=multicast)
+        greeted = [self._greetings.heard(address) for address in {identity.guid.endpoint, source}]
+        self._judge(seat, verdict, now, previous=previous, source=source)
+        if verdict in {Verdict.NEW, Verdict.RESTARTED} and not multicast and seat.current is not None:
+            self._presume(seat.current, beacon, source, now, greeted=any(greeted))
+        if verdict is Verdict.STALE:
+            self.counters.add("beacon.late")
+        elif verdict in {Verdict.NEW, Verdict.RESTARTED, Verdict.KNOWN, Verdict.CHANGED}:
+            self._answer(seat, verdict, beacon, now, multicast=multicast)
+            self._hearsay(beacon, now)
+        self._drop_if_empty(key)
+
+    def link_up(self, identity: Identity, now: float, source: Address | None = None) -> None:
+        """A link to this peer is up: it is in the roster for as long as the link is, however silent.
+
+        Args:
+            identity: As its handshake said.
+            now: Monotonic seconds.
+            source: Where its beacons can be sent to, if that is known to differ from its GUID's endpoint.
+        """
+        key = _key(identity.guid)
+        seat = self._seats.get(key)
+        if seat is None:
+            if len(self._seats) >= limits.ROSTER_PEERS_MAX and not self._evict():
+                self.counters.add("roster.full")
+                return
+            seat = self._seats[key] = Seat()
+        if seat.own:
+            self.counters.add("roster.own_link")
+            return
+        previous = seat.current.identity if seat.current is not None else None
+        verdict = seat.link_up(identity, now)
+        if source is not None and seat.current is not None:
+            seat.current.source = source
+        self._greetings.heard(identity.guid.endpoint)
+        self._judge(seat, verdict, now, previous=previous, source=source)
+        if not seat.present:
+            self._found(seat, now)
+
+    def link_down(self, guid: Guid, now: float, instance: bytes | None = None) -> None:
+        """The link to this peer fell: from now on its silence counts.
+
+        Args:
+            guid: Whose link.
+            now: Monotonic seconds.
+            instance: Which run's; a link of a run that was replaced meanwhile changes nothing.
+        """
+        key = _key(guid)
+        seat = self._seats.get(key)
+        if seat is None or seat.own or seat.current is None:
+            return
+        previous = seat.current.identity
+        if instance is not None and previous.instance != instance:
+            return
+        verdict = seat.link_down(now)
+        if verdict is Verdict.CONFLICT:
+            self._lost(seat, LossReason.CONFLICT)
+            return
+        source = seat.current.source
+        self._judge(seat, verdict, now, previous=previous, source=source)
+        if verdict is Verdict.RESTARTED:
+            self._send_answer(seat.current, now)
+        self._drop_if_empty(key)
+
+    def interfaces_changed(self, now: float, addresses: tuple[IPv4Address, ...] | None = None) -> None:
+        """Interfaces came or went: announce ourselves again, with our present addresses if they are given."""
+        if self._closed:
+            return
+        if addresses is not None:
+            own = self._own
+            self._own = Identity(own.guid, own.instance, own.name, own.domain, addresses)
+        self._burst = self._burst_times(now, limits.BURST_AGAIN_OFFSETS)
+        self.handle_timer(now)
+
+    def set_seeds(self, seeds: Iterable[Address]) -> None:
+        """Greet these numeric addresses now and with each heartbeat; replaces the former ones."""
+        known = self._seeds
+        self._seeds = tuple(dict.fromkeys(seeds))
+        if self._heartbeat_at is not None:
+            for address in self._seeds:
+                if address not in known:
+                    self._send(BeaconKind.ANNOUNCE, address)
+
+    def goodbye(self, now: float) -> None:
+        """Say that we leave; nothing is sent or taken in afterwards."""
+        if self._closed or self._heartbeat_at is None:
+            return
+        if self._multicast:
+            self._outputs.append(SendMulticast(self._beacon(BeaconKind.GOODBYE)))
+        for voice in self._unheard_by_multicast(now):
+            for address in _addresses(voice):
+                self._send(BeaconKind.GOODBYE, address)
+        self._closed = True
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` wants to be called, in the clock's seconds."""
+        if self._closed:
+            return None
+        return earliest(
+            self._heartbeat_at,
+            self._spread_at,
+            self._burst[0] if self._burst else None,
+            self._greetings.next_timer(),
+            *(seat.next_timer() for seat in self._seats.values()),
+        )
+
+    def handle_timer(self, now: float) -> None:
+        """Do what is due."""
+        if self._closed or self._heartbeat_at is None:
+            return
+        self._leases(now)
+        if self._burst and self._burst[0] <= now:
+            self._burst = [at for at in self._burst if at > now]
+            self._shout(BeaconKind.ANNOUNCE, now)
+            for address in self._seeds:
+                self._send(BeaconKind.ANNOUNCE, address)
+        if self._heartbeat_at <= now:
+            self._heartbeat_at = self._next_heartbeat(now)
+            self._shout(BeaconKind.HEARTBEAT, now)
+            self._whisper(now)
+            met = {address for voice in self._present() for address in _addresses(voice)}
+            for address in self._seeds:
+                if address not in met:
+                    self._send(BeaconKind.ANNOUNCE, address)
+        if self._spread_at is not None and self._spread_at <= now:
+            self._spread(now)
+        for address in self._greetings.due(now):
+            self._send(BeaconKind.ANNOUNCE, address)
+
+    # --- what it says -----------------------------------------------------------------------------------------
+
+    def outputs(self) -> list[Output]:
+        """What to send, in order; taken out."""
+        taken, self._outputs = self._outputs, []
+        return taken
+
+    def events(self) -> list[Event]:
+        """What happened, in order; taken out."""
+        taken, self._events = self._events, []
+        return taken
+
+    def peers(self) -> tuple[PeerView, ...]:
+        """All peers in GUID order, those that a conflict keeps out included."""
+        return tuple(
+            self._view(seat, voice)
+            for seat in self._ordered()
+            for voice in [seat.current, *(seat.rivals() if seat.conflict else [])]
+            if voice is not None and not (seat.own and voice is seat.current)
+        )
+
+    @property
+    def identity(self) -> Identity:
+        """Our own, as the next beacon will say it."""
+        return self._own
+
+    # --- verdicts to events -----------------------------------------------------------------------------------
+
+    def _judge(
+        self, seat: Seat, verdict: Verdict, now: float, *, previous: Identity | None, source: Address | None
+    ) -> None:
+        current = seat.current
+        if current is None:
+            return
+        if verdict is Verdict.NEW:
+            self._found(seat, now)
+        elif verdict is Verdict.CHANGED and previous is not None and seat.present:
+            self._events.append(PeerChanged(current.identity, previous))
+            if current.identity.name != previous.name:
+                self._check_name(seat, current.identity)
+        elif verdict is Verdict.RESTARTED and previous is not None:
+            if seat.present:
+                self._events.append(PeerRestarted(current.identity, previous, source))
+                self._check_name(seat, current.identity)
+                self._news(now)
+            elif not seat.conflict:
+                self._found(seat, now)
+        elif verdict is Verdict.LEAVING and not current.linked:
+            self._lost(seat, LossReason.GOODBYE)
+            seat.vacate()
+            self._settle(seat, now)
+        elif verdict is Verdict.CONFLICT:
+            kind = ConflictKind.OWN_GUID if seat.own else ConflictKind.GUID
+            rival = max(seat.rivals(), key=lambda v: v.heard)
+            self._events.append(Conflict(kind, rival.identity, current.identity))
+            if not current.linked:
+                self._lost(seat, LossReason.CONFLICT)
+        elif verdict is Verdict.WAITING:
+            self._settle(seat, now)
+
+    def _found(self, seat: Seat, now: float) -> None:
+        voice = seat.current
+        if voice is None or seat.own:
+            return
+        seat.present = True
+        voice.since = now
+        self._events.append(PeerFound(voice.identity, voice.source, voice.found_by))
+        self._check_name(seat, voice.identity)
+        self._news(now)
+
+    def _lost(self, seat: Seat, reason: LossReason) -> None:
+        if seat.present and seat.current is not None:
+            seat.present = False
+            self._events.append(PeerLost(seat.current.identity, reason))
+
+    def _check_name(self, seat: Seat, identity: Identity) -> None:
+        for other in self._namesakes(seat, identity):
+            self._events.append(Conflict(ConflictKind.NAME, identity, other))
+            return
+
+    def _namesakes(self, seat: Seat, identity: Identity) -> list[Identity]:
+        return [
+            other.current.identity
+            for other in self._ordered()
+            if other is not seat
+            and other.current is not None
+            and (other.present or other.own)
+            and other.current.identity.name == identity.name
+        ]
+
+    def _settle(self, seat: Seat, now: float) -> None:
+        """After somebody of this seat fell silent or left: is a conflict over?"""
+        seat.forget(now)
+        if seat.conflict and seat.current is not None and not seat.rivals():
+            seat.conflict = False
+            kind = ConflictKind.OWN_GUID if seat.own else ConflictKind.GUID
+            self._events.append(ConflictCleared(kind, seat.current.identity))
+            if not seat.present:
+                self._found(seat, now)
+                if not seat.own:
+                    self._send_answer(seat.current, now)
+
+    def _leases(self, now: float) -> None:
+        for key in sorted(self._seats):
+            seat = self._seats[key]
+            timer = seat.next_timer()
+            if timer is None or timer > now:
+                continue
+            voice = seat.current
+            if voice is not None and not voice.linked and voice.deadline <= now:
+                self._lost(seat, LossReason.SILENCE)
+                seat.vacate()
+                if voice.multicast_at + limits.MULTICAST_SILENCE < now:
+                    # No multicast will bring it back by itself once the network heals.
+                    self._greetings.learn(voice.identity.guid.endpoint, now)
+            self._settle(seat, now)
+            self._drop_if_empty(key)
+
+    def _drop_if_empty(self, key: int) -> None:
+        seat = self._seats[key]
+        if seat.current is None and not seat.others:
+            del self._seats[key]
+
+    def _evict(self) -> bool:
+        """Make room for a linked peer: the one that is silent for longest has no link to prove that it exists."""
+        unlinked = [
+            (seat.current.heard if seat.current is not None else _NEVER, key)
+            for key, seat in self._seats.items()
+            if seat.current is None or not seat.current.linked
+        ]
+        if not unlinked:
+            return False
+        _, key = min(unlinked)
+        self._lost(self._seats.pop(key), LossReason.SILENCE)
+        return True
+
+    # --- sending ----------------------------------------------------------------------------------------------
+
+    def _beacon(self, kind: BeaconKind, gossip: tuple[Guid, ...] = ()) -> Beacon:
+        self._sequence = (self._sequence + 1) & 0xFFFF_FFFF
+        return Beacon(kind, self._own, self._lease_ms, self._sequence, gossip)
+
+    def _send(self, kind: BeaconKind, address: Address, gossip: tuple[Guid, ...] = ()) -> None:
+        if not self._closed:
+            self._outputs.append(SendUnicast(self._beacon(kind, gossip), address))
+
+    def _shout(self, kind: BeaconKind, now: float) -> None:
+        """Multicast, with those that multicast does not bring to the others."""
+        if self._multicast:
+            gossip = self._gossip(self._unheard_by_multicast(now), None)
+            self._outputs.append(SendMulticast(self._beacon(kind, gossip)))
+
+    def _whisper(self, now: float) -> None:
+        """The heartbeat, and all we know, to each peer that multicast does not join with us."""
+        for voice in self._unheard_by_multicast(now):
+            gossip = self._gossip(self._present(), voice)
+            for address in _addresses(voice):
+                self._send(BeaconKind.HEARTBEAT, address, gossip)
+
+    def _spread(self, now: float) -> None:
+        self._spread_at = None
+        self._spread_last = now
+        self._whisper(now)
+        if self._unheard_by_multicast(now):
+            self._shout(BeaconKind.HEARTBEAT, now)
+
+    def _news(self, now: float) -> None:
+        """Somebody was found: let those know who cannot hear it themselves."""
+        if self._spread_at is None and self._heartbeat_at is not None and len(self._present()) > 1:
+            self._spread_at = max(now, self._spread_last + limits.SPREAD_INTERVAL)
+
+    def _answer(self, seat: Seat, verdict: Verdict, beacon: Beacon, now: float, *, multicast: bool) -> None:
+        """Tell the sender of us if it does not know us, or may not."""
+        voice = seat.current
+        if voice is None or voice.linked or seat.conflict or beacon.kind is BeaconKind.ANSWER:
+            return
+        unknown = verdict in {Verdict.NEW, Verdict.RESTARTED}
+        # A heartbeat by unicast says that its sender hears no multicast of ours; if we hear none of its either
+        # our own heartbeat goes there by unicast anyway.
+        deaf = not multicast and now - voice.multicast_at <= limits.MULTICAST_SILENCE
+        if unknown or deaf or beacon.kind is BeaconKind.ANNOUNCE:
+            self._send_answer(voice, now)
+
+    def _send_answer(self, voice: Voice, now: float) -> None:
+        gossip = self._gossip(self._present(), voice)
+        for address in _addresses(voice):
+            if self._answers.allows(address, now):
+                self._send(BeaconKind.ANSWER, address, gossip)
+            else:
+                self.counters.add("beacon.answer_limited")
+
+    def _presume(self, voice: Voice, beacon: Beacon, source: Address, now: float, *, greeted: bool) -> None:
+        """Whoever answers without having been greeted has heard our multicast: expect to hear its, for a while."""
+        if greeted:
+            voice.found_by = Heard.GOSSIP
+        elif beacon.kind is BeaconKind.ANSWER and self._multicast and source not in self._seeds:
+            voice.multicast_at = now - limits.HEARTBEAT_INTERVAL
+
+    def _hearsay(self, beacon: Beacon, now: float) -> None:
+        """Greet those whom the sender knows and we do not; only their own word puts them into the roster."""
+        for guid in beacon.gossip:
+            if _key(guid) in self._seats or (guid.address.is_loopback and not self._own.guid.address.is_loopback):
+                continue
+            if not self._greetings.learn(guid.endpoint, now):
+                self.counters.add("gossip.full")
+        for address in self._greetings.due(now):
+            self._send(BeaconKind.ANNOUNCE, address)
+
+    def _gossip(self, voices: list[Voice], to: Voice | None) -> tuple[Guid, ...]:
+        """GUIDs to pass on, in order; where they are too many for one beacon, in turn."""
+        near = to.identity.guid.address.is_loopback if to is not None else self._own.guid.address.is_loopback
+        guids = [v.identity.guid for v in voices if v is not to and (near or not v.identity.guid.address.is_loopback)]
+        most = limits.BEACON_GOSSIP_MAX
+        if len(guids) <= most:
+            return tuple(guids)
+        self._gossip_turn = (self._gossip_turn + most) % len(guids)
+        return tuple((guids[self._gossip_turn :] + guids)[:most])
+
+    # --- small reads ------------------------------------------------------------------------------------------
+
+    def _ordered(self) -> list[Seat]:
+        return [self._seats[key] for key in sorted(self._seats)]
+
+    def _present(self) -> list[Voice]:
+        return [s.current for s in self._ordered() if s.present and s.current is not None]
+
+    def _unheard_by_multicast(self, now: float) -> list[Voice]:
+        """Peers that get their heartbeats by unicast."""
+        silence = limits.MULTICAST_SILENCE
+        return [v for v in self._present() if not self._multicast or now - v.multicast_at > silence]
+
+    def _burst_times(self, now: float, offsets: tuple[float, ...]) -> list[float]:
+        return [now + offset + (limits.BURST_JITTER * self._rng() if offset else 0.0) for offset in offsets]
+
+    def _next_heartbeat(self, now: float) -> float:
+        return now + limits.HEARTBEAT_INTERVAL * (1.0 - limits.HEARTBEAT_JITTER * self._rng())
+
+    def _view(self, seat: Seat, voice: Voice) -> PeerView:
+        conflicts = []
+        if seat.conflict and seat.current is not None:
+            rivals = seat.rivals()
+            other = seat.current if voice is not seat.current else rivals[0] if rivals else voice
+            kind = ConflictKind.OWN_GUID if seat.own else ConflictKind.GUID
+            conflicts.append(str(Conflict(kind, voice.identity, other.identity)))
+        conflicts += [
+            str(Conflict(ConflictKind.NAME, voice.identity, o)) for o in self._namesakes(seat, voice.identity)
+        ]
+        return PeerView(
+            voice.identity,
+            voice.since,
+            voice.heard,
+            voice.found_by,
+            voice.heard_by if not voice.linked else Heard.LINK,
+            voice.source,
+            voice.linked,
+            tuple(conflicts),
+            seat.present and voice is seat.current,
+        )
+
+
+def _key(guid: Guid) -> int:
+    """Address and port: all incarnations of one peer share them; in GUID order."""
+    return guid.value >> 16
+
+
+def _addresses(voice: Voice) -> tuple[Address, ...]:
+    """Where a peer's unicast goes: its GUID's endpoint, and where its packets come from if that differs."""
+    endpoint, source = voice.identity.guid.endpoint, voice.source
+    return (endpoint,) if source is None or source == endpoint else (endpoint, source)
