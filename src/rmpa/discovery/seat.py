@@ -141,7 +141,7 @@ class Seat:
             return Verdict.LEAVING
         if self.conflict:
             return Verdict.CONFLICT
-        waiting = [v for v in self.rivals() if v.since >= current.since]
+        waiting = [v for v in self.rivals() if v.since > current.since]
         if not waiting:
             return Verdict.KNOWN
         return self._promote(max(waiting, key=lambda v: v.heard), now, Verdict.RESTARTED)

@@ -1,0 +1,534 @@
+"""The roster machine, alone and in pairs, under a clock that is an argument."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from ipaddress import IPv4Address
+
+import pytest
+
+from rmpa.core import limits
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+from rmpa.discovery.beacon import Beacon, BeaconKind
+from rmpa.discovery.events import (
+    Conflict,
+    ConflictCleared,
+    ConflictKind,
+    Heard,
+    LossReason,
+    Output,
+    PeerChanged,
+    PeerFound,
+    PeerLost,
+    PeerRestarted,
+    SendMulticast,
+    SendUnicast,
+)
+from rmpa.discovery.roster import Roster
+
+T0 = 1000.0
+
+
+def who(number: int, run: int = 1, name: str = "") -> Identity:
+    """Peer ``number`` at 10.0.0.number, in its ``run``-th run."""
+    return Identity(
+        Guid.of(f"10.0.0.{number}", 40000 + number, run), bytes([number, run] * 8), name or f"peer{number}"
+    )
+
+
+class Speaker:
+    """Makes one run's beacons, numbered."""
+
+    def __init__(self, identity: Identity, start: int = 0) -> None:
+        self.identity = identity
+        self.sequence = start
+
+    def __call__(self, kind: BeaconKind = BeaconKind.HEARTBEAT, *gossip: Guid, lease: float = 16.0) -> Beacon:
+        self.sequence += 1
+        return Beacon(kind, self.identity, round(lease * 1000), self.sequence, gossip)
+
+
+class Harness:
+    """A started roster of peer 1 with a clock in hand."""
+
+    def __init__(self, *, multicast: bool = True, name: str = "") -> None:
+        self.now = T0
+        self.roster = Roster(who(1, name=name), rng=lambda: 0.0, multicast=multicast)
+        self.roster.start(T0)
+
+    def hear(self, beacon: Beacon, *, multicast: bool = True, source: tuple[str, int] | None = None) -> None:
+        self.roster.receive(beacon, source or beacon.identity.guid.endpoint, self.now, multicast=multicast)
+
+    def run(self, seconds: float) -> list[Output]:
+        """Let time pass; return what was sent meanwhile."""
+        sent = self.roster.outputs()
+        end = self.now + seconds
+        while (timer := self.roster.next_timer()) is not None and timer <= end:
+            self.now = max(self.now, timer)
+            self.roster.handle_timer(self.now)
+            sent += self.roster.outputs()
+        self.now = end
+        return sent
+
+    def present(self) -> list[str]:
+        return [view.identity.name for view in self.roster.peers() if view.present]
+
+
+@pytest.fixture
+def one() -> Harness:
+    harness = Harness()
+    harness.run(1.0)
+    return harness
+
+
+def unicasts(outputs: list[Output], kind: BeaconKind) -> list[tuple[str, int]]:
+    return [o.address for o in outputs if isinstance(o, SendUnicast) and o.beacon.kind is kind]
+
+
+def test_a_burst_then_silence_but_for_the_heartbeat() -> None:
+    harness = Harness()
+    kinds = [(o.beacon.kind, o.beacon.sequence) for o in harness.run(4.9) if isinstance(o, SendMulticast)]
+    assert kinds == [(BeaconKind.ANNOUNCE, n) for n in range(1, len(limits.BURST_OFFSETS) + 1)]
+    later = harness.run(10.0)
+    assert [o.beacon.kind for o in later] == [BeaconKind.HEARTBEAT] * 2
+
+
+def test_jitter_stays_in_its_bounds() -> None:
+    roster = Roster(who(1), rng=lambda: 0.999, multicast=True)
+    roster.start(T0)
+    assert roster.next_timer() == pytest.approx(T0 + 0.1 + limits.BURST_JITTER, abs=0.001)
+    roster.handle_timer(T0 + 1)
+    assert roster.next_timer() == pytest.approx(T0 + 4.5, abs=0.01)
+
+
+def test_an_unknown_peer_is_found_and_answered_by_unicast(one: Harness) -> None:
+    speaker = Speaker(who(2))
+    one.hear(speaker())
+    assert one.roster.events() == [PeerFound(who(2), ("10.0.0.2", 40002), Heard.MULTICAST)]
+    assert unicasts(one.roster.outputs(), BeaconKind.ANSWER) == [("10.0.0.2", 40002)]
+    one.now += 1
+    one.hear(speaker())
+    assert one.roster.events() == []
+    assert one.roster.outputs() == []
+
+
+def test_the_answer_also_goes_where_the_packet_came_from(one: Harness) -> None:
+    one.hear(Speaker(who(2))(), source=("192.0.2.9", 5555))
+    assert unicasts(one.roster.outputs(), BeaconKind.ANSWER) == [("10.0.0.2", 40002), ("192.0.2.9", 5555)]
+
+
+def test_each_announce_is_answered_but_not_faster_than_the_limit(one: Harness) -> None:
+    speaker = Speaker(who(2))
+    answered = 0
+    for _ in range(10):
+        one.hear(speaker(BeaconKind.ANNOUNCE))
+        answered += len(unicasts(one.roster.outputs(), BeaconKind.ANSWER))
+        one.now += limits.ANSWER_INTERVAL / 2
+    assert answered == 5
+
+
+def test_an_answer_is_not_answered(one: Harness) -> None:
+    one.hear(Speaker(who(2))(BeaconKind.ANSWER), multicast=False)
+    assert one.roster.events()
+    assert one.roster.outputs() == []
+
+
+def test_forged_beacons_do_not_make_an_amplifier(one: Harness) -> None:
+    for i in range(400):
+        host = Guid.of(IPv4Address(0x0A010000 + i), 4000)
+        beacon = Speaker(replace(who(2), guid=host, instance=i.to_bytes(16, "big")))()
+        one.hear(beacon, source=("192.0.2.7", i + 1))
+    assert len(unicasts(one.roster.outputs(), BeaconKind.ANSWER)) <= limits.ANSWERS_PER_SECOND
+
+
+def test_our_own_echo_is_ignored(one: Harness) -> None:
+    one.hear(Speaker(who(1))())
+    assert (one.roster.events(), one.roster.outputs()) == ([], [])
+    assert one.roster.counters["beacon.echo"] == 1
+
+
+def test_silence_for_the_lease_loses_an_unlinked_peer(one: Harness) -> None:
+    one.hear(Speaker(who(2))(lease=16))
+    one.run(15.9)
+    assert one.present() == ["peer2"]
+    one.run(0.2)
+    assert one.roster.events()[-1] == PeerLost(who(2), LossReason.SILENCE)
+    assert one.roster.peers() == ()
+
+
+@pytest.mark.parametrize(("asked", "granted"), [(0.0, limits.ROSTER_LEASE_MIN), (4e6, limits.ROSTER_LEASE_MAX)])
+def test_a_lease_has_bounds(one: Harness, asked: float, granted: float) -> None:
+    one.hear(Speaker(who(2))(lease=asked))
+    one.run(granted - 0.1)
+    assert one.present() == ["peer2"]
+    one.run(0.2)
+    assert one.present() == []
+
+
+def test_a_linked_peer_is_never_lost_by_silence_and_its_lease_begins_when_the_link_falls(one: Harness) -> None:
+    one.hear(Speaker(who(2))())
+    one.roster.link_up(who(2), one.now)
+    one.run(1000)
+    assert one.present() == ["peer2"]
+    assert one.roster.peers()[0].linked
+    one.roster.link_down(who(2).guid, one.now)
+    one.run(15.9)
+    assert one.present() == ["peer2"]
+    one.run(0.2)
+    assert one.present() == []
+
+
+def test_a_link_alone_finds_a_peer(one: Harness) -> None:
+    one.roster.link_up(who(2), one.now)
+    assert one.roster.events() == [PeerFound(who(2), None, Heard.LINK)]
+
+
+def test_goodbye_and_its_late_shadow(one: Harness) -> None:
+    speaker = Speaker(who(2))
+    late = speaker()
+    one.hear(speaker())
+    newest = speaker()
+    one.hear(speaker(BeaconKind.GOODBYE))
+    assert one.roster.events()[-1] == PeerLost(who(2), LossReason.GOODBYE)
+    one.hear(late)
+    one.hear(newest)
+    assert one.roster.events() == []
+    assert one.roster.counters["beacon.late"] == 2
+    one.hear(speaker())
+    assert one.present() == ["peer2"]
+
+
+def test_goodbye_of_a_linked_peer_waits_for_its_link(one: Harness) -> None:
+    speaker = Speaker(who(2))
+    one.hear(speaker())
+    one.roster.link_up(who(2), one.now)
+    one.hear(speaker(BeaconKind.GOODBYE))
+    assert one.present() == ["peer2"]
+    one.roster.link_down(who(2).guid, one.now)
+    assert one.roster.events()[-1] == PeerLost(who(2), LossReason.GOODBYE)
+
+
+def test_a_stranger_that_says_goodbye_is_not_met(one: Harness) -> None:
+    one.hear(Speaker(who(2))(BeaconKind.GOODBYE))
+    assert (one.roster.events(), one.roster.outputs(), one.roster.peers()) == ([], [], ())
+
+
+def test_we_say_goodbye_and_nothing_after_it(one: Harness) -> None:
+    one.hear(Speaker(who(2))())
+    one.hear(Speaker(who(3))(), multicast=False)
+    one.run(6)
+    one.roster.goodbye(one.now)
+    outputs = one.roster.outputs()
+    assert [o.beacon.kind for o in outputs] == [BeaconKind.GOODBYE] * 2
+    assert unicasts(outputs, BeaconKind.GOODBYE) == [("10.0.0.3", 40003)]
+    one.hear(Speaker(who(4))())
+    assert one.roster.next_timer() is None
+    assert one.roster.outputs() == []
+
+
+def test_restart_is_told_from_ghost(one: Harness) -> None:
+    old, new = Speaker(who(2)), Speaker(who(2, run=2))
+    one.hear(old())
+    late = old()
+    one.hear(new())
+    assert one.roster.events()[-1] == PeerRestarted(who(2, 2), who(2), ("10.0.0.2", 40002))
+    one.now += 0.5
+    one.hear(late)
+    assert one.roster.events() == []
+    assert [v.identity for v in one.roster.peers()] == [who(2, 2)]
+
+
+def test_a_restart_behind_a_link_waits_until_the_link_falls(one: Harness) -> None:
+    old, new = Speaker(who(2)), Speaker(who(2, run=2))
+    one.hear(old())
+    one.roster.link_up(who(2), one.now)
+    one.roster.events()
+    one.now += 0.4
+    one.hear(new(BeaconKind.ANNOUNCE))
+    assert one.roster.events() == []
+    one.now += 0.4
+    one.roster.outputs()
+    one.roster.link_down(who(2).guid, one.now)
+    assert [type(e) for e in one.roster.events()] == [PeerRestarted]
+    assert unicasts(one.roster.outputs(), BeaconKind.ANSWER) == [("10.0.0.2", 40002)]
+
+
+def test_a_ghost_behind_a_live_link_changes_nothing(one: Harness) -> None:
+    old, new = Speaker(who(2)), Speaker(who(2, run=2))
+    one.hear(old())
+    late = old()
+    one.hear(new())
+    one.roster.link_up(who(2, 2), one.now)
+    one.roster.events()
+    one.hear(late)
+    one.now += 1
+    one.roster.link_down(who(2).guid, one.now)
+    assert one.roster.events() == []
+    assert one.present() == ["peer2"]
+
+
+def test_a_link_of_a_replaced_run_that_falls_late_changes_nothing(one: Harness) -> None:
+    one.roster.link_up(who(2), one.now)
+    one.roster.link_up(who(2, 2), one.now)
+    assert [type(e) for e in one.roster.events()] == [PeerFound, PeerRestarted]
+    one.roster.link_down(who(2).guid, one.now, who(2).instance)
+    assert one.roster.peers()[0].linked
+
+
+def test_a_ghost_that_came_last_gives_way_when_it_stays_silent(one: Harness) -> None:
+    ghost, live = Speaker(who(2)), Speaker(who(2, run=2))
+    one.hear(live())
+    one.hear(ghost())
+    one.run(0.6)
+    one.hear(live())
+    one.run(limits.HEARTBEAT_LATE)
+    one.roster.events()
+    one.hear(live())
+    assert one.roster.events() == [PeerRestarted(who(2, 2), who(2), ("10.0.0.2", 40002))]
+
+
+def twins(one: Harness, *, linked: bool = False) -> tuple[Speaker, Speaker]:
+    """Two live peers with one GUID address, heard until it is beyond doubt."""
+    left, right = Speaker(who(2, name="left")), Speaker(who(2, run=2, name="right"))
+    one.hear(left())
+    if linked:
+        one.roster.link_up(who(2, name="left"), one.now)
+    one.run(2.5)
+    one.hear(right())
+    one.run(2.5)
+    one.hear(left())
+    one.run(2.5)
+    one.hear(right())
+    return left, right
+
+
+def test_two_live_peers_with_one_guid_stay_out_until_one_is_silent(one: Harness) -> None:
+    left, right = twins(one)
+    events = one.roster.events()
+    assert [type(e) for e in events] == [PeerFound, PeerRestarted, Conflict, PeerLost]
+    assert isinstance(events[-1], PeerLost)
+    assert events[-1].reason is LossReason.CONFLICT
+    assert one.present() == []
+    text = str(events[2])
+    assert "two live peers share one GUID address 10.0.0.2:40002" in text
+    assert "--port" in text
+    assert "NAT" in text
+    views = one.roster.peers()
+    assert {v.identity.name for v in views} == {"left", "right"}
+    assert all(v.conflicts for v in views)
+    for _ in range(6):
+        one.run(2.5)
+        one.hear(left())
+        one.hear(right())
+    assert one.roster.events() == []
+    for _ in range(8):
+        one.run(2.5)
+        one.hear(left())
+    cleared, found = one.roster.events()
+    assert cleared == ConflictCleared(ConflictKind.GUID, who(2, name="left"))
+    assert isinstance(found, PeerFound)
+    assert one.present() == ["left"]
+
+
+def test_a_conflict_ends_with_a_goodbye(one: Harness) -> None:
+    _, right = twins(one)
+    one.roster.events()
+    one.hear(right(BeaconKind.GOODBYE))
+    one.run(0)
+    assert [type(e) for e in one.roster.events()] == [ConflictCleared, PeerFound]
+    assert one.present() == ["left"]
+
+
+def test_a_working_link_survives_a_conflict(one: Harness) -> None:
+    twins(one, linked=True)
+    events = one.roster.events()
+    assert [type(e) for e in events] == [PeerFound, Conflict]
+    assert one.present() == ["left"]
+    one.roster.link_down(who(2).guid, one.now)
+    assert [type(e) for e in one.roster.events()] == [PeerLost]
+
+
+def test_somebody_else_with_our_guid(one: Harness) -> None:
+    twin = Speaker(who(1, run=9, name="twin"))
+    one.hear(twin())
+    one.run(5)
+    one.hear(twin())
+    (event,) = one.roster.events()
+    assert isinstance(event, Conflict)
+    assert event.kind is ConflictKind.OWN_GUID
+    assert "twin has our own GUID address 10.0.0.1:40001" in str(event)
+    for _ in range(3):
+        one.run(5)
+        one.hear(twin())
+    assert one.roster.events() == []
+    assert [v.identity.name for v in one.roster.peers()] == ["twin"]
+    one.run(20)
+    assert one.roster.events() == [ConflictCleared(ConflictKind.OWN_GUID, who(1))]
+
+
+def test_two_peers_of_one_name_both_stay_and_it_is_said_once(one: Harness) -> None:
+    first, second = Speaker(who(2, name="base")), Speaker(who(3, name="base"))
+    for _ in range(3):
+        one.hear(first())
+        one.hear(second())
+        one.run(5)
+    conflicts = [e for e in one.roster.events() if isinstance(e, Conflict)]
+    assert [str(c) for c in conflicts] == [
+        "two peers are named base: 10.0.0.3:40003#1 and 10.0.0.2:40002#1; rename one: --name"
+    ]
+    assert one.present() == ["base", "base"]
+    assert all("rename one" in view.conflicts[0] for view in one.roster.peers())
+
+
+def test_a_peer_with_our_own_name() -> None:
+    one = Harness(name="base")
+    one.hear(Speaker(who(2, name="base"))())
+    assert [e.kind for e in one.roster.events() if isinstance(e, Conflict)] == [ConflictKind.NAME]
+
+
+def test_a_peer_that_changes(one: Harness) -> None:
+    speaker = Speaker(who(2))
+    one.hear(speaker())
+    one.roster.events()
+    speaker.identity = replace(who(2), addresses=(IPv4Address("192.0.2.2"),))
+    one.hear(speaker())
+    assert one.roster.events() == [PeerChanged(speaker.identity, who(2))]
+
+
+def test_gossip_only_leads_to_greetings_that_end(one: Harness) -> None:
+    one.hear(Speaker(who(2))(BeaconKind.ANSWER, who(3).guid), multicast=False)
+    sent = one.roster.outputs() + one.run(12)
+    greeted = [a for a in unicasts(sent, BeaconKind.ANNOUNCE) if a == ("10.0.0.3", 40003)]
+    assert len(greeted) == limits.GREETING_ATTEMPTS
+    one.hear(Speaker(who(2), 50)(BeaconKind.ANSWER, who(3).guid), multicast=False)
+    sent = one.run(40)
+    assert ("10.0.0.3", 40003) not in unicasts(sent, BeaconKind.ANNOUNCE)
+    assert "peer3" not in one.present()
+
+
+def test_a_greeted_peer_that_answers_is_found_by_gossip(one: Harness) -> None:
+    one.hear(Speaker(who(2))(BeaconKind.ANSWER, who(3).guid), multicast=False)
+    one.hear(Speaker(who(3))(BeaconKind.ANSWER), multicast=False)
+    assert one.present() == ["peer2", "peer3"]
+    assert one.roster.peers()[1].found_by is Heard.GOSSIP
+    sent = one.roster.outputs() + one.run(15)
+    assert unicasts(sent, BeaconKind.ANNOUNCE).count(("10.0.0.3", 40003)) == 1
+
+
+def test_a_lost_peer_that_multicast_cannot_bring_back_is_greeted_again(one: Harness) -> None:
+    one.hear(Speaker(who(2))(BeaconKind.ANNOUNCE), multicast=False)
+    one.run(15.9)
+    sent = one.run(10)
+    assert one.present() == []
+    assert unicasts(sent, BeaconKind.ANNOUNCE).count(("10.0.0.2", 40002)) >= 3
+
+
+def test_gossip_is_bounded(one: Harness) -> None:
+    speaker = Speaker(who(2))
+    for i in range(10):
+        guids = [Guid.of(IPv4Address(0x0A020000 + 100 * i + j), 1) for j in range(limits.BEACON_GOSSIP_MAX)]
+        one.hear(speaker(BeaconKind.HEARTBEAT, *guids))
+    greeted = unicasts(one.roster.outputs(), BeaconKind.ANNOUNCE)
+    assert len(greeted) == limits.GREETINGS_MAX
+    assert one.roster.counters["gossip.full"]
+
+
+def test_loopback_gossip_from_afar_is_not_believed(one: Harness) -> None:
+    one.hear(Speaker(who(2))(BeaconKind.ANSWER, Guid.of("127.0.0.1", 40000)), multicast=False)
+    assert unicasts(one.run(5), BeaconKind.ANNOUNCE) == []
+
+
+def test_an_answer_carries_gossip_but_not_the_listener(one: Harness) -> None:
+    one.hear(Speaker(who(3))())
+    one.roster.outputs()
+    one.hear(Speaker(who(2))())
+    (answer,) = [o for o in one.roster.outputs() if isinstance(o, SendUnicast)]
+    assert answer.beacon.gossip == (who(3).guid,)
+
+
+def test_seeds_are_greeted_at_start_and_with_each_heartbeat_until_met() -> None:
+    seed = ("10.9.0.1", 11411)
+    one = Harness()
+    one.roster.set_seeds([seed, seed])
+    assert unicasts(one.roster.outputs(), BeaconKind.ANNOUNCE) == [seed]
+    one.run(1)
+    assert unicasts(one.run(10), BeaconKind.ANNOUNCE) == [seed] * 2
+    one.hear(Speaker(who(2))(BeaconKind.ANSWER), multicast=False, source=seed)
+    assert unicasts(one.run(10), BeaconKind.ANNOUNCE) == []
+
+
+def test_a_peer_not_heard_by_multicast_gets_unicast_heartbeats_with_gossip(one: Harness) -> None:
+    one.hear(Speaker(who(3))())
+    far = Speaker(who(2))
+    one.hear(far(BeaconKind.ANNOUNCE), multicast=False)
+    one.run(1)
+    sent = [o for o in one.run(5) if isinstance(o, SendUnicast) and o.beacon.kind is BeaconKind.HEARTBEAT]
+    assert [(o.address, o.beacon.gossip) for o in sent] == [(("10.0.0.2", 40002), (who(3).guid,))]
+
+
+def test_news_spread_at_once_to_those_without_multicast(one: Harness) -> None:
+    one.hear(Speaker(who(2))(BeaconKind.ANNOUNCE), multicast=False)
+    one.run(1)
+    one.hear(Speaker(who(3))())
+    sent = one.run(0.01)
+    assert [
+        o.beacon.gossip for o in sent if isinstance(o, SendUnicast) and o.beacon.kind is BeaconKind.HEARTBEAT
+    ] == [(who(3).guid,)]
+    shouted = [o.beacon.gossip for o in sent if isinstance(o, SendMulticast)]
+    assert shouted == [(who(2).guid,)]
+
+
+def test_a_deaf_peers_unicast_heartbeat_is_answered(one: Harness) -> None:
+    speaker = Speaker(who(2))
+    one.hear(speaker())
+    one.run(1)
+    one.hear(speaker(), multicast=False)
+    assert unicasts(one.roster.outputs(), BeaconKind.ANSWER) == [("10.0.0.2", 40002)]
+
+
+def test_without_multicast_nothing_is_shouted() -> None:
+    one = Harness(multicast=False)
+    one.roster.set_seeds([("10.9.0.1", 11411)])
+    one.hear(Speaker(who(2))(BeaconKind.ANSWER), multicast=False)
+    sent = one.run(20)
+    one.roster.goodbye(one.now)
+    sent += one.roster.outputs()
+    assert sent
+    assert not [o for o in sent if isinstance(o, SendMulticast)]
+    assert ("10.0.0.2", 40002) in unicasts(sent, BeaconKind.HEARTBEAT)
+
+
+def test_a_change_of_interfaces_gives_a_shorter_burst_with_the_new_addresses(one: Harness) -> None:
+    one.roster.interfaces_changed(one.now, (IPv4Address("10.8.0.1"),))
+    sent = [o for o in one.run(1) if isinstance(o, SendMulticast)]
+    assert [o.beacon.kind for o in sent] == [BeaconKind.ANNOUNCE] * len(limits.BURST_AGAIN_OFFSETS)
+    assert sent[0].beacon.identity.addresses == (IPv4Address("10.8.0.1"),)
+
+
+def test_the_roster_is_bounded_and_links_go_first(one: Harness) -> None:
+    for i in range(2 * limits.ROSTER_PEERS_MAX):
+        guid = Guid.of(IPv4Address(0x0A010000 + i), 4000)
+        one.hear(Speaker(replace(who(2), guid=guid, instance=i.to_bytes(16, "big"), name=f"n{i}"))())
+    assert len(one.roster.peers()) == limits.ROSTER_PEERS_MAX - 1
+    assert one.roster.counters["roster.full"]
+    one.roster.link_up(who(3), one.now)
+    assert "peer3" in one.present()
+    assert len(one.roster.peers()) == limits.ROSTER_PEERS_MAX - 1
+
+
+def test_sequence_numbers_wrap(one: Harness) -> None:
+    speaker = Speaker(who(2), 0xFFFF_FFFD)
+    one.hear(speaker())
+    one.hear(speaker())
+    speaker.sequence = -1
+    one.run(10)
+    one.hear(speaker())
+    one.run(8)
+    assert one.present() == ["peer2"]
+
+
+def test_peers_are_read_in_guid_order(one: Harness) -> None:
+    for number in (5, 3, 9, 2):
+        one.hear(Speaker(who(number))())
+    assert one.present() == ["peer2", "peer3", "peer5", "peer9"]
