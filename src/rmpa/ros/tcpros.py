@@ -160,8 +160,8 @@ def split_messages(data: memoryview) -> tuple[list[memoryview], int, int]:
         ``wanted`` counts from behind the consumed bytes, as ``core.aio.stream`` asks for.
 
     Raises:
-        LimitExceeded: A message claims more than ``limits.TCPROS_MESSAGE_MAX``; nothing is returned then, not
-            even the whole messages before it.
+        LimitExceeded: The first message claims more than ``limits.TCPROS_MESSAGE_MAX``. Whole messages before such
+            a one are returned first.
     """
     messages: list[memoryview] = []
     start = 0
@@ -169,6 +169,8 @@ def split_messages(data: memoryview) -> tuple[list[memoryview], int, int]:
     while filled - start >= LENGTH.size:
         (size,) = LENGTH.unpack_from(data, start)
         if size > limits.TCPROS_MESSAGE_MAX:
+            if messages:
+                break
             raise LimitExceeded("message", size, limits.TCPROS_MESSAGE_MAX)
         end = start + LENGTH.size + size
         if end > filled:
