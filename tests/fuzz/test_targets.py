@@ -1,0 +1,58 @@
+"""Every fuzz target: its seeds, seeded mutations of them, and hypothesis's own bytes.
+
+``python -m tests.fuzz --seconds 60`` runs longer.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.fuzz import targets
+from tests.fuzz.mutate import mutate
+
+MUTATIONS = int(os.environ.get("FUZZ_MUTATIONS", "2000"))
+every_target = pytest.mark.parametrize("name", targets.names())
+
+
+@every_target
+def test_seeds(name: str) -> None:
+    target = targets.load(name)
+    assert target.seeds
+    for seed in target.seeds:
+        target.fuzz(seed)
+
+
+@every_target
+def test_seeded_mutations(name: str) -> None:
+    target = targets.load(name)
+    rng = random.Random(f"rmpa {name}")
+    for number in range(MUTATIONS):
+        data = mutate(rng, target.seeds)
+        try:
+            target.fuzz(data)
+        except Exception as error:
+            error.add_note(f"mutation {number} of {name}: fuzz({data!r})")
+            raise
+
+
+@every_target
+def test_any_bytes(name: str) -> None:
+    target = targets.load(name)
+
+    @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+    @given(st.binary(max_size=512))
+    def run(data: bytes) -> None:
+        target.fuzz(data)
+
+    run()
+
+
+def test_mutations_replay_from_their_seed() -> None:
+    seeds = [b"RMPA" * 5, b"", b"x"]
+    first, second = (random.Random(7) for _ in range(2))
+    assert [mutate(first, seeds) for _ in range(200)] == [mutate(second, seeds) for _ in range(200)]
