@@ -26,6 +26,8 @@ def test_a_new_link_is_told_all_that_policy_lets_cross(exports: Exports) -> None
             Source("/secret", "/joy"): JOY,
             Source("/rosout", "/joy"): LocalSource("rosgraph_msgs/Log", "http://127.0.0.1:4000/"),
             Source("/odd", "/joy"): LocalSource("*", "http://127.0.0.1:4000/"),
+            Source("/no name", "/joy"): JOY,
+            Source("/cmd", "no_node"): JOY,
         }
     )
     assert exports.link_up(1) == [

@@ -156,7 +156,7 @@ def test_another_type_than_the_local_one_is_refused_loudly_on_both_sides_until_i
 def test_a_publisher_that_sends_another_type_than_offered_is_not_described(imports: Imports) -> None:
     imports.advertised(1, Advertise(added=(OFFER,)))
     imports.demand(1, CMD, 0.0, wanted=True)
-    odd = Description("a/B", "00", "", False)
+    odd = Description("a/B", "5a9ea5f83505693b71e785041e67a8bb", "", False)
     actions = imports.opened(1, Opened(1, odd), 0.0)
     assert [type(action) for action in actions] == [Send, Warn, Detach]
     assert state(imports) is RouteState.WAITING

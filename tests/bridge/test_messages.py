@@ -38,9 +38,9 @@ GOLDEN: list[tuple[Message, bytes]] = [
     ),
     (Open(7, "/cmd", "/joy"), b'{"op":"open","route":7,"topic":"/cmd","node":"/joy"}'),
     (
-        Opened(7, Description("sensor_msgs/Joy", "5a9e", "Header header\n", True)),
+        Opened(7, Description("sensor_msgs/Joy", "5a9ea5f83505693b71e785041e67a8bb", "Header header\n", True)),
         (
-            b'{"op":"opened","route":7,"description":{"type":"sensor_msgs/Joy","md5":"5a9e",'
+            b'{"op":"opened","route":7,"description":{"type":"sensor_msgs/Joy","md5":"5a9ea5f83505693b71e785041e67a8bb",'
             b'"definition":"Header header\\n","latching":true}}'
         ),
     ),
@@ -83,6 +83,10 @@ def test_golden_bytes(message: Message, wire: bytes) -> None:
         b'{"op":"advertise","added":[{"topic":"","node":"/b","type":"a/B"}]}',
         b'{"op":"advertise","removed":[{"topic":"/a","node":""}]}',
         b'{"op":"opened","route":1,"description":{"type":"*","md5":"*","definition":"","latching":false}}',
+        (
+            b'{"op":"opened","route":1,"description":{"type":"a/B","md5":"5a9ea5f83505693b71e785041e67a8bb",'
+            b'"definition":"\xe2\x82\xac","latching":false}}'
+        ),
         b'{"op":"close","route":1}trailing',
         b"[" * 100_000,
     ],
@@ -111,6 +115,7 @@ def test_fields_of_later_versions_are_ignored() -> None:
 
 _names = st.from_regex(r"/[a-z][a-z0-9_]{0,8}(/[a-z][a-z0-9_]{0,8}){0,3}", fullmatch=True)
 _types = st.from_regex(r"[a-z][a-z_]{0,8}/[A-Z][A-Za-z]{0,8}", fullmatch=True)
+_md5s = st.from_regex(r"[0-9a-f]{32}", fullmatch=True)
 _routes = st.integers(1, (1 << 32) - 1)
 _messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(
@@ -120,7 +125,11 @@ _messages: st.SearchStrategy[Message] = st.one_of(
         full=st.booleans(),
     ),
     st.builds(Open, _routes, _names, _names),
-    st.builds(Opened, _routes, st.builds(Description, _types, st.text(), st.text(), st.booleans())),
+    st.builds(
+        Opened,
+        _routes,
+        st.builds(Description, _types, _md5s, st.text(st.characters(max_codepoint=255)), st.booleans()),
+    ),
     st.builds(Close, _routes),
     st.builds(Closed, _routes, st.text()),
     st.builds(Mismatch, _names, _names, st.text(), st.text()),

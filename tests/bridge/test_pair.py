@@ -38,7 +38,7 @@ from rmpa.bridge.policy import Policy
 from rmpa.core.config import PolicySettings
 
 SOURCES = [Source("/a", "/n"), Source("/a", "/m"), Source("/b", "/n")]
-ABOUT = Description("a/B", "00", "", False)
+ABOUT = Description("a/B", "5a9ea5f83505693b71e785041e67a8bb", "", False)
 
 
 class World:

@@ -8,7 +8,7 @@ from rmpa.core.errors import RemoteProtocolError
 SEEDS: list[bytes] = [
     b'{"op":"advertise","added":[{"topic":"/cmd","node":"/joy","type":"sensor_msgs/Joy"}],"removed":[],"full":true}',
     b'{"op":"open","route":7,"topic":"/cmd","node":"/joy"}',
-    b'{"op":"opened","route":7,"description":{"type":"a/B","md5":"5a","definition":"x","latching":true}}',
+    b'{"op":"opened","route":7,"description":{"type":"a/B","md5":"5a9ea5f83505693b71e785041e67a8bb","definition":"x","latching":true}}',
     b'{"op":"closed","route":7,"reason":"the node has gone"}',
     b'{"op":"mismatch","topic":"/cmd","node":"/joy","subscriber":"/base","text":"md5"}',
 ]

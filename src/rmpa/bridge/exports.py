@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, Warn
 from rmpa.bridge.messages import Advertise, Close, Closed, Description, Offer, Open, Opened, Source
 from rmpa.core import limits
-from rmpa.core.names import is_type_name
+from rmpa.core.names import is_global_name, is_type_name
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -79,7 +79,10 @@ class Exports:
         crossing = [
             source
             for source, local in sources.items()
-            if is_type_name(local.type) and self._policy.judge(source.topic, local.type, source.node).allowed
+            if is_type_name(local.type)
+            and is_global_name(source.topic)
+            and is_global_name(source.node)
+            and self._policy.judge(source.topic, local.type, source.node).allowed
         ]
         actions: list[Action] = []
         if len(crossing) > limits.TOPICS_PER_PEER_MAX:

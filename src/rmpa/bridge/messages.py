@@ -6,6 +6,7 @@ packet capture. ``docs/design/protocol.md`` lists the messages with examples.
 
 from __future__ import annotations
 
+import re
 from typing import Final
 
 import msgspec
@@ -50,7 +51,8 @@ class Description(msgspec.Struct, frozen=True):
     Args:
         type: Message type.
         md5: Its MD5 sum, never ``*``.
-        definition: The full text of its definition, byte for byte as the publisher sent it.
+        definition: The full text of its definition, byte for byte as the publisher sent it: one character a byte
+            (ISO 8859-1), for some definitions have comments that are not UTF-8.
         latching: Whether each new subscriber gets the last message.
     """
 
@@ -58,6 +60,17 @@ class Description(msgspec.Struct, frozen=True):
     md5: str
     definition: str
     latching: bool
+
+    @property
+    def problem(self) -> str:
+        """Why a publisher with this header cannot be passed on, or empty."""
+        if not is_type_name(self.type):
+            return f"its publisher names no message type (but {self.type!r})"
+        if not _MD5.fullmatch(self.md5):
+            return f"its publisher names no md5 sum (but {self.md5!r})"
+        if any(character > "\xff" for character in self.definition):
+            return "its definition has characters that are no bytes"
+        return ""
 
 
 class Advertise(msgspec.Struct, frozen=True, tag_field="op", tag="advertise"):
@@ -119,6 +132,7 @@ Message = Advertise | Open | Opened | Close | Closed | Mismatch
 
 _ENCODER: Final = msgspec.json.Encoder()
 _DECODER: Final = msgspec.json.Decoder(Message)
+_MD5: Final = re.compile(r"[0-9a-f]{32}")
 _ROUTE_MAX: Final = (1 << 32) - 1
 
 
@@ -158,8 +172,8 @@ def _validate(message: Message) -> None:
             _check_names(source.topic, source.node)
     elif isinstance(message, Open | Mismatch):
         _check_names(message.topic, message.node)
-    elif isinstance(message, Opened) and not is_type_name(message.description.type):
-        raise RemoteProtocolError(f"{message.description.type!r} is not a message type")
+    elif isinstance(message, Opened) and message.description.problem:
+        raise RemoteProtocolError(f"route {message.route}: {message.description.problem}")
 
 
 def _check_names(topic: str, node: str) -> None:

@@ -1,0 +1,296 @@
+"""The bridge of one agent: carries out what the exports and imports decide."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rmpa.bridge import actions as act
+from rmpa.bridge.aio.inbound import Inbound
+from rmpa.bridge.aio.outbound import Outbound
+from rmpa.bridge.exports import Exports, LocalSource
+from rmpa.bridge.imports import Imports
+from rmpa.bridge.messages import (
+    Advertise,
+    Close,
+    Closed,
+    Description,
+    Message,
+    Mismatch,
+    Open,
+    Opened,
+    Source,
+    decode,
+    encode,
+)
+from rmpa.bridge.policy import OWN_NODE
+from rmpa.bridge.proxy_names import LOOPBACK, proxy_prefix
+from rmpa.core import limits
+from rmpa.core.counters import Counters, RefusalLog
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.ros.aio.slave_server import SlaveNode
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from rmpa.bridge.policy import Policy
+    from rmpa.mesh.aio.link import MeshLink
+    from rmpa.ros.aio.core import RosCore
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class Attached:
+    """One link and what came of it."""
+
+    peer: int
+    link: MeshLink
+    inbound: Inbound
+
+
+class Bridge:
+    """Joins the local core and the links of the mesh.
+
+    Args:
+        core: The local core, started.
+        policy: What may cross.
+        rng: Uniform numbers in [0, 1) for back-off jitter.
+    """
+
+    def __init__(self, core: RosCore, policy: Policy, *, rng: Callable[[], float]) -> None:
+        self._core = core
+        self._exports = Exports(policy)
+        self._imports = Imports(policy, rng)
+        self._node = SlaveNode(OWN_NODE, LOOPBACK, core.uri)
+        self._outbound = Outbound(core, self._node, on_described=self._described, on_lost=self._lost)
+        self._numbers = itertools.count(1)
+        self._by_number: dict[int, Attached] = {}
+        self._by_link: dict[MeshLink, Attached] = {}
+        self._closing: set[asyncio.Task[None]] = set()
+        self._timer: asyncio.TimerHandle | None = None
+        self._reconciler: asyncio.TimerHandle | None = None
+        self._rescan: asyncio.Handle | None = None
+        self._closed = False
+        self.counters = Counters()
+        self._refusals = RefusalLog(_log, self.counters)
+
+    @property
+    def exports(self) -> Exports:
+        """The outbound plan, for the monitor."""
+        return self._exports
+
+    @property
+    def imports(self) -> Imports:
+        """The inbound plan, for the monitor."""
+        return self._imports
+
+    @property
+    def outbound(self) -> Outbound:
+        """The outbound side, for the monitor."""
+        return self._outbound
+
+    def attached(self) -> Iterator[Attached]:
+        """Every link that is up, for the monitor."""
+        return iter(self._by_number.values())
+
+    async def start(self) -> None:
+        """Follow the local graph."""
+        self._loop = asyncio.get_running_loop()
+        await self._node.start()
+        self._core.on_change(lambda _change: self._graph_changed())
+        self._scan()
+        self._reconciler = self._loop.call_later(limits.RECONCILE_INTERVAL, self._reconcile)
+
+    async def close(self) -> None:
+        """Retract all that came from elsewhere and leave all local publishers."""
+        self._closed = True
+        for timer in (self._timer, self._reconciler, self._rescan):
+            if timer is not None:
+                timer.cancel()
+        for attached in list(self._by_number.values()):
+            self._detach(attached)
+        if self._closing:
+            await asyncio.gather(*self._closing)
+        self._outbound.close()
+        await self._node.close()
+
+    # --- the mesh's side ---------------------------------------------------------------------------------------
+
+    def link_up(self, link: MeshLink) -> None:
+        """A link is up: tell what we have, and let what it has appear."""
+        peer = next(self._numbers)
+        prefix = proxy_prefix(link.identity, {attached.inbound.prefix for attached in self._by_number.values()})
+        inbound = Inbound(
+            self._core,
+            prefix,
+            on_demand=lambda source, wanted: self._demand(peer, source, wanted=wanted),
+            on_mismatch=lambda source, subscriber, text: self._act(
+                self._imports.mismatched(peer, source, subscriber, text)
+            ),
+        )
+        attached = Attached(peer, link, inbound)
+        self._by_number[peer] = self._by_link[link] = attached
+        self._act(self._imports.link_up(peer))
+        self._act(self._exports.link_up(peer))
+
+    def link_down(self, link: MeshLink) -> None:
+        """A link is gone: retract what came over it."""
+        attached = self._by_link.get(link)
+        if attached is not None:
+            self._detach(attached)
+
+    def control(self, link: MeshLink, payload: bytes | bytearray | memoryview) -> None:
+        """A control frame came.
+
+        Raises:
+            RemoteProtocolError: It is not a message that belongs here; the link is to be closed.
+        """
+        attached = self._by_link.get(link)
+        if attached is not None:
+            self._dispatch(attached, decode(payload))
+
+    def data(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
+        """A data frame came: the hot path. One for a route that was closed meanwhile is dropped."""
+        attached = self._by_link.get(link)
+        flow = attached.inbound.flows.get(route) if attached is not None else None
+        if flow is None:
+            self.counters.add("route.unknown")
+        elif len(payload) < 4 or int.from_bytes(payload[:4], "little") != len(payload) - 4:
+            raise RemoteProtocolError(
+                f"a data frame of {len(payload)} bytes on route {route} does not hold one message"
+            )
+        else:
+            flow.message(sequence, stamp_ns, payload)
+
+    def _dispatch(self, attached: Attached, message: Message) -> None:
+        peer, now = attached.peer, self._loop.time()
+        match message:
+            case Advertise():
+                _log.info(
+                    "< %s publishes %d more topics, %d less",
+                    attached.link.name,
+                    len(message.added),
+                    len(message.removed),
+                )
+                self._act(self._imports.advertised(peer, message))
+            case Open():
+                self._act(self._exports.opened(peer, message))
+            case Opened():
+                self._act(self._imports.opened(peer, message, now))
+            case Close():
+                self._act(self._exports.closed(peer, message))
+            case Closed():
+                _log.info("< %s closes route %d: %s", attached.link.name, message.route, message.reason)
+                self._act(self._imports.closed(peer, message, now))
+            case Mismatch():
+                who = f"{attached.link.name}: {message.source}"
+                self._warn("mismatch.remote", who, f"{who}: {message.text}")
+
+    def _detach(self, attached: Attached) -> None:
+        del self._by_number[attached.peer]
+        del self._by_link[attached.link]
+        attached.inbound.flows.clear()
+        for action in self._exports.link_down(attached.peer):
+            if isinstance(action, act.RemoveRoute):
+                self._outbound.remove_route(action, attached.link)
+            else:
+                self._do(action)
+        self._imports.link_down(attached.peer)  # its actions are what closing the inbound side does at once
+        task = asyncio.create_task(attached.inbound.close(), name=f"retract {attached.inbound.prefix}")
+        self._closing.add(task)
+        task.add_done_callback(self._closing.discard)
+        self._set_timer()
+
+    # --- the local graph's side --------------------------------------------------------------------------------
+
+    def _graph_changed(self) -> None:
+        if self._rescan is None and not self._closed:
+            self._rescan = self._loop.call_soon(self._scan)
+
+    def _scan(self) -> None:
+        self._rescan = None
+        state = self._core.state()
+        sources = {
+            Source(topic, node): LocalSource(state.types.get(topic, "*"), uri)
+            for topic, nodes in state.publishers.items()
+            for node, uri in nodes.items()
+            if node != OWN_NODE and not node.startswith(OWN_NODE + "/")
+        }
+        self._act(self._exports.graph(sources))
+        self._act(self._imports.local_types({source.topic: local.type for source, local in sources.items()}))
+
+    def _reconcile(self) -> None:
+        self._reconciler = self._loop.call_later(limits.RECONCILE_INTERVAL, self._reconcile)
+        self._scan()
+        publishers = self._core.state().publishers
+        for attached in self._by_number.values():
+            if again := attached.inbound.reconcile(publishers):
+                self.counters.add("proxy.registered_again", again)
+
+    def _demand(self, peer: int, source: Source, *, wanted: bool) -> None:
+        self._act(self._imports.demand(peer, source, self._loop.time(), wanted=wanted))
+
+    def _described(self, source: Source, description: Description) -> None:
+        self._act(self._exports.described(source, description))
+
+    def _lost(self, source: Source, reason: str) -> None:
+        self._act(self._exports.lost(source, reason))
+
+    # --- carrying out ------------------------------------------------------------------------------------------
+
+    def _act(self, actions: list[act.Action]) -> None:
+        for action in actions:
+            self._do(action)
+        self._set_timer()
+
+    def _do(self, action: act.Action) -> None:
+        match action:
+            case act.Connect():
+                self._outbound.connect(action)
+                return
+            case act.Disconnect():
+                self._outbound.disconnect(action.source)
+                return
+            case act.Warn():
+                self._warn(action.kind, action.who, action.text)
+                return
+        attached = self._by_number.get(action.peer)
+        if attached is None:
+            return
+        match action:
+            case act.Send():
+                attached.link.send_control(encode(action.message))
+            case act.AddRoute():
+                self._outbound.add_route(action, attached.link)
+            case act.RemoveRoute():
+                self._outbound.remove_route(action, attached.link)
+                attached.link.close_route(action.route)
+            case act.Publish():
+                attached.inbound.publish(action)
+            case act.Retract():
+                attached.inbound.retract(action)
+            case act.Describe():
+                attached.inbound.describe(action)
+            case act.Detach():
+                attached.inbound.detach(action)
+
+    def _warn(self, kind: str, who: str, text: str) -> None:
+        self._refusals.refuse(self._loop.time(), kind, who, text)
+
+    def _set_timer(self) -> None:
+        due = self._imports.next_timer()
+        if self._timer is not None:
+            if self._timer.when() == due:
+                return
+            self._timer.cancel()
+            self._timer = None
+        if due is not None and not self._closed:
+            self._timer = self._loop.call_at(due, self._on_timer)
+
+    def _on_timer(self) -> None:
+        self._timer = None
+        self._act(self._imports.handle_timer(self._loop.time()))

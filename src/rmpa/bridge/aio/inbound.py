@@ -1,0 +1,178 @@
+"""Drives the imports: one proxy node in the local graph for each node of a peer that publishes something."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from rmpa.bridge.aio.flows import ImportFlow
+from rmpa.bridge.proxy_names import LOOPBACK, proxy_name
+from rmpa.core.errors import RmpaError
+from rmpa.ros.aio.publication import Publication
+from rmpa.ros.aio.slave_server import SlaveNode
+from rmpa.ros.tcpros import Description
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from rmpa.bridge.actions import Describe, Detach, Publish, Retract
+    from rmpa.bridge.messages import Source
+    from rmpa.ros.aio.core import RosCore
+
+_log = logging.getLogger(__name__)
+
+
+def _not_here(name: str, reason: str) -> None:
+    """Somebody asked a proxy to end (``rosnode kill``); only its module can do that."""
+    _log.warning("! %s stands for a node of another module and cannot be ended from here (%s)", name, reason)
+
+
+@dataclass(slots=True)
+class Proxy:
+    """A node of a peer, standing in the local graph."""
+
+    node: SlaveNode
+    types: dict[str, str] = field(default_factory=dict)
+    publications: dict[str, Publication] = field(default_factory=dict)
+
+
+class Inbound:
+    """The proxies of one peer.
+
+    Making a proxy binds sockets, which takes a turn of the loop; so what changes the graph is done one after the
+    other by a task, in the order in which it was asked for.
+
+    Args:
+        core: The local core, in which the proxies are registered.
+        prefix: The namespace of this peer's proxies.
+        on_demand: Called with a source and whether somebody local listens to it.
+        on_mismatch: Called with a source, the caller id of a refused subscriber and the text it was told.
+    """
+
+    def __init__(
+        self,
+        core: RosCore,
+        prefix: str,
+        *,
+        on_demand: Callable[[Source, bool], None],
+        on_mismatch: Callable[[Source, str, str], None],
+    ) -> None:
+        self.prefix = prefix
+        self._core = core
+        self._on_demand = on_demand
+        self._on_mismatch = on_mismatch
+        self._proxies: dict[str, Proxy] = {}
+        self._jobs: asyncio.Queue[Publish | Retract | None] = asyncio.Queue()
+        self._task = asyncio.create_task(self._work(), name=f"proxies {prefix}")
+        self.flows: dict[int, ImportFlow] = {}
+        """Open routes; the data path looks here."""
+
+    def __iter__(self) -> Iterator[tuple[str, Proxy]]:
+        """Each remote node and its proxy."""
+        return iter(self._proxies.items())
+
+    def publication(self, source: Source) -> Publication | None:
+        """The local end of a source, if it is there."""
+        proxy = self._proxies.get(source.node)
+        return proxy.publications.get(source.topic) if proxy else None
+
+    def publish(self, action: Publish) -> None:
+        """Let a source appear; takes a moment."""
+        self._jobs.put_nowait(action)
+
+    def retract(self, action: Retract) -> None:
+        """Let a source disappear: its data stops at once, its registration a moment later."""
+        self._jobs.put_nowait(action)
+
+    def describe(self, action: Describe) -> None:
+        """Data of a source will come on a route; its subscribers learn what it is."""
+        publication = self.publication(action.source)
+        if publication is None:
+            return
+        self.flows[action.route] = ImportFlow(publication)
+        about = action.description
+        text = about.definition.encode("latin-1").decode(errors="surrogateescape")
+        publication.describe(Description(about.type, about.md5, text, about.latching))
+
+    def detach(self, action: Detach) -> None:
+        """No data comes on a route any more."""
+        self.flows.pop(action.route, None)
+        publication = self.publication(action.source)
+        if publication is not None:
+            publication.forget_latched()
+
+    def reconcile(self, publishers: Mapping[str, Mapping[str, str]]) -> int:
+        """Register again what is missing from the local graph; return how many that were."""
+        missing = [
+            (proxy, topic)
+            for proxy in self._proxies.values()
+            for topic in proxy.publications
+            if publishers.get(topic, {}).get(proxy.node.name) != proxy.node.uri
+        ]
+        for proxy, topic in missing:
+            self._register(proxy, topic)
+        return len(missing)
+
+    async def close(self) -> None:
+        """Retract everything that is still there."""
+        self.flows.clear()
+        self._jobs.put_nowait(None)
+        await self._task
+
+    async def _work(self) -> None:
+        while (job := await self._jobs.get()) is not None:
+            try:
+                if hasattr(job, "type"):
+                    await self._publish(job.source, job.type)
+                else:
+                    await self._retract(job.source)
+            except (RmpaError, OSError):
+                _log.exception("! %s: %s cannot be carried out", self.prefix, job)
+        for node in list(self._proxies):
+            await self._close_proxy(node)
+
+    async def _publish(self, source: Source, type_name: str) -> None:
+        proxy = self._proxies.get(source.node)
+        if proxy is None:
+            name = proxy_name(self.prefix, source.node)
+            node = SlaveNode(name, LOOPBACK, self._core.uri, on_shutdown=lambda reason: _not_here(name, reason))
+            await node.start()
+            proxy = self._proxies[source.node] = Proxy(node)
+        publication = Publication(
+            source.topic,
+            proxy.node.name,
+            on_first_subscriber=lambda: self._on_demand(source, True),
+            on_last_subscriber=lambda: self._on_demand(source, False),
+            on_mismatch=lambda fields, text: self._on_mismatch(source, fields.get("callerid", ""), text),
+        )
+        proxy.node.add_publication(publication)
+        proxy.publications[source.topic] = publication
+        proxy.types[source.topic] = type_name
+        self._register(proxy, source.topic)
+
+    async def _retract(self, source: Source) -> None:
+        proxy = self._proxies.get(source.node)
+        publication = proxy.publications.pop(source.topic, None) if proxy else None
+        if proxy is None or publication is None:
+            return
+        del proxy.types[source.topic]
+        self._core.call("unregisterPublisher", proxy.node.name, source.topic, proxy.node.uri)
+        # rospy never leaves a publisher because the master says so: it must be hung up on.
+        proxy.node.remove_publication(source.topic)
+        if not proxy.publications:
+            await self._close_proxy(source.node)
+
+    async def _close_proxy(self, node: str) -> None:
+        proxy = self._proxies.pop(node)
+        for topic in proxy.publications:
+            self._core.call("unregisterPublisher", proxy.node.name, topic, proxy.node.uri)
+        await proxy.node.close()
+
+    def _register(self, proxy: Proxy, topic: str) -> None:
+        code, status, _ = self._core.call(
+            "registerPublisher", proxy.node.name, topic, proxy.types[topic], proxy.node.uri
+        )
+        if code != 1:
+            _log.error("! the local core does not take %s of %s: %s", topic, proxy.node.name, status)

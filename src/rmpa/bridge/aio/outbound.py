@@ -1,0 +1,116 @@
+"""Drives the exports: one subscription to each local publisher that some peer wants."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+from rmpa.bridge.aio.flows import DataLink, ExportFlow
+from rmpa.bridge.messages import Description, Source
+from rmpa.bridge.policy import OWN_NODE
+from rmpa.ros.aio.subscription import PublisherConnection
+from rmpa.ros.tcpros import Description as TcprosDescription
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from rmpa.bridge.actions import AddRoute, Connect, RemoveRoute
+    from rmpa.ros.aio.core import RosCore
+    from rmpa.ros.aio.slave_server import SlaveNode
+
+_log = logging.getLogger(__name__)
+
+
+class Outbound:
+    """Subscriptions to local publishers, as the agent's own node.
+
+    Args:
+        core: The local core; the agent's subscriptions are registered there, so that the stock tools show them.
+        node: The agent's own node.
+        on_described: Called with a source and its publisher's header.
+        on_lost: Called with a source and a reason when its publisher is no longer connected.
+    """
+
+    def __init__(
+        self,
+        core: RosCore,
+        node: SlaveNode,
+        *,
+        on_described: Callable[[Source, Description], None],
+        on_lost: Callable[[Source, str], None],
+    ) -> None:
+        self._core = core
+        self._node = node
+        self._on_described = on_described
+        self._on_lost = on_lost
+        self._connections: dict[Source, PublisherConnection] = {}
+        self._flows: dict[Source, ExportFlow] = {}
+
+    @property
+    def flows(self) -> Mapping[Source, ExportFlow]:
+        """What flows, for the monitor."""
+        return self._flows
+
+    def connect(self, action: Connect) -> None:
+        """Subscribe to one publisher; its answer comes by ``on_described`` or ``on_lost``."""
+        source = action.source
+        flow = self._flows[source] = ExportFlow()
+        if sum(s.topic == source.topic for s in self._flows) == 1:
+            self._core.call("registerSubscriber", OWN_NODE, source.topic, "*", self._node.uri)
+        _log.debug("> subscribe to %s at %s", source, action.uri)
+        connection = PublisherConnection(
+            source.topic,
+            action.uri,
+            OWN_NODE,
+            on_message=flow.message,
+            on_header=lambda fields: self._header(source, fields),
+            on_refused=lambda text: self._gone(source, connection, f"its publisher refuses: {text}"),
+            on_lost=lambda reason: self._gone(source, connection, reason),
+        )
+        self._connections[source] = connection
+        connection.start()
+
+    def disconnect(self, source: Source) -> None:
+        """Leave one publisher."""
+        connection = self._connections.pop(source, None)
+        if connection is not None:
+            connection.close()
+        self._drop(source)
+
+    def add_route(self, action: AddRoute, link: DataLink) -> None:
+        """Send a source to one more peer."""
+        self._flows[action.source].add(link, action.route)
+
+    def remove_route(self, action: RemoveRoute, link: DataLink) -> None:
+        """Send a source to a peer no longer."""
+        flow = self._flows.get(action.source)
+        if flow is not None:
+            flow.remove(link, action.route)
+
+    def close(self) -> None:
+        """Leave all publishers."""
+        for source in list(self._connections):
+            self.disconnect(source)
+
+    def _header(self, source: Source, fields: Mapping[str, str]) -> None:
+        about = TcprosDescription.from_header(fields)
+        text = about.definition.encode(errors="surrogateescape").decode("latin-1")
+        description = Description(about.type, about.md5sum, text, about.latching)
+        if description.problem:
+            self._gone(source, self._connections[source], description.problem)
+            return
+        self._flows[source].latching = description.latching
+        self._on_described(source, description)
+
+    def _gone(self, source: Source, connection: PublisherConnection, reason: str) -> None:
+        if self._connections.get(source) is not connection:
+            return
+        self._connections.pop(source).close()
+        _log.info("= %s: %s", source, reason)
+        self._on_lost(source, reason)
+        self._drop(source)
+        self._core.suspect(source.node)
+
+    def _drop(self, source: Source) -> None:
+        if self._flows.pop(source, None) is not None and not any(s.topic == source.topic for s in self._flows):
+            self._core.call("unregisterSubscriber", OWN_NODE, source.topic, self._node.uri)

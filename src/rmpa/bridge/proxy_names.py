@@ -1,0 +1,44 @@
+"""Under which names the nodes of other modules stand in the local graph."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from rmpa.bridge.policy import OWN_NODE
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from rmpa.core.identity import Identity
+
+
+LOOPBACK: Final = "127.0.0.1"
+"""Where proxies listen: only nodes of this module may reach them."""
+
+
+def proxy_prefix(peer: Identity, taken: Collection[str]) -> str:
+    """The namespace of one peer's proxies: ``/rmpa/<name>``.
+
+    Args:
+        peer: Who it is.
+        taken: Prefixes of the other links; two peers of one name must not share one, or their nodes would push
+            each other out of the graph.
+    """
+    prefix = f"{OWN_NODE}/{peer.name}"
+    if prefix in taken:
+        address, port = peer.guid.endpoint
+        prefix = f"{prefix}_{address.replace('.', '_')}_{port}"
+    return prefix
+
+
+def proxy_name(prefix: str, node: str) -> str:
+    """The proxy of a remote node: ``/rmpa/joystick`` and ``/joy_node`` give ``/rmpa/joystick/joy_node``."""
+    return prefix + node
+
+
+def proxied_node(name: str) -> tuple[str, str] | None:
+    """Whom a local node's name stands for: ``(peer's name, its node)``, or ``None`` for a node of this module."""
+    if not name.startswith(OWN_NODE + "/"):
+        return None
+    peer, slash, node = name[len(OWN_NODE) + 1 :].partition("/")
+    return (peer, slash + node) if node else None
