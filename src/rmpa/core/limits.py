@@ -206,6 +206,8 @@ XMLRPC_DEPTH_MAX: Final = 256
 """XML elements inside each other: some eighty arrays in arrays; nobody's parameters come near."""
 XMLRPC_ELEMENTS_MAX: Final = 1_000_000
 """XML elements in one body: what 8 MiB of short numbers have, at some hundred bytes of memory each."""
+PARAM_DEPTH_MAX: Final = 64
+"""Namespaces inside each other in one parameter's name; more is an attack on the recursion."""
 SLAVE_CALL_TIMEOUT: Final = 3.0
 """For one XML-RPC call to a node; a stopped node must not hold the others up."""
 NODE_CHECK_INTERVAL: Final = 5.0

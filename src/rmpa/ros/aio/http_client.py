@@ -192,9 +192,8 @@ async def call(
             "XML-RPC server", uri, f"no answer to {method} in {timeout:g} s; is that program stopped?"
         ) from error
     except OSError as error:
-        raise UnreachableError(
-            "XML-RPC server", uri, f"{error.strerror or error}; is that program running?"
-        ) from error
+        problem = os.strerror(error.errno) if error.errno else str(error)
+        raise UnreachableError("XML-RPC server", uri, f"{problem}; is that program running?") from error
     except h11.RemoteProtocolError as error:
         raise RemoteProtocolError(f"{uri} does not speak HTTP: {error}") from error
     return parse_response(body)

@@ -1,0 +1,296 @@
+"""The Master API and the Parameter Server API (wiki.ros.org/ROS/Master_API, …/Parameter_Server_API).
+
+A drop-in for rosmaster 1.15: the same methods, codes and values, the same calls to slaves in the same order. The
+status texts are our own.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from rmpa.ros.master import parameters as params
+from rmpa.ros.master import validators as v
+from rmpa.ros.master.effects import Effect, GraphChange, GraphState, Kind
+from rmpa.ros.master.registrations import Registrations
+from rmpa.ros.master.resolution import with_slash
+from rmpa.ros.xmlrpc import Reply, RosFault, XmlRpcValue, brief
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+_log = logging.getLogger(__name__)
+
+SUCCESS: Final = 1
+FAILURE: Final = 0
+ERROR: Final = -1
+
+
+@dataclass(frozen=True, slots=True)
+class _Method:
+    """One method of the API: its parameters behind ``caller_id``, and the value of a reply that says no."""
+
+    function: Callable[..., Reply]
+    parameters: tuple[tuple[str, v.Validator], ...]
+    error_value: XmlRpcValue
+
+
+class MasterApi:
+    """One master with its parameter server.
+
+    Args:
+        uri: What ``getUri`` answers.
+        pid: What ``getPid`` answers.
+        on_shutdown: Called with the reason when somebody asks the master to end.
+    """
+
+    def __init__(self, uri: str, pid: int, on_shutdown: Callable[[str], None]) -> None:
+        self.uri = uri
+        self._pid = pid
+        self._on_shutdown = on_shutdown
+        self.registrations = Registrations()
+        self.parameters = params.Parameters()
+        self._methods = self._table()
+
+    # --- calling ----------------------------------------------------------------------------------------------
+
+    @property
+    def methods(self) -> list[str]:
+        """The names of all methods, in order."""
+        return sorted([*self._methods, "system.listMethods", "system.multicall"])
+
+    def call(self, method: str, arguments: Sequence[XmlRpcValue]) -> Reply:
+        """Call a method of the Master or Parameter Server API.
+
+        Args:
+            method: Its name.
+            arguments: What it is called with, the caller id first.
+
+        Returns:
+            Code 1 with the value; or 0 or -1 with text and a value of the same kind.
+
+        Raises:
+            RosFault: There is no such method.
+        """
+        found = self._methods.get(method)
+        if found is None:
+            raise RosFault(1, f"this master has no method {brief(method)}; system.listMethods names them")
+        if len(arguments) != 1 + len(found.parameters):
+            wanted = ", ".join(["caller_id", *(name for name, _ in found.parameters)])
+            return Reply(ERROR, f"{method} takes ({wanted}), not {len(arguments)} parameters", found.error_value)
+        caller_id, *rest = arguments
+        if not isinstance(caller_id, str):
+            return Reply(ERROR, f"caller_id must be a string, not {brief(caller_id)}", found.error_value)
+        try:
+            checked = [
+                check(value, name, caller_id) for (name, check), value in zip(found.parameters, rest, strict=True)
+            ]
+        except v.InvalidParameterError as error:
+            _log.info("! %s: %s: %s", caller_id, method, error)
+            return Reply(ERROR, str(error), found.error_value)
+        return found.function(caller_id, *checked)
+
+    def answer(self, method: str, arguments: Sequence[XmlRpcValue]) -> XmlRpcValue:
+        """Answer an XML-RPC call: one of the API's, ``system.listMethods`` or ``system.multicall``.
+
+        Raises:
+            RosFault: There is no such method, or a system method is called wrongly.
+        """
+        if method == "system.multicall":
+            return self._multicall(arguments)
+        if method == "system.listMethods":
+            return self.methods
+        return list(self.call(method, arguments))
+
+    def _multicall(self, arguments: Sequence[XmlRpcValue]) -> XmlRpcValue:
+        match arguments:
+            case [list(calls)] | [tuple(calls)]:
+                return [self._one_of_many(call) for call in calls]
+        raise RosFault(1, "system.multicall takes one list of {methodName, params}")
+
+    def _one_of_many(self, call: XmlRpcValue) -> XmlRpcValue:
+        match call:
+            case {"methodName": "system.multicall"}:
+                problem = RosFault(1, "system.multicall cannot be called within itself")
+            case {"methodName": str(method), "params": list(arguments)}:
+                try:
+                    return [self.answer(method, arguments)]
+                except RosFault as fault:
+                    problem = fault
+            case _:
+                problem = RosFault(1, f"{brief(call)} is not a struct of methodName and params")
+        return {"faultCode": problem.code, "faultString": problem.text}
+
+    def take(self) -> tuple[list[Effect], list[GraphChange]]:
+        """Take what is to be done and what has changed since the last time, in order."""
+        taken = self.registrations.effects, self.registrations.changes
+        self.registrations.effects, self.registrations.changes = [], []
+        return taken
+
+    def state(self) -> GraphState:
+        """All registrations."""
+        return self.registrations.state()
+
+    # --- the node's own API -----------------------------------------------------------------------------------
+
+    def _shutdown(self, caller_id: str, reason: XmlRpcValue) -> Reply:
+        _log.warning("< %s asks this core to end: %s", caller_id, brief(reason))
+        self._on_shutdown(f"{caller_id}: {brief(reason)}")
+        return Reply(SUCCESS, "the core ends", 0)
+
+    def _get_uri(self, _caller_id: str) -> Reply:
+        return Reply(SUCCESS, "", self.uri)
+
+    def _get_pid(self, _caller_id: str) -> Reply:
+        return Reply(SUCCESS, "", self._pid)
+
+    # --- parameters -------------------------------------------------------------------------------------------
+
+    def _delete_param(self, _caller_id: str, key: str) -> Reply:
+        try:
+            self.parameters.delete(key)
+        except KeyError:
+            return Reply(ERROR, f"there is no parameter {key} to delete", 0)
+        self.registrations.effects += params.updates(self.registrations.param_subscribers(), key, {})
+        return Reply(SUCCESS, f"deleted {key}", 0)
+
+    def _set_param(self, caller_id: str, key: str, value: XmlRpcValue) -> Reply:
+        try:
+            self.parameters.set(key, value)
+        except TypeError as error:
+            return Reply(ERROR, str(error), 0)
+        self.registrations.effects += params.updates(self.registrations.param_subscribers(), key, value, caller_id)
+        return Reply(SUCCESS, f"set {key}", 0)
+
+    def _get_param(self, _caller_id: str, key: str) -> Reply:
+        try:
+            return Reply(SUCCESS, f"the value of {key}", self.parameters.get(key))
+        except KeyError:
+            return Reply(ERROR, f"there is no parameter {key}", 0)
+
+    def _search_param(self, caller_id: str, key: str) -> Reply:
+        try:
+            found = self.parameters.search(caller_id, key)
+        except ValueError as error:
+            return Reply(FAILURE, str(error), 0)
+        if found is None:
+            return Reply(ERROR, f"there is no {key} in {caller_id} or above", "")
+        return Reply(SUCCESS, f"found {found}", found)
+
+    def _subscribe_param(self, caller_id: str, api: str, key: str) -> Reply:
+        value = self.parameters.get(key) if self.parameters.has(key) else {}
+        self.registrations.subscribe_param(with_slash(key), caller_id, api)
+        return Reply(SUCCESS, f"subscribed to parameter {key}", value)
+
+    def _unsubscribe_param(self, caller_id: str, api: str, key: str) -> Reply:
+        self.registrations.unregister(Kind.PARAM, with_slash(key), caller_id, api)
+        # Whether it was subscribed or not: rosmaster says 1.
+        return Reply(SUCCESS, f"not subscribed to parameter {key}", 1)
+
+    def _has_param(self, _caller_id: str, key: str) -> Reply:
+        # The name is the status: clients of old look there.
+        return Reply(SUCCESS, key, self.parameters.has(key))
+
+    def _get_param_names(self, _caller_id: str) -> Reply:
+        return Reply(SUCCESS, "the names of all parameters", self.parameters.names())
+
+    # --- services ---------------------------------------------------------------------------------------------
+
+    def _register_service(self, caller_id: str, service: str, uri: str, api: str) -> Reply:
+        self.registrations.register_service(service, uri, caller_id, api)
+        return Reply(SUCCESS, f"{caller_id} provides {service}", 1)
+
+    def _unregister_service(self, caller_id: str, service: str, uri: str) -> Reply:
+        found = self.registrations.unregister_service(service, uri, caller_id)
+        return _unregistered(caller_id, service, found=found)
+
+    def _lookup_service(self, _caller_id: str, service: str) -> Reply:
+        uri = self.registrations.service_uri(service)
+        if uri is None:
+            return Reply(ERROR, f"nobody provides {service}", "")
+        return Reply(SUCCESS, f"the provider of {service}", uri)
+
+    # --- topics -----------------------------------------------------------------------------------------------
+
+    def _register_subscriber(self, caller_id: str, topic: str, topic_type: str, api: str) -> Reply:
+        self.registrations.register_subscriber(topic, topic_type, caller_id, api)
+        publishers = self.registrations.apis(Kind.PUBLISHER, topic)
+        return Reply(SUCCESS, f"{caller_id} subscribes to {topic}", publishers)
+
+    def _unregister_subscriber(self, caller_id: str, topic: str, api: str) -> Reply:
+        found = self.registrations.unregister(Kind.SUBSCRIBER, topic, caller_id, api)
+        return _unregistered(caller_id, topic, found=found)
+
+    def _register_publisher(self, caller_id: str, topic: str, topic_type: str, api: str) -> Reply:
+        self.registrations.register_publisher(topic, topic_type, caller_id, api)
+        subscribers = self.registrations.apis(Kind.SUBSCRIBER, topic)
+        return Reply(SUCCESS, f"{caller_id} publishes {topic}", subscribers)
+
+    def _unregister_publisher(self, caller_id: str, topic: str, api: str) -> Reply:
+        found = self.registrations.unregister(Kind.PUBLISHER, topic, caller_id, api)
+        return _unregistered(caller_id, topic, found=found)
+
+    # --- the graph --------------------------------------------------------------------------------------------
+
+    def _lookup_node(self, _caller_id: str, node: str) -> Reply:
+        api = self.registrations.node_api(node)
+        if api is None:
+            return Reply(ERROR, f"no node {node} is registered here", "")
+        return Reply(SUCCESS, f"the API of {node}", api)
+
+    def _get_published_topics(self, _caller_id: str, subgraph: str) -> Reply:
+        prefix = subgraph if not subgraph or subgraph.endswith("/") else f"{subgraph}/"
+        types = self.registrations.types()
+        found = [[topic, types[topic]] for topic in self.registrations.published() if topic.startswith(prefix)]
+        return Reply(SUCCESS, "the topics that somebody publishes", found)
+
+    def _get_topic_types(self, _caller_id: str) -> Reply:
+        return Reply(
+            SUCCESS, "the topics and their types", [list(item) for item in self.registrations.types().items()]
+        )
+
+    def _get_system_state(self, _caller_id: str) -> Reply:
+        tables = [self.registrations.providers(kind) for kind in (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)]
+        return Reply(SUCCESS, "publishers, subscribers and services", tables)
+
+    def _table(self) -> dict[str, _Method]:
+        def method(function: Callable[..., Reply], error_value: XmlRpcValue, **parameters: v.Validator) -> _Method:
+            return _Method(function, tuple(parameters.items()), error_value)
+
+        return {
+            "shutdown": method(self._shutdown, 0, msg=v.anything),
+            "getUri": method(self._get_uri, ""),
+            "getPid": method(self._get_pid, -1),
+            "deleteParam": method(self._delete_param, 0, key=v.key),
+            "setParam": method(self._set_param, 0, key=v.key, value=v.present),
+            "getParam": method(self._get_param, 0, key=v.key),
+            "searchParam": method(self._search_param, 0, key=v.text),
+            "subscribeParam": method(self._subscribe_param, 0, caller_api=v.uri, key=v.key),
+            "unsubscribeParam": method(self._unsubscribe_param, 0, caller_api=v.uri, key=v.key),
+            "hasParam": method(self._has_param, False, key=v.key),
+            "getParamNames": method(self._get_param_names, []),
+            "registerService": method(
+                self._register_service, 0, service=v.resource, service_api=v.uri, caller_api=v.uri
+            ),
+            "unregisterService": method(self._unregister_service, 0, service=v.resource, service_api=v.uri),
+            "lookupService": method(self._lookup_service, "", service=v.resource),
+            "registerSubscriber": method(
+                self._register_subscriber, [], topic=v.resource, topic_type=v.type_name, caller_api=v.uri
+            ),
+            "unregisterSubscriber": method(self._unregister_subscriber, 0, topic=v.resource, caller_api=v.uri),
+            "registerPublisher": method(
+                self._register_publisher, [], topic=v.resource, topic_type=v.type_name, caller_api=v.uri
+            ),
+            "unregisterPublisher": method(self._unregister_publisher, 0, topic=v.resource, caller_api=v.uri),
+            "lookupNode": method(self._lookup_node, "", node=v.node_name),
+            "getPublishedTopics": method(self._get_published_topics, 0, subgraph=v.subgraph),
+            "getTopicTypes": method(self._get_topic_types, []),
+            "getSystemState": method(self._get_system_state, [[], [], []]),
+        }
+
+
+def _unregistered(caller_id: str, name: str, *, found: bool) -> Reply:
+    if found:
+        return Reply(SUCCESS, f"{caller_id} is no longer registered for {name}", 1)
+    return Reply(SUCCESS, f"{caller_id} was not registered for {name} with that URI", 0)

@@ -1,0 +1,186 @@
+"""The parameter tree, and who is to be told what of a change.
+
+The tree is never changed in place: a change copies the dicts along its path, so whatever was handed out stays as it
+was. Keys are resolved names; a value that is a dict is a namespace.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeAlias
+
+from rmpa.ros.master.effects import ParamUpdate
+from rmpa.ros.master.resolution import join, with_slash
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from rmpa.ros.xmlrpc import XmlRpcValue
+
+Tree: TypeAlias = "dict[str, XmlRpcValue]"
+
+
+def _parts(key: str) -> list[str]:
+    return [part for part in key.split("/") if part]
+
+
+def _plain(value: XmlRpcValue) -> XmlRpcValue:
+    """A copy made of dicts and lists, that shares nothing with the caller's."""
+    if isinstance(value, dict):
+        return {name: _plain(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    return value
+
+
+def _with(tree: Tree, parts: list[str], value: XmlRpcValue) -> Tree:
+    first, *rest = parts
+    copy = dict(tree)
+    if rest:
+        below = tree.get(first)
+        copy[first] = _with(below if isinstance(below, dict) else {}, rest, value)
+    else:
+        copy[first] = value
+    return copy
+
+
+def _without(tree: Tree, parts: list[str]) -> Tree:
+    first, *rest = parts
+    copy = dict(tree)
+    if rest:
+        below = tree[first]
+        if not isinstance(below, dict):
+            raise KeyError(first)
+        copy[first] = _without(below, rest)
+    else:
+        del copy[first]
+    return copy
+
+
+class Parameters:
+    """The tree of one parameter server."""
+
+    def __init__(self) -> None:
+        self._tree: Tree = {}
+
+    def get(self, key: str) -> XmlRpcValue:
+        """The value or the namespace at ``key``; ``/`` is the whole tree. Not to be changed.
+
+        Raises:
+            KeyError: There is none.
+        """
+        value: XmlRpcValue = self._tree
+        for part in _parts(key):
+            if not isinstance(value, dict):
+                raise KeyError(key)
+            value = value[part]
+        return value
+
+    def has(self, key: str) -> bool:
+        """Whether there is a value or a namespace, also an empty one, at ``key``."""
+        try:
+            self.get(key)
+        except KeyError:
+            return False
+        return True
+
+    def set(self, key: str, value: XmlRpcValue) -> None:
+        """Put a value or a namespace at ``key``; what was there is gone, a value on the way becomes a namespace.
+
+        Raises:
+            TypeError: The root is set to something that is no dict.
+        """
+        value = _plain(value)
+        parts = _parts(key)
+        if parts:
+            self._tree = _with(self._tree, parts, value)
+        elif isinstance(value, dict):
+            self._tree = value
+        else:
+            raise TypeError("the root of the parameter tree can only be set to a dictionary")
+
+    def delete(self, key: str) -> None:
+        """Take ``key`` away.
+
+        Raises:
+            KeyError: There is none, or it is the root.
+        """
+        parts = _parts(key)
+        if not parts:
+            raise KeyError(key)
+        self._tree = _without(self._tree, parts)
+
+    def names(self) -> list[str]:
+        """The full names of all values; an empty namespace has none."""
+        return list(_names("/", self._tree))
+
+    def search(self, namespace: str, key: str) -> str | None:
+        """Find ``key`` in ``namespace`` or the nearest one above it.
+
+        Only the first part of ``key`` has to exist, as in rosmaster: a search for ``robot/arm`` stops at the
+        nearest ``robot``, whether it has an ``arm`` or not.
+
+        Raises:
+            ValueError: ``key`` is private or empty, or ``namespace`` is not global.
+        """
+        if not key or key.startswith("~"):
+            raise ValueError(f"{key!r} cannot be searched for: write a relative or a global name")
+        if not namespace.startswith("/"):
+            raise ValueError(f"{namespace!r} is not a global name to search from")
+        if key.startswith("/"):
+            return key if self.has(key) else None
+        first = _parts(key)[0]
+        if self.has(join(namespace, first)):
+            return join(namespace, key)
+        above = _parts(namespace)
+        while above:
+            above.pop()
+            if self.has("/" + "/".join([*above, first])):
+                return "/" + "/".join([*above, key])
+        return None
+
+
+def _names(namespace: str, tree: Tree) -> Iterator[str]:
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from _names(join(namespace, name), value)
+        else:
+            yield join(namespace, name)
+
+
+def _below(key: str, value: XmlRpcValue) -> Iterator[tuple[str, XmlRpcValue]]:
+    """Every key below ``key`` with its value, the namespaces before what is in them."""
+    if isinstance(value, dict):
+        for name, part in value.items():
+            full = join(key, name) + "/"
+            yield full, part
+            yield from _below(full, part)
+
+
+def updates(
+    subscribers: Mapping[str, Mapping[str, str]], key: str, value: XmlRpcValue, setter: str | None = None
+) -> list[ParamUpdate]:
+    """Who is to be told what after a parameter was set or deleted.
+
+    Args:
+        subscribers: Subscribed keys, each ending in ``/``, with nodes and their slave APIs.
+        key: The key that changed.
+        value: What it is now; deleted is ``{}``.
+        setter: The node that set it, which is not told of its own namespace's change.
+
+    Returns:
+        In rosmaster's order: first those who subscribed the key or a namespace above it, or something below that is
+        gone; then those who subscribed something below that is there.
+    """
+    if not subscribers:
+        return []
+    key = with_slash(key)
+    below = dict(_below(key, value))
+    found: list[ParamUpdate] = []
+    for subscribed, nodes in subscribers.items():
+        if key.startswith(subscribed):
+            found += [ParamUpdate(api, key, value) for node, api in nodes.items() if node != setter]
+        elif isinstance(value, dict) and subscribed.startswith(key) and subscribed not in below:
+            found += [ParamUpdate(api, subscribed, {}) for api in nodes.values()]
+    for full, part in below.items():
+        found += [ParamUpdate(api, full, part) for api in subscribers.get(full, {}).values()]
+    return found

@@ -1,0 +1,91 @@
+"""Checks of the Master API's parameters: what rosmaster answers with code -1, and nothing stricter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+from rmpa.core import limits
+from rmpa.ros.master.registrations import ANY_TYPE
+from rmpa.ros.master.resolution import resolve
+from rmpa.ros.xmlrpc import XmlRpcValue, brief
+
+
+class InvalidParameterError(Exception):
+    """A parameter that the caller has to correct; the text says which and how. Never leaves this room."""
+
+
+Validator: TypeAlias = Callable[[XmlRpcValue, str, str], XmlRpcValue]
+"""``(value, the parameter's name, caller id) -> the value to use``; raises ``InvalidParameterError``."""
+
+
+def anything(value: XmlRpcValue, name: str, caller_id: str) -> XmlRpcValue:  # noqa: ARG001 - a Validator
+    """Every value will do."""
+    return value
+
+
+def present(value: XmlRpcValue, name: str, caller_id: str) -> XmlRpcValue:  # noqa: ARG001 - a Validator
+    """Anything that can be written in XML-RPC again: nil cannot, at no depth."""
+    if _has_nil(value):
+        raise InvalidParameterError(f"{name} is nil or contains one, which ROS does not have")
+    return value
+
+
+def _has_nil(value: XmlRpcValue) -> bool:
+    if isinstance(value, dict):
+        return any(_has_nil(part) for part in value.values())
+    if isinstance(value, list | tuple):
+        return any(_has_nil(part) for part in value)
+    return value is None
+
+
+def text(value: XmlRpcValue, name: str, caller_id: str) -> str:  # noqa: ARG001 - a Validator
+    """A string that is not empty."""
+    if not isinstance(value, str) or not value:
+        raise InvalidParameterError(f"{name} must be a non-empty string, not {brief(value)}")
+    return value
+
+
+def key(value: XmlRpcValue, name: str, caller_id: str) -> str:
+    """A parameter's name, resolved."""
+    resolved = resolve(text(value, name, caller_id), caller_id)
+    if resolved.count("/") > limits.PARAM_DEPTH_MAX:
+        raise InvalidParameterError(f"{name} has more than {limits.PARAM_DEPTH_MAX} namespaces")
+    return resolved
+
+
+def node_name(value: XmlRpcValue, name: str, caller_id: str) -> str:
+    """A graph name, resolved; what looks like a URI is none."""
+    given = text(value, name, caller_id)
+    if ":" in given or " " in given:
+        raise InvalidParameterError(f"{name} {brief(given)} is not a graph name: it has a colon or a space in it")
+    return resolve(given, caller_id)
+
+
+def resource(value: XmlRpcValue, name: str, caller_id: str) -> str:
+    """The name of a topic or service, resolved; not the root."""
+    resolved = node_name(value, name, caller_id)
+    if value == "/":
+        raise InvalidParameterError(f"{name} cannot be the root namespace")
+    return resolved
+
+
+def subgraph(value: XmlRpcValue, name: str, caller_id: str) -> str:
+    """A namespace, resolved, or the empty string for all."""
+    if not isinstance(value, str):
+        raise InvalidParameterError(f"{name} must be a string, not {brief(value)}")
+    return resolve(value, caller_id) if value else ""
+
+
+def uri(value: XmlRpcValue, name: str, caller_id: str) -> str:  # noqa: ARG001 - a Validator
+    """A URI of an API. It is kept as it is: roscpp recognises itself by its exact text."""
+    if not isinstance(value, str) or not value.startswith(("http://", "rosrpc://")):
+        raise InvalidParameterError(f"{name} must be a URI like http://host:port/ or rosrpc://host:port")
+    return value
+
+
+def type_name(value: XmlRpcValue, name: str, caller_id: str) -> str:  # noqa: ARG001 - a Validator
+    """``package/Name``, or ``*`` for "whatever it is"."""
+    if not isinstance(value, str) or (value != ANY_TYPE and value.count("/") != 1):
+        raise InvalidParameterError(f"{name} must be a type like std_msgs/String or *, not {brief(value)}")
+    return value
