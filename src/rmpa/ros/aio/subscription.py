@@ -229,6 +229,7 @@ class PublisherConnection:
             self._on_header(fields)
             return not self._closed
         self.refused = problem
+        self._drop()
         self._end(None)
         _log.debug("! %s: publisher %s refuses: %s", self.topic, self.uri, problem)
         self._on_refused(problem)
@@ -304,10 +305,15 @@ class Subscription:
         """For ``getBusInfo`` and ``getBusStats``."""
         return [link.connection() for link in self._links.values()]
 
-    def update(self, uris: Iterable[str]) -> None:
-        """Take the list of publishers from the master: connect to the new ones, leave those that are gone."""
+    def update(self, uris: Iterable[str], *, keep: bool = False) -> None:
+        """Take the list of publishers from the master: connect to the new ones, leave those that are gone.
+
+        Args:
+            uris: Their slave APIs.
+            keep: Leave none: the list is from a master that was started anew and does not know all yet.
+        """
         listed = {uri for uri in uris if uri != self._own_uri}
-        for uri in self._links.keys() - listed:
+        for uri in () if keep else self._links.keys() - listed:
             self._leave(uri)
         for uri in listed:
             link = self._links.get(uri)

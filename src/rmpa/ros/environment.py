@@ -1,0 +1,203 @@
+"""What a node is told from outside: the ROS_* variables and the remapping arguments.
+
+Sources: wiki.ros.org/ROS/EnvironmentVariables, wiki.ros.org/Remapping%20Arguments. An argument is stronger than a
+variable. Pure: variables, arguments and the machine's addresses are passed in.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core.errors import ConfigError
+from rmpa.core.names import is_legal_name, resolve_name
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from rmpa.ros.xmlrpc import XmlRpcValue
+
+DEFAULT_MASTER_URI: Final = "http://localhost:11311"
+_URI: Final = re.compile(r"http://(?P<host>\[[0-9A-Fa-f:.]+\]|[^\s/:\[\]]+):(?P<port>[0-9]{1,5})/?")
+_SPECIAL: Final = ("__name", "__ns", "__ip", "__hostname", "__master", "__log")
+_PORT_MAX: Final = 65535
+
+
+@dataclass(frozen=True, slots=True)
+class RosEnvironment:
+    """How a node finds its master and what it is called.
+
+    Args:
+        master_uri: Of the master.
+        host: The address that others are told to connect to.
+        host_given: Whether somebody asked for that address; else it is the first that is not a loopback one.
+        namespace: Global; names are resolved in it.
+        name: What replaces the node's own name, or empty.
+        remappings: Names to names, both as they were written.
+        parameters: Private parameters (``_key:=value``) with their values, keys without the underscore.
+        arguments: The arguments that are none of these.
+    """
+
+    master_uri: str = DEFAULT_MASTER_URI
+    host: str = "127.0.0.1"
+    host_given: bool = False
+    namespace: str = "/"
+    name: str = ""
+    remappings: Mapping[str, str] = field(default_factory=dict)
+    parameters: Mapping[str, XmlRpcValue] = field(default_factory=dict)
+    arguments: tuple[str, ...] = ()
+
+    @classmethod
+    def read(
+        cls, variables: Mapping[str, str], arguments: Sequence[str] = (), addresses: Sequence[str] = ()
+    ) -> RosEnvironment:
+        """Read the variables and the arguments behind the program's name.
+
+        Args:
+            variables: As in ``os.environ``.
+            arguments: As in ``sys.argv[1:]``.
+            addresses: This machine's IPv4 addresses, best first.
+
+        Raises:
+            ConfigError: A variable or an argument cannot be used.
+        """
+        special, remappings, parameters, rest = _split(arguments)
+        host = _first(
+            ("__hostname:=", special.get("__hostname", "")),
+            ("__ip:=", special.get("__ip", "")),
+            ("ROS_HOSTNAME", variables.get("ROS_HOSTNAME", "")),
+            ("ROS_IP", variables.get("ROS_IP", "")),
+        )
+        _check_host(*host)
+        outer = next((address for address in addresses if not is_loopback(address)), "127.0.0.1")
+        return cls(
+            master_uri=_master_uri(special, variables),
+            host=host[1] or outer,
+            host_given=bool(host[1]),
+            namespace=_namespace(special, variables),
+            name=_name(special),
+            remappings=remappings,
+            parameters=parameters,
+            arguments=rest,
+        )
+
+    def node_name(self, name: str) -> str:
+        """The global name of a node that calls itself ``name``.
+
+        Raises:
+            ValueError: It is not a legal name.
+        """
+        return resolve_name(self.name or name, self.namespace)
+
+    def resolve(self, name: str, node: str) -> str:
+        """Resolve and remap a name that a node uses.
+
+        Args:
+            name: As the node writes it.
+            node: The node's global name.
+
+        Raises:
+            ValueError: It is not a legal name.
+        """
+        resolved = resolve_name(name, self.namespace, node)
+        for source, target in self.remappings.items():
+            if resolve_name(source, self.namespace, node) == resolved:
+                return resolve_name(target, self.namespace, node)
+        return resolved
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host, as written in a URI, is this machine only."""
+    return host in ("localhost", "::1", "[::1]") or re.fullmatch(r"127(\.[0-9]+){3}", host) is not None
+
+
+def host_of(uri: str) -> str:
+    """The host in a ROS URI, or empty if it is none."""
+    match = _URI.fullmatch(uri)
+    return match["host"] if match else ""
+
+
+def parse_value(text: str) -> XmlRpcValue:
+    """A parameter's value from the command line: a number, a truth value, a JSON list or object, else the text.
+
+    rosparam reads YAML here; this is the part of it that people type.
+    """
+    lowered = text.strip().lower()
+    if lowered in ("true", "false"):
+        return lowered == "true"
+    if re.fullmatch(r"[+-]?[0-9]+", lowered) and abs(int(lowered)) < 1 << 31:
+        return int(lowered)
+    if re.fullmatch(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?", lowered):
+        return float(lowered)
+    if text[:1] in ("[", "{", '"'):
+        try:
+            value: XmlRpcValue = json.loads(text)
+        except ValueError:
+            return text
+        return value
+    return text
+
+
+def _split(
+    arguments: Sequence[str],
+) -> tuple[dict[str, str], dict[str, str], dict[str, XmlRpcValue], tuple[str, ...]]:
+    special: dict[str, str] = {}
+    remappings: dict[str, str] = {}
+    parameters: dict[str, XmlRpcValue] = {}
+    rest = []
+    for argument in arguments:
+        key, separator, value = argument.partition(":=")
+        if not separator or not key or key.startswith("-"):
+            rest.append(argument)
+        elif key in _SPECIAL:
+            special[key] = value
+        elif key.startswith("__"):
+            raise ConfigError(f"{key}:=", "is not an argument of ROS", f"use one of {', '.join(_SPECIAL)}")
+        elif key.startswith("_"):
+            parameters[key[1:]] = parse_value(value)
+        elif is_legal_name(key) and value and is_legal_name(value):
+            remappings[key] = value
+        else:
+            raise ConfigError(argument, "does not remap one ROS name to another", "write from:=to")
+    return special, remappings, parameters, tuple(rest)
+
+
+def _first(*candidates: tuple[str, str]) -> tuple[str, str]:
+    return next((candidate for candidate in candidates if candidate[1]), ("", ""))
+
+
+def _check_host(source: str, host: str) -> None:
+    if "://" in host:
+        raise ConfigError(source, f"{host!r} is a URI", "write the host alone, without http://")
+    if host and not re.fullmatch(r"[A-Za-z0-9_.:-]+", host):
+        raise ConfigError(source, f"{host!r} is neither a host name nor an address")
+
+
+def _master_uri(special: Mapping[str, str], variables: Mapping[str, str]) -> str:
+    source, uri = _first(
+        ("__master:=", special.get("__master", "")), ("ROS_MASTER_URI", variables.get("ROS_MASTER_URI", ""))
+    )
+    if not uri:
+        return DEFAULT_MASTER_URI
+    match = _URI.fullmatch(uri.strip())
+    if match is None or not 0 < int(match["port"]) <= _PORT_MAX:
+        raise ConfigError(source, f"{uri!r} is not a master's URI", f"write it like {DEFAULT_MASTER_URI}")
+    return uri.strip()
+
+
+def _namespace(special: Mapping[str, str], variables: Mapping[str, str]) -> str:
+    source, namespace = _first(
+        ("__ns:=", special.get("__ns", "")), ("ROS_NAMESPACE", variables.get("ROS_NAMESPACE", ""))
+    )
+    if not is_legal_name(namespace) or namespace.startswith("~"):
+        raise ConfigError(source, f"{namespace!r} is not a namespace", "write it like /robot")
+    return resolve_name(namespace)
+
+
+def _name(special: Mapping[str, str]) -> str:
+    name = special.get("__name", "")
+    if not is_legal_name(name) or name.startswith("~") or "/" in name:
+        raise ConfigError("__name:=", f"{name!r} is not a node's base name", "use letters, digits and _, and __ns:=")
+    return name
