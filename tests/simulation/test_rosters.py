@@ -1,0 +1,40 @@
+"""Rosters alone, in thousands of small networks and some large ones.
+
+``RMPA_SIMULATION_SEEDS=20`` runs twenty times as many; ``python -m tests.simulation --seed N --peers M`` one.
+"""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from tests.simulation.scenario import Scenario
+
+FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
+BLOCK = 50
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5])
+@pytest.mark.parametrize("block", range(5 * FACTOR))
+def test_small_networks_agree_after_healing(count: int, block: int) -> None:
+    for seed in range(block * BLOCK, (block + 1) * BLOCK):
+        Scenario(seed, count).play()
+
+
+@pytest.mark.parametrize("block", range(10 * FACTOR))
+def test_networks_of_ten_agree_after_healing(block: int) -> None:
+    for seed in range(block * 10, (block + 1) * 10):
+        Scenario(seed, 10).play()
+
+
+@pytest.mark.parametrize("seed", range(3 * FACTOR))
+def test_networks_of_fifty_agree_after_healing(seed: int) -> None:
+    Scenario(seed, 50).play()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_one_seed_gives_one_run(seed: int) -> None:
+    first, second = (Scenario(seed, 4).play() for _ in range(2))
+    assert first == second
+    assert first.trace_hash != Scenario(seed + 1000, 4).play().trace_hash
