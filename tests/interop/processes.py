@@ -42,6 +42,7 @@ class Process:
     Args:
         argv: The command.
         env: Its whole environment.
+        commands: Whether ``tell`` can write to its standard input, which is empty otherwise.
         name: How failures call it; default: the command's last path component.
         log: A file that gets every line as well.
         pass_fds: File descriptors that it inherits.
@@ -53,6 +54,7 @@ class Process:
         *,
         env: Mapping[str, str] | None = None,
         name: str = "",
+        commands: bool = False,
         log: Path | None = None,
         pass_fds: Sequence[int] = (),
     ) -> None:
@@ -67,7 +69,7 @@ class Process:
         self._child = subprocess.Popen(
             [*_tied_to_us(), *self.argv],
             env=dict(os.environ if env is None else env),
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.PIPE if commands else subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             process_group=0,
@@ -151,6 +153,12 @@ class Process:
         """Do as ``wait_event`` does, without blocking the event loop."""
         return await asyncio.to_thread(self.wait_event, kind, timeout, where=where, since=since)
 
+    def tell(self, line: str) -> None:
+        """Write one line to its standard input."""
+        assert self._child.stdin, "made without commands"
+        self._child.stdin.write(line + "\n")
+        self._child.stdin.flush()
+
     # --- its life -----------------------------------------------------------------------------------------------
 
     @property
@@ -217,7 +225,10 @@ class Process:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._child.pid, signal.SIGKILL)  # children that outlived it, still in its group
         self._reader.join(2.0)
-        if not self._reader.is_alive() and self._child.stdout:
+        if self._child.stdin:
+            with contextlib.suppress(BrokenPipeError):
+                self._child.stdin.close()
+        if self._child.stdout and not self._reader.is_alive():
             self._child.stdout.close()
         if self._log:
             self._log.close()

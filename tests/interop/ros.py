@@ -105,10 +105,12 @@ class Ros:
         while self._started:
             self._started.pop().end()
 
-    def start(self, *argv: str | Path, name: str = "", env: Mapping[str, str] | None = None) -> Process:
-        """Start any program in this shell."""
+    def start(
+        self, *argv: str | Path, name: str = "", env: Mapping[str, str] | None = None, commands: bool = False
+    ) -> Process:
+        """Start any program in this shell; arguments as of ``Process``."""
         where = f"{name or Path(argv[0]).name}@{self.host.name}"
-        process = Process(self.host.command(argv), env={**self.env, **(env or {})}, name=where)
+        process = Process(self.host.command(argv), env={**self.env, **(env or {})}, name=where, commands=commands)
         self._started.append(process)
         return process
 
@@ -129,17 +131,24 @@ class Ros:
         self._wait_master()
         return process
 
-    def rospy(self, program: str, *remaps: str, **options: object) -> Process:
+    def rospy(
+        self, program: str, *remaps: str, nodes: Path = NODES, commands: bool = False, **options: object
+    ) -> Process:
         """Start ``nodes/PROGRAM.py``; ``remaps`` are ROS arguments such as ``__name:=x``."""
-        return self.start(PYTHON, NODES / f"{program}.py", *_words(options), *remaps, name=f"{program}.py")
+        env = {"PYTHONPATH": str(NODES)}
+        argv: list[str | Path] = [PYTHON, nodes / f"{program}.py", *_words(options), *remaps]
+        return self.start(*argv, name=f"{program}.py", env=env, commands=commands)
 
-    def roscpp(self, program: str, *remaps: str, **options: object) -> Process:
+    def roscpp(
+        self, program: str, *remaps: str, nodes: Path = NODES, commands: bool = False, **options: object
+    ) -> Process:
         """Compile ``nodes/PROGRAM.cpp`` if that was not done yet, and start it."""
-        return self.start(compiled(program), *_words(options), *remaps, name=program)
+        return self.start(compiled(program, nodes), *_words(options), *remaps, name=program, commands=commands)
 
     def node(self, kind: str, program: str, *remaps: str, **options: object) -> Process:
         """Start a node by its client library, ``"rospy"`` or ``"roscpp"``."""
-        return (self.rospy if kind == "rospy" else self.roscpp)(program, *remaps, **options)
+        start = self.rospy if kind == "rospy" else self.roscpp
+        return start(program, *remaps, **options)  # type: ignore[arg-type]  # options are of the node, not of start
 
     def _wait_master(self) -> None:
         probe = (
@@ -153,10 +162,10 @@ class Ros:
 
 
 @functools.cache
-def compiled(program: str) -> Path:
-    """The binary of ``nodes/PROGRAM.cpp``; compiled once for each version of the sources there."""
-    source = NODES / f"{program}.cpp"
-    flags = ["-std=c++17", "-O2", "-Wall", "-Wextra"]
+def compiled(program: str, nodes: Path = NODES) -> Path:
+    """The binary of ``PROGRAM.cpp`` in the folder ``nodes``; compiled once for each version of the sources."""
+    source = nodes / f"{program}.cpp"
+    flags = ["-std=c++17", "-O2", "-Wall", "-Wextra", f"-I{NODES}"]
     libraries = subprocess.run(
         ["pkg-config", "--cflags", "--libs", "roscpp"], capture_output=True, text=True, check=True
     ).stdout.split()

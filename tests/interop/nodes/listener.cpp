@@ -10,7 +10,7 @@ int main(int argc, char** argv) {
   const bool each = options.flag("each");
   auto take = [&](const std_msgs::UInt8MultiArray::ConstPtr& message) {
     tally.take(message->data);
-    if (tally.count == 1) payload::say("first", tally.report());
+    if (tally.count == 1) payload::say("first", "\"stamp_ns\": " + std::to_string(payload::wall_ns()) + ", " + tally.report());
     if (each) payload::say("report", tally.report());
     if (tally.count == wanted) payload::say("done", tally.report());
   };

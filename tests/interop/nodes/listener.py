@@ -6,6 +6,7 @@ with the report at ``--count`` messages. Stays until it is ended.
 
 import sys
 import threading
+import time
 
 import rospy
 from payload import Tally, parser, say
@@ -27,7 +28,7 @@ def main() -> None:
             tally.take(message.data)
             count = tally.count
             if count == 1:
-                say("first", **tally.report())
+                say("first", stamp_ns=time.time_ns(), **tally.report())
             if args.each:
                 say("report", **tally.report())
             if count == args.count:
