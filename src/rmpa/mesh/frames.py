@@ -1,0 +1,186 @@
+"""Frames: what a link is made of (docs/design/protocol.md, "Frames").
+
+``Frame`` is the readable form, for everything rare. The data path packs and reads headers with the two bound
+methods ``pack_header`` and ``unpack_header`` and makes no objects.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+Buffer = bytes | bytearray | memoryview
+
+_HEADER: Final = struct.Struct(">IBBHIIQ")
+_STAMPS: Final = struct.Struct(">QQ")
+
+unpack_header: Final = _HEADER.unpack_from
+"""``(view, offset)`` to ``(length, kind, flags, reserved, route, sequence, stamp_ns)``, unchecked."""
+
+_pack: Final = _HEADER.pack
+
+FIRST: Final = 1
+"""Flag: the first fragment of a message."""
+LAST: Final = 2
+"""Flag: the last fragment of a message."""
+WHOLE: Final = FIRST | LAST
+"""The flags of a message in one piece."""
+
+
+class Kind(IntEnum):
+    """Kinds of frames."""
+
+    HELLO = 1
+    WELCOME = 2
+    REFUSE = 3
+    PING = 4
+    PONG = 5
+    CONTROL = 6
+    DATA = 7
+    BYE = 8
+
+
+PAYLOAD_MAX: Final[Mapping[int, int]] = MappingProxyType(
+    {
+        Kind.HELLO: limits.HELLO_PAYLOAD_MAX,
+        Kind.WELCOME: limits.HELLO_PAYLOAD_MAX,
+        Kind.REFUSE: limits.HELLO_PAYLOAD_MAX,
+        Kind.PING: 0,
+        Kind.PONG: _STAMPS.size,
+        Kind.CONTROL: limits.CONTROL_PAYLOAD_MAX,
+        Kind.DATA: limits.FRAME_PAYLOAD_MAX,
+        Kind.BYE: limits.HELLO_PAYLOAD_MAX,
+    }
+)
+"""The most bytes of payload that a frame of each kind may claim."""
+
+
+def pack_data_header(length: int, route: int, sequence: int, stamp_ns: int) -> bytes:
+    """The 24 bytes in front of a whole message of ``length`` bytes.
+
+    Raises:
+        LocalProtocolError: The message is longer than a frame carries, or a number does not fit its field.
+    """
+    if length > limits.FRAME_PAYLOAD_MAX:
+        raise LocalProtocolError(f"a message of {length} bytes exceeds a frame's {limits.FRAME_PAYLOAD_MAX}")
+    try:
+        return _pack(length, 7, 3, 0, route, sequence & 0xFFFFFFFF, stamp_ns)
+    except struct.error as error:
+        raise LocalProtocolError(f"route {route} or stamp {stamp_ns} does not fit its field: {error}") from None
+
+
+def check_header(length: int, kind: int, flags: int) -> None:
+    """Check what a header claims, before anything of its payload is stored.
+
+    Raises:
+        LimitExceeded: The length is beyond what this kind may have.
+        RemoteProtocolError: There is no such kind, or the message is a fragment (not in use yet).
+    """
+    limit = PAYLOAD_MAX.get(kind)
+    if limit is None:
+        raise RemoteProtocolError(f"frame of unknown kind {kind}")
+    if length > limit:
+        raise LimitExceeded(f"{Kind(kind).name.lower()} frame", length, limit)
+    if flags & WHOLE != WHOLE:
+        raise RemoteProtocolError(f"{Kind(kind).name.lower()} frame is a fragment, which nobody agreed to")
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One whole frame.
+
+    Args:
+        kind: What it is.
+        payload: Its bytes; what they mean depends on the kind.
+        route: Data only: the route's id, 32 bits.
+        sequence: Data only: counts the messages of the route, 32 bits.
+        stamp_ns: The sender's wall clock, or for data the time of publication; 64 bits.
+        flags: ``FIRST`` and ``LAST``; both on a whole message.
+    """
+
+    kind: Kind
+    payload: bytes = b""
+    route: int = 0
+    sequence: int = 0
+    stamp_ns: int = 0
+    flags: int = WHOLE
+
+    @classmethod
+    def parse(cls, data: Buffer) -> tuple[Frame, int] | None:
+        """Read the frame at the start of ``data``.
+
+        Returns:
+            The frame and how many bytes it took; ``None`` while it is not complete.
+
+        Raises:
+            RemoteProtocolError: Its header claims what cannot be (known as soon as the header is there).
+        """
+        if len(data) < limits.FRAME_HEADER_BYTES:
+            return None
+        length, kind, flags, _, route, sequence, stamp_ns = unpack_header(data, 0)
+        check_header(length, kind, flags)
+        end = limits.FRAME_HEADER_BYTES + length
+        if len(data) < end:
+            return None
+        payload = bytes(data[limits.FRAME_HEADER_BYTES : end])
+        return cls(Kind(kind), payload, route, sequence, stamp_ns, flags), end
+
+    def serialize(self) -> bytes:
+        """The bytes on the wire.
+
+        Raises:
+            LocalProtocolError: The payload is longer than this kind allows.
+        """
+        if len(self.payload) > PAYLOAD_MAX[self.kind]:
+            limit = PAYLOAD_MAX[self.kind]
+            raise LocalProtocolError(f"{self.kind.name} payload of {len(self.payload)} bytes exceeds {limit}")
+        header = _pack(len(self.payload), self.kind, self.flags, 0, self.route, self.sequence, self.stamp_ns)
+        return header + self.payload
+
+    def __str__(self) -> str:
+        """``DATA route=7 #12 1048580 bytes``; never the payload."""
+        parts = [self.kind.name]
+        if self.kind is Kind.DATA:
+            parts.append(f"route={self.route} #{self.sequence}")
+        if self.flags & WHOLE != WHOLE:
+            parts.append(f"flags={self.flags}")
+        if self.payload:
+            parts.append(f"{len(self.payload)} bytes")
+        return " ".join(parts)
+
+
+def pong(ping_stamp_ns: int, came_ns: int, stamp_ns: int) -> Frame:
+    """The answer to a ping: its stamp (t1), when it came (t2), and now (t3)."""
+    return Frame(Kind.PONG, _STAMPS.pack(ping_stamp_ns, came_ns), stamp_ns=stamp_ns)
+
+
+def parse_pong(payload: Buffer) -> tuple[int, int]:
+    """Read t1 and t2, in ns, from a pong's payload.
+
+    Raises:
+        RemoteProtocolError: It has not 16 bytes.
+    """
+    if len(payload) != _STAMPS.size:
+        raise RemoteProtocolError(f"pong of {len(payload)} bytes; it has {_STAMPS.size}")
+    t1, t2 = _STAMPS.unpack(payload)
+    return t1, t2
+
+
+def text_payload(text: str) -> bytes:
+    """Text for a refuse or bye frame, cut at what such a frame may carry."""
+    return text.encode("utf-8", "replace")[: limits.HELLO_PAYLOAD_MAX - 2]
+
+
+def parse_text(payload: Buffer) -> str:
+    """The text of a refuse or bye frame, safe for a log: one line, nothing unprintable."""
+    text = bytes(payload).decode("utf-8", "replace")
+    return "".join(c if c.isprintable() else " " for c in text)[:512]

@@ -1,0 +1,287 @@
+"""The handshake: who is there, and whether we want to be linked (docs/design/protocol.md, "Handshake").
+
+``judge`` decides on a hello, ``judge_welcome`` on the answer; both are pure, the machines act on them.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity, peer_name_problem
+from rmpa.mesh.frames import Buffer, parse_text, text_payload
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+MAGIC: Final = b"RMPA"
+VERSION: Final = 1
+
+_PREFIX: Final = struct.Struct(">4sBBH")
+_HELLO: Final = struct.Struct(">4sBBHQ16sIQIB")
+_CODE: Final = struct.Struct(">H")
+
+
+class Lane(IntEnum):
+    """What a connection is for."""
+
+    EXPRESS = 1
+    BULK = 2
+
+
+LANES: Final = frozenset({Lane.EXPRESS})
+"""The lanes that this version joins; the others have their place in the handshake only."""
+
+
+class Refusal(IntEnum):
+    """Why a link was refused."""
+
+    VERSION = 1
+    DOMAIN = 2
+    MYSELF = 3
+    ALREADY_LINKED = 4
+    DUPLICATE = 5
+    WRONG_PEER = 6
+    MALFORMED = 7
+    BUSY = 8
+    LANE = 9
+
+
+@dataclass(frozen=True, slots=True)
+class Refuse:
+    """A no, with its reason: the payload of a refuse frame.
+
+    Args:
+        code: One of ``Refusal``, or a number of a later version.
+        text: For people: what is wrong and what to do.
+    """
+
+    code: int
+    text: str
+
+    @classmethod
+    def parse(cls, payload: Buffer) -> Refuse:
+        """Read a refuse frame's payload.
+
+        Raises:
+            RemoteProtocolError: It has no code.
+        """
+        if len(payload) < _CODE.size:
+            raise RemoteProtocolError(f"refusal of {len(payload)} bytes has no code")
+        (code,) = _CODE.unpack_from(payload)
+        return cls(code, parse_text(payload[_CODE.size :]))
+
+    def serialize(self) -> bytes:
+        """The bytes on the wire."""
+        return _CODE.pack(self.code) + text_payload(self.text)
+
+    @property
+    def label(self) -> str:
+        """The code as a word for counts: ``version``, ``already_linked``, ``code 17``."""
+        try:
+            return Refusal(self.code).name.lower()
+        except ValueError:
+            return f"code {self.code}"
+
+    def __str__(self) -> str:
+        """``domain: …``."""
+        return f"{self.label}: {self.text}"
+
+
+Verdict = Refuse | None
+"""``None`` is a welcome."""
+
+
+class HandshakeError(RemoteProtocolError):
+    """A hello or welcome that cannot be read; ``refuse`` says so to its sender."""
+
+    def __init__(self, refuse: Refuse) -> None:
+        super().__init__(refuse.text)
+        self.refuse = refuse
+
+
+def _malformed(text: str) -> HandshakeError:
+    return HandshakeError(Refuse(Refusal.MALFORMED, f"the handshake is malformed: {text}"))
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """What each side says of itself: the payload of hello and welcome frames.
+
+    Args:
+        guid: The sender's.
+        instance: The sender's, 16 bytes.
+        name: The sender's.
+        domain: The sender's.
+        lease_ms: The sender is dead when it was silent for this long, in milliseconds.
+        expected: Hello: whom the sender believes it dialled, ``None`` if it knows only an address; welcome: the
+            hello's GUID.
+        lane: What the connection is for; a number, because a later version may know more.
+        features: Bits for later versions.
+    """
+
+    guid: Guid
+    instance: bytes
+    name: str
+    domain: int
+    lease_ms: int
+    expected: Guid | None = None
+    lane: int = Lane.EXPRESS
+    features: int = 0
+
+    @classmethod
+    def of(cls, identity: Identity, *, lease: float, expected: Guid | None, lane: int = Lane.EXPRESS) -> Hello:
+        """Say who we are; ``lease`` in seconds."""
+        return cls(
+            identity.guid, identity.instance, identity.name, identity.domain, round(lease * 1000), expected, lane
+        )
+
+    @classmethod
+    def parse(cls, payload: Buffer) -> Hello:
+        """Read a hello or welcome; bytes behind the name are left for later versions and ignored.
+
+        Raises:
+            HandshakeError: It is of another version, or malformed.
+        """
+        if len(payload) < _PREFIX.size:
+            raise _malformed(f"{len(payload)} bytes")
+        magic, version, _, _ = _PREFIX.unpack_from(payload)
+        if magic != MAGIC:
+            raise _malformed("it does not begin with RMPA; is this port meant for something else?")
+        if version != VERSION:
+            text = f"protocol version {version} meets version {VERSION}: install the same release of rmpa on both"
+            raise HandshakeError(Refuse(Refusal.VERSION, text))
+        if len(payload) < _HELLO.size:
+            raise _malformed(f"{len(payload)} bytes, at least {_HELLO.size} are needed")
+        _, _, lane, domain, guid, instance, lease_ms, expected, features, size = _HELLO.unpack_from(payload)
+        raw = bytes(payload[_HELLO.size : _HELLO.size + size])
+        if len(raw) != size:
+            raise _malformed("it is shorter than its name")
+        name = raw.decode("utf-8", "replace")
+        if problem := peer_name_problem(name):
+            raise _malformed(problem)
+        if lease_ms == 0:
+            raise _malformed("a lease of 0")
+        return cls(Guid(guid), instance, name, domain, lease_ms, Guid(expected) if expected else None, lane, features)
+
+    def serialize(self) -> bytes:
+        """The bytes on the wire."""
+        name = self.name.encode()
+        expected = self.expected.value if self.expected is not None else 0
+        head = _HELLO.pack(
+            MAGIC,
+            VERSION,
+            self.lane,
+            self.domain,
+            self.guid.value,
+            self.instance,
+            self.lease_ms,
+            expected,
+            self.features,
+            len(name),
+        )
+        return head + name
+
+    @property
+    def lease(self) -> float:
+        """Seconds, within what we accept."""
+        return min(max(self.lease_ms / 1000, limits.LINK_LEASE_MIN), limits.LINK_LEASE_MAX)
+
+    @property
+    def identity(self) -> Identity:
+        """The sender as an identity; only valid for a domain that was judged to be ours."""
+        return Identity(self.guid, self.instance, self.name, self.domain)
+
+    def __str__(self) -> str:
+        """``base (10.0.0.1:40001#7) domain 0``."""
+        return f"{self.name} ({self.guid}) domain {self.domain}"
+
+
+def same_place(one: Guid, other: Guid) -> bool:
+    """Whether two GUIDs are one address and port: incarnations of one peer, or two peers in conflict."""
+    return one.value >> 16 == other.value >> 16
+
+
+@dataclass(frozen=True, slots=True)
+class KnownLink:
+    """What a hello is judged against: a link that is up.
+
+    Args:
+        guid: The peer's.
+        instance: The peer's.
+        dialled: Whether we dialled.
+        alive: Whether bytes came lately (``limits.GHOST_QUIET``): it is not the link of a peer that died.
+    """
+
+    guid: Guid
+    instance: bytes
+    dialled: bool
+    alive: bool
+
+
+def judge(hello: Hello, ours: Identity, links: Iterable[KnownLink], *, busy: bool = False) -> Verdict:
+    """Decide on a hello that came in.
+
+    Args:
+        hello: What the dialler says.
+        ours: Who we are.
+        links: Our links that are up, or at least those with a peer of the hello's address and port.
+        busy: Whether we have no room for one more peer.
+    """
+    if refuse := _stranger(hello, ours):
+        return refuse
+    if hello.lane not in LANES:
+        return Refuse(Refusal.LANE, f"lane {hello.lane} is not supported here: install the same release on both")
+    if hello.expected is not None and not same_place(hello.expected, ours.guid):
+        text = f"you called {hello.expected}, but this is {ours}: that address is used by two machines"
+        return Refuse(Refusal.WRONG_PEER, text)
+    there = [link for link in links if same_place(link.guid, hello.guid)]
+    for link in there:
+        if link.instance != hello.instance:
+            if link.alive:
+                return _duplicate(hello.guid)
+        elif link.dialled and ours.guid < hello.guid:
+            return Refuse(Refusal.ALREADY_LINKED, "we are linked already; the link that the lower GUID dialled stays")
+    if busy and not there:
+        return Refuse(Refusal.BUSY, f"{ours.name} has as many links as it can hold ({limits.LINKS_MAX})")
+    return None
+
+
+def judge_welcome(welcome: Hello, ours: Identity, expected: Guid | None) -> Verdict:
+    """Decide on the answer to our hello.
+
+    Args:
+        welcome: What the one we dialled says.
+        ours: Who we are.
+        expected: Whom we believe we dialled.
+    """
+    if refuse := _stranger(welcome, ours):
+        return refuse
+    if expected is not None and not same_place(expected, welcome.guid):
+        text = f"we called {expected}, but {welcome.name} ({welcome.guid}) answers: two machines use that address"
+        return Refuse(Refusal.WRONG_PEER, text)
+    if welcome.expected != ours.guid:
+        return Refuse(Refusal.MALFORMED, f"the welcome is for {welcome.expected}, but we are {ours.guid}")
+    return None
+
+
+def _stranger(hello: Hello, ours: Identity) -> Verdict:
+    if hello.instance == ours.instance:
+        return Refuse(Refusal.MYSELF, f"{ours.name} reached its own port: one of its addresses leads back to it")
+    if hello.domain != ours.domain:
+        text = f"domain {hello.domain} meets domain {ours.domain}: start both with the same --domain (ROS_DOMAIN_ID)"
+        return Refuse(Refusal.DOMAIN, text)
+    if same_place(hello.guid, ours.guid):
+        return _duplicate(hello.guid)
+    return None
+
+
+def _duplicate(guid: Guid) -> Refuse:
+    address, port = guid.endpoint
+    text = f"two live agents are {address}:{port}: give one of them another --port or address (are both behind NAT?)"
+    return Refuse(Refusal.DUPLICATE, text)

@@ -1,0 +1,420 @@
+"""One link's machine: handshake, keepalive, lease, bye. Bytes and ``now`` in; events and bytes out.
+
+::
+
+    HANDSHAKING ──welcome sent or received──► UP ──bye sent──► CLOSING ──drained──► CLOSED
+         │  refuse sent: CLOSING                │  bye received, lease over, protocol error: CLOSED
+         └─ refused, time out, error: CLOSED    └
+
+The driver feeds ``receive``, sends what ``take_output`` gives, calls ``handle_timer`` when ``next_timer`` is due
+and closes the socket at ``Closed``. Events and data come in the order of the bytes, from within ``receive``.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum, auto
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.clock import earliest
+from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
+from rmpa.mesh import frames
+from rmpa.mesh.frames import Frame, Kind
+from rmpa.mesh.handshake import HandshakeError, Hello, Refuse, judge_welcome
+from rmpa.mesh.timing import LinkClock
+
+if TYPE_CHECKING:
+    from rmpa.core.guid import Guid
+    from rmpa.core.identity import Identity
+
+_log = logging.getLogger(__name__)
+
+_HEADER: Final = limits.FRAME_HEADER_BYTES
+_DATA: Final = int(Kind.DATA)
+
+
+class Role(Enum):
+    """Who connected."""
+
+    DIALLER = auto()
+    ACCEPTOR = auto()
+
+
+class State(Enum):
+    """Where a link is in its life."""
+
+    HANDSHAKING = auto()
+    UP = auto()
+    CLOSING = auto()
+    CLOSED = auto()
+
+
+class _Act(Enum):
+    WELCOMED = auto()
+    REFUSING = auto()
+    LEAVING = auto()
+    ENDED = auto()
+
+
+_NEXT: Final[Mapping[tuple[State, _Act], State]] = MappingProxyType(
+    {
+        (State.HANDSHAKING, _Act.WELCOMED): State.UP,
+        (State.HANDSHAKING, _Act.REFUSING): State.CLOSING,
+        (State.HANDSHAKING, _Act.LEAVING): State.CLOSING,
+        (State.HANDSHAKING, _Act.ENDED): State.CLOSED,
+        (State.UP, _Act.LEAVING): State.CLOSING,
+        (State.UP, _Act.ENDED): State.CLOSED,
+        (State.CLOSING, _Act.ENDED): State.CLOSED,
+    }
+)
+
+_TALK: Final[frozenset[int]] = frozenset({Kind.PING, Kind.PONG, Kind.CONTROL, Kind.DATA, Kind.BYE})
+_ALLOWED: Final[Mapping[tuple[Role, State], frozenset[int]]] = MappingProxyType(
+    {
+        (Role.DIALLER, State.HANDSHAKING): frozenset({int(Kind.WELCOME), int(Kind.REFUSE)}),
+        (Role.ACCEPTOR, State.HANDSHAKING): frozenset({int(Kind.HELLO)}),
+        (Role.DIALLER, State.UP): _TALK,
+        (Role.ACCEPTOR, State.UP): _TALK,
+    }
+)
+
+
+@dataclass(frozen=True, slots=True)
+class HelloReceived:
+    """Acceptor: somebody wants a link; answer with ``accept`` or ``refuse``."""
+
+    hello: Hello
+
+
+@dataclass(frozen=True, slots=True)
+class Up:
+    """The handshake is over, both want the link."""
+
+    hello: Hello
+
+
+@dataclass(frozen=True, slots=True)
+class ControlReceived:
+    """A control frame came.
+
+    Args:
+        payload: Its bytes, a copy.
+    """
+
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """No link: one of the two said no. ``Closed`` follows.
+
+    Args:
+        refuse: Why.
+        by_us: Whether it was us.
+    """
+
+    refuse: Refuse
+    by_us: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Closed:
+    """The link is over: send what is left, close the socket.
+
+    Args:
+        reason: Why, for people.
+        orderly: Whether one of the sides said so (bye, refuse), rather than an error or silence.
+    """
+
+    reason: str
+    orderly: bool
+
+
+Event = HelloReceived | Up | ControlReceived | Refused | Closed
+OnEvent = Callable[[Event], None]
+OnData = Callable[[int, int, int, memoryview], None]
+
+
+class Link:
+    """One side of one link.
+
+    Args:
+        role: Whether we connected.
+        ours: Who we are.
+        now: Monotonic seconds at which the connection stood.
+        wall_ns: The wall clock; only asked where a stamp is needed.
+        on_event: Called from within the methods below; it may call any of them but ``receive``.
+        on_data: Called with ``(route, sequence, stamp_ns, payload)`` for each data frame; the payload is a view
+            into the bytes given to ``receive`` and only valid during the call.
+        expected: Dialler: whom we believe we dialled, ``None`` if only the address is known.
+        lease: What we promise: seconds after which our silence means that we are dead.
+        label: For log lines, until the other side's name is known.
+    """
+
+    def __init__(
+        self,
+        role: Role,
+        ours: Identity,
+        now: float,
+        *,
+        wall_ns: Callable[[], int],
+        on_event: OnEvent,
+        on_data: OnData,
+        expected: Guid | None = None,
+        lease: float = limits.LINK_LEASE,
+        label: str = "?",
+    ) -> None:
+        self.role = role
+        self.clock = LinkClock()
+        self.remote: Hello | None = None
+        self._ours = ours
+        self._wall_ns = wall_ns
+        self._on_event = on_event
+        self._on_data = on_data
+        self._expected = expected
+        self._lease = lease
+        self._label = label
+        self._state = State.HANDSHAKING
+        self._keepalive = lease * limits.KEEPALIVE_INTERVAL / limits.LINK_LEASE
+        self._deadline = now + limits.HANDSHAKE_TIMEOUT
+        self._reason = ""
+        self._heard = now
+        self._sent = now
+        self._pinged = now
+        self._output = bytearray()
+        if role is Role.DIALLER:
+            self._send(Frame(Kind.HELLO, Hello.of(ours, lease=lease, expected=expected).serialize()))
+
+    @property
+    def state(self) -> State:
+        """Where the link is in its life."""
+        return self._state
+
+    @property
+    def heard_at(self) -> float:
+        """Monotonic seconds at which bytes last came."""
+        return self._heard
+
+    @property
+    def has_output(self) -> bool:
+        """Whether ``take_output`` has something."""
+        return bool(self._output)
+
+    def take_output(self) -> bytes:
+        """Bytes to send, before all data that is sent later."""
+        output = bytes(self._output)
+        self._output.clear()
+        return output
+
+    def heard(self, now: float) -> None:
+        """Bytes came at ``now``, though not yet a whole frame: a large message renews the lease as it arrives."""
+        self._heard = max(self._heard, now)
+
+    def receive(self, view: memoryview, now: float) -> tuple[int, int]:
+        """Take whole frames from the start of ``view``.
+
+        Returns:
+            How many bytes were taken, and how many bytes there must be behind those for the next frame (0: a
+            header, or nothing more).
+
+        Raises:
+            RemoteProtocolError: The other side broke the protocol; the link is ``CLOSED``.
+        """
+        self._heard = now
+        size = len(view)
+        offset = 0
+        try:
+            while size - offset >= _HEADER:
+                length, kind, flags, _, route, sequence, stamp_ns = frames.unpack_header(view, offset)
+                if (kind != _DATA or self._state is not State.UP) and not self._admit(kind):
+                    return size, 0
+                # One comparison each on the data path; what is wrong is said by check_header.
+                if kind != _DATA or length > limits.FRAME_PAYLOAD_MAX or flags & 3 != 3:
+                    frames.check_header(length, kind, flags)
+                start = offset + _HEADER
+                end = start + length
+                if end > size:
+                    return offset, end - offset
+                offset = end
+                if kind == _DATA:
+                    self._on_data(route, sequence, stamp_ns, view[start:end])
+                else:
+                    self._handle(Kind(kind), view[start:end], stamp_ns, now)
+        except RemoteProtocolError as error:
+            self._end(f"{self._name} broke the protocol: {error}")
+            raise
+        return (size if self._state is State.CLOSED else offset), 0
+
+    def accept(self, now: float) -> None:
+        """Acceptor, after ``HelloReceived``: welcome the other side; the link is up.
+
+        Raises:
+            LocalProtocolError: There was no hello, or it was answered.
+        """
+        hello = self._unanswered()
+        welcome = Hello.of(self._ours, lease=self._lease, expected=hello.guid, lane=hello.lane)
+        self._send(Frame(Kind.WELCOME, welcome.serialize()))
+        self._raise_up(hello, now)
+
+    def refuse(self, refuse: Refuse, now: float) -> None:
+        """Acceptor, after ``HelloReceived``: say no, and leave.
+
+        Raises:
+            LocalProtocolError: There was no hello, or it was answered.
+        """
+        self._unanswered()
+        self._refuse(refuse, now)
+
+    def control(self, payload: bytes) -> bytes:
+        """The bytes of a control frame, for the driver to send.
+
+        Raises:
+            LocalProtocolError: It is too long.
+        """
+        return Frame(Kind.CONTROL, payload, stamp_ns=self._wall_ns()).serialize()
+
+    def close(self, reason: str, now: float) -> None:
+        """Say bye and leave; ``Closed`` comes from ``drained`` or the timer. Without effect once leaving."""
+        if self._state in (State.CLOSING, State.CLOSED):
+            return
+        if self._state is State.UP:
+            self._send(Frame(Kind.BYE, frames.text_payload(reason), stamp_ns=self._wall_ns()))
+        self._leave(_Act.LEAVING, reason, now)
+
+    def drained(self) -> None:
+        """The driver has sent all that was to be sent; the end of ``CLOSING``."""
+        if self._state is State.CLOSING:
+            self._end(self._reason, orderly=True)
+
+    def lost(self, reason: str) -> None:
+        """The connection is gone; without effect once closed."""
+        if self._state is not State.CLOSED:
+            self._end(self._reason or reason, orderly=self._state is State.CLOSING)
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is due, in monotonic seconds."""
+        if self._state is State.CLOSED:
+            return None
+        if self._state is State.UP:
+            ping = min(self._sent + self._keepalive, self._pinged + limits.CLOCK_INTERVAL)
+            return earliest(self._heard + self._remote_lease, ping)
+        return self._deadline
+
+    def handle_timer(self, now: float) -> None:
+        """Do what is due: keepalive, end of the lease, end of the handshake's or the drain's time."""
+        due = self.next_timer()
+        if due is None or now < due:
+            return
+        if self._state is State.CLOSING:
+            self._end(self._reason, orderly=True)
+        elif self._state is State.HANDSHAKING:
+            self._end(f"{self._name} did not finish the handshake within {limits.HANDSHAKE_TIMEOUT:g} s")
+        elif now >= self._heard + self._remote_lease:
+            self._end(f"{self._name} was silent for its lease of {self._remote_lease:g} s")
+        else:
+            self._ping(now)
+
+    # --- inside ---------------------------------------------------------------------------------------------
+
+    @property
+    def _name(self) -> str:
+        return self.remote.name if self.remote is not None else self._label
+
+    @property
+    def _remote_lease(self) -> float:
+        return self.remote.lease if self.remote is not None else limits.LINK_LEASE
+
+    def _admit(self, kind: int) -> bool:
+        """Whether a frame of this kind is read now; ``False`` when we are leaving and read nothing more."""
+        if self._state in (State.CLOSING, State.CLOSED):
+            return False
+        if kind not in _ALLOWED[self.role, self._state] or (self.remote is not None and self._state is not State.UP):
+            what = Kind(kind).name.lower() if kind in frames.PAYLOAD_MAX else f"kind {kind}"
+            raise RemoteProtocolError(f"{what} frame while {self._state.name.lower()}")
+        return True
+
+    def _handle(self, kind: Kind, payload: memoryview, stamp_ns: int, now: float) -> None:
+        if _log.isEnabledFor(logging.DEBUG):
+            _log.debug("< %s: %s, %d bytes", self._name, kind.name, len(payload))
+        if kind is Kind.PING:
+            came = self._wall_ns()
+            self._send(frames.pong(stamp_ns, came, self._wall_ns()))
+            self._sent = now
+        elif kind is Kind.PONG:
+            t1, t2 = frames.parse_pong(payload)
+            self.clock.ponged(t1, t2, stamp_ns, self._wall_ns(), now)
+        elif kind is Kind.CONTROL:
+            self._on_event(ControlReceived(bytes(payload)))
+        elif kind is Kind.BYE:
+            self._end(f"{self._name} left: {frames.parse_text(payload)}", orderly=True)
+        elif kind is Kind.REFUSE:
+            refuse = Refuse.parse(payload)
+            self._on_event(Refused(refuse, by_us=False))
+            self._end(f"{self._label} refused: {refuse}", orderly=True)
+        else:
+            self._handshake(payload, now)
+
+    def _handshake(self, payload: memoryview, now: float) -> None:
+        try:
+            hello = Hello.parse(payload)
+        except HandshakeError as error:
+            self._refuse(error.refuse, now)
+            return
+        if self.role is Role.ACCEPTOR:
+            self.remote = hello
+            self._on_event(HelloReceived(hello))
+        elif refuse := judge_welcome(hello, self._ours, self._expected):
+            self._refuse(refuse, now)
+        else:
+            self._raise_up(hello, now)
+
+    def _unanswered(self) -> Hello:
+        if self.role is not Role.ACCEPTOR or self.remote is None or self._state is not State.HANDSHAKING:
+            raise LocalProtocolError(f"no hello waits for an answer (state {self._state.name})")
+        return self.remote
+
+    def _raise_up(self, hello: Hello, now: float) -> None:
+        self._state = _NEXT[self._state, _Act.WELCOMED]
+        self.remote = hello
+        self._heard = now
+        _log.debug("= %s: up", self._name)
+        self._ping(now)
+        self._on_event(Up(hello))
+
+    def _refuse(self, refuse: Refuse, now: float) -> None:
+        self._send(Frame(Kind.REFUSE, refuse.serialize()) if self.role is Role.ACCEPTOR else _bye(refuse.text))
+        self._leave(_Act.REFUSING, f"refused: {refuse}", now)
+        self._on_event(Refused(refuse, by_us=True))
+
+    def _leave(self, act: _Act, reason: str, now: float) -> None:
+        self._state = _NEXT[self._state, act]
+        self._reason = reason
+        self._deadline = now + limits.DRAIN_TIMEOUT
+        _log.debug("= %s: closing: %s", self._name, reason)
+
+    def _end(self, reason: str, *, orderly: bool = False) -> None:
+        if self._state is State.CLOSED:
+            return
+        self._state = _NEXT[self._state, _Act.ENDED]
+        self._reason = reason
+        _log.debug("= %s: closed: %s", self._name, reason)
+        self._on_event(Closed(reason, orderly))
+
+    def _ping(self, now: float) -> None:
+        stamp = self._wall_ns()
+        self.clock.pinged(stamp, now)
+        self._send(Frame(Kind.PING, stamp_ns=stamp))
+        self._sent = self._pinged = now
+
+    def _send(self, frame: Frame) -> None:
+        if _log.isEnabledFor(logging.DEBUG):
+            _log.debug("> %s: %s", self._name, frame)
+        self._output += frame.serialize()
+
+
+def _bye(text: str) -> Frame:
+    return Frame(Kind.BYE, frames.text_payload(text))

@@ -1,0 +1,415 @@
+"""Who dials whom, when, and which of two links stays: one machine over all peers.
+
+A peer's place is its address and port; its incarnations follow each other there. Outputs are collected and
+taken with ``take``: ``Dial`` and ``CloseLink`` are orders to the driver, ``LinkUp`` and ``LinkDown`` tell the
+rooms above. Each ``Dial`` is answered by exactly one of ``link_up``, ``dial_refused`` or ``dial_failed``.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, Literal
+
+from rmpa.core import limits
+from rmpa.core.backoff import Backoff
+from rmpa.core.clock import earliest
+from rmpa.mesh.handshake import Hello, KnownLink, Refusal, Refuse, Verdict, judge
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.core.guid import Guid
+    from rmpa.core.identity import Identity
+
+_log = logging.getLogger(__name__)
+
+Endpoint = tuple[str, int]
+
+_SLOW: Final = frozenset({Refusal.VERSION, Refusal.DOMAIN, Refusal.DUPLICATE, Refusal.MALFORMED, Refusal.LANE})
+_ELSEWHERE: Final = frozenset({Refusal.MYSELF, Refusal.WRONG_PEER})
+
+
+@dataclass(frozen=True, slots=True)
+class Dial:
+    """Connect to this endpoint, which should be this peer."""
+
+    guid: Guid
+    endpoint: Endpoint
+
+
+@dataclass(frozen=True, slots=True)
+class CloseLink:
+    """Say bye on this link and close it."""
+
+    link_id: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class LinkUp:
+    """This link is the one that is used with its peer."""
+
+    link_id: int
+    identity: Identity
+
+
+@dataclass(frozen=True, slots=True)
+class LinkDown:
+    """The link that was used with this peer is gone."""
+
+    link_id: int
+    identity: Identity
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class LinkRefused:
+    """A peer said no, for the first time for this reason; what to do is in the text."""
+
+    identity: Identity
+    refuse: Refuse
+
+
+Output = Dial | CloseLink | LinkUp | LinkDown | LinkRefused
+
+
+@dataclass(frozen=True, slots=True)
+class PeerStatus:
+    """One peer, for the monitor.
+
+    Args:
+        identity: Who.
+        state: ``refused`` is a wait after a no that waiting seldom mends.
+        link_id: Its link, if linked.
+        lower: Whether we are the lower GUID, which dials first.
+        since: When the link came up, in monotonic seconds.
+        attempts: Dials since the last link.
+        last_error: Why there is no link, as far as we know; for a linked peer, why the last one ended.
+        next_attempt: When we dial next, in monotonic seconds.
+        endpoint: Where we dial or dialled last.
+    """
+
+    identity: Identity
+    state: Literal["linked", "dialling", "waiting", "refused"]
+    link_id: int | None
+    lower: bool
+    since: float | None
+    attempts: int
+    last_error: str
+    next_attempt: float | None
+    endpoint: Endpoint | None
+
+
+@dataclass(slots=True)
+class _LinkInfo:
+    id: int
+    identity: Identity
+    dialled: bool
+    since: float
+
+
+@dataclass(slots=True)
+class _Peer:
+    identity: Identity
+    lower: bool
+    backoff: Backoff
+    announced: bool = False
+    gone: bool = False
+    source: str | None = None
+    good: Endpoint | None = None
+    link: _LinkInfo | None = None
+    dialling: Endpoint | None = None
+    tried: set[Endpoint] = field(default_factory=set)
+    next_attempt: float | None = None
+    forget_at: float | None = None
+    attempts: int = 0
+    last_error: str = ""
+    last_endpoint: Endpoint | None = None
+    refused: Refuse | None = None
+    said: set[int] = field(default_factory=set)
+
+    def endpoints(self) -> list[Endpoint]:
+        """Where to dial, best first: what worked last, where its beacon came from, what it says of itself."""
+        candidates = [self.good] if self.good is not None else []
+        if self.source is not None:
+            candidates.append((self.source, self.identity.guid.port))
+        return list(dict.fromkeys([*candidates, *self.identity.endpoints]))
+
+
+class Peering:
+    """The machine over all peers.
+
+    Args:
+        ours: Who we are.
+        rng: Uniform numbers in [0, 1), for the jitter.
+        alive: Whether a link, by its id, heard something in the last ``limits.GHOST_QUIET`` seconds.
+    """
+
+    def __init__(self, ours: Identity, *, rng: Callable[[], float], alive: Callable[[int], bool]) -> None:
+        self._ours = ours
+        self._rng = rng
+        self._alive = alive
+        self._peers: dict[int, _Peer] = {}
+        self._by_link: dict[int, _Peer] = {}
+        self._outputs: list[Output] = []
+
+    # --- what discovery says --------------------------------------------------------------------------------
+
+    def peer_found(self, identity: Identity, now: float, source: str | None = None) -> None:
+        """Discovery knows a peer, or knows it better (new addresses, a restart).
+
+        Args:
+            identity: Who.
+            now: Monotonic seconds.
+            source: The address that its beacon came from, if it was the peer's own beacon.
+        """
+        if identity.instance == self._ours.instance or _place(identity.guid) == _place(self._ours.guid):
+            return
+        peer = self._peers.get(_place(identity.guid))
+        if peer is None:
+            peer = self._add(identity)
+        restarted = peer.identity.instance != identity.instance
+        fresh = not peer.announced or restarted
+        if restarted and identity.guid < peer.identity.guid and peer.link is not None:
+            return  # old news: the link is with a newer instance
+        peer.announced, peer.gone, peer.forget_at = True, False, None
+        peer.source = source or peer.source
+        peer.identity = identity
+        if restarted:
+            peer.lower = self._ours.guid < identity.guid
+            self._restart(peer, now)
+        if fresh and peer.link is None and peer.dialling is None:
+            peer.next_attempt = now if peer.lower else now + limits.DIAL_FALLBACK
+        self._dial_due(peer, now)
+
+    def peer_gone(self, guid: Guid, now: float) -> None:  # noqa: ARG002 - all machines are told the time
+        """Discovery gave a peer up: dial it no more. A link that is up stays until it falls by itself."""
+        peer = self._peers.get(_place(guid))
+        if peer is None or peer.identity.guid != guid:
+            return
+        peer.announced, peer.gone, peer.next_attempt = False, True, None
+        self._forget_if_idle(peer)
+
+    # --- what the driver says -------------------------------------------------------------------------------
+
+    def judge(self, hello: Hello) -> Verdict:
+        """Decide on a hello that came in; ``None`` is a welcome, and ``link_up`` follows."""
+        peer = self._peers.get(_place(hello.guid))
+        known = []
+        if peer is not None and peer.link is not None:
+            link = peer.link
+            known.append(KnownLink(link.identity.guid, link.identity.instance, link.dialled, self._alive(link.id)))
+        return judge(hello, self._ours, known, busy=len(self._by_link) >= limits.LINKS_MAX)
+
+    def link_up(
+        self, link_id: int, identity: Identity, now: float, *, dialled: bool, endpoint: Endpoint | None = None
+    ) -> None:
+        """A handshake ended well.
+
+        Args:
+            link_id: The driver's number for the link, never used twice.
+            identity: Who the other side says it is; discovery need not have seen it.
+            now: Monotonic seconds.
+            dialled: Whether we dialled.
+            endpoint: Where we dialled.
+        """
+        peer = self._peers.get(_place(identity.guid)) or self._add(identity)
+        if dialled:
+            peer.dialling = None
+            peer.good = endpoint
+        new = _LinkInfo(link_id, identity, dialled, now)
+        old = peer.link
+        if old is not None and self._keeps(old, new):
+            self._outputs.append(CloseLink(link_id, "we are linked already; the lower GUID's link stays"))
+            return
+        if old is not None:
+            reason = (
+                "replaced by a newer link" if old.identity.instance == identity.instance else "the peer restarted"
+            )
+            self._drop(peer, old, reason, close=True)
+        if peer.identity.instance != identity.instance:
+            peer.identity = identity
+            peer.lower = self._ours.guid < identity.guid
+            peer.backoff.reset()
+        peer.link = new
+        peer.next_attempt = peer.forget_at = peer.refused = None
+        peer.attempts = 0
+        peer.gone = False
+        peer.tried.clear()
+        peer.said.clear()
+        self._by_link[link_id] = peer
+        self._outputs.append(LinkUp(link_id, identity))
+
+    def link_down(self, link_id: int, reason: str, now: float) -> None:
+        """A link ended, for whatever reason; one that was replaced or never up says nothing new."""
+        peer = self._by_link.get(link_id)
+        if peer is None or peer.link is None:
+            return
+        link = peer.link
+        self._drop(peer, link, reason)
+        peer.last_error = reason
+        if now - link.since >= limits.LINK_STABLE:
+            peer.backoff.reset()
+        if not peer.announced and len(self._peers) > limits.ROSTER_PEERS_MAX:
+            peer.gone = True  # invented identities must not fill the memory, nor make us dial for them
+        if peer.gone:
+            self._forget_if_idle(peer)
+            return
+        if not peer.announced:
+            peer.forget_at = now + limits.FORGET_UNANNOUNCED
+        if peer.dialling is None:
+            peer.next_attempt = now + peer.backoff.delay() + (0.0 if peer.lower else limits.DIAL_FALLBACK)
+
+    def dial_failed(self, guid: Guid, error: str, now: float) -> None:
+        """Nobody answered a ``Dial``, or the connection ended before the handshake did."""
+        peer = self._answered(guid)
+        if peer is not None:
+            peer.last_error = error
+            peer.refused = None
+            self._again(peer, now)
+
+    def dial_refused(self, guid: Guid, refuse: Refuse, now: float) -> None:
+        """A ``Dial`` was answered with a no, by them or by us."""
+        peer = self._answered(guid)
+        if peer is None:
+            return
+        peer.last_error = str(refuse)
+        if refuse.code == Refusal.ALREADY_LINKED:
+            # They hold a link that we lost, or that is about to be welcomed here: it falls within the lease.
+            if peer.link is None:
+                peer.next_attempt = now + max(limits.LINK_LEASE, peer.backoff.delay())
+            return
+        if refuse.code in _ELSEWHERE or refuse.code not in _SLOW:
+            self._again(peer, now)
+        elif peer.link is None:
+            peer.refused = refuse
+            peer.next_attempt = now + limits.REFUSED_RETRY * (1 + 0.5 * self._rng())
+        if refuse.code not in _ELSEWHERE and refuse.code not in peer.said:
+            peer.said.add(refuse.code)
+            self._outputs.append(LinkRefused(peer.identity, refuse))
+
+    # --- time and outputs -----------------------------------------------------------------------------------
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is due, in monotonic seconds."""
+        return earliest(*(earliest(p.next_attempt, p.forget_at) for p in self._peers.values()))
+
+    def handle_timer(self, now: float) -> None:
+        """Dial and forget what is due."""
+        for peer in list(self._peers.values()):
+            if peer.forget_at is not None and now >= peer.forget_at:
+                peer.gone = True
+                self._forget_if_idle(peer)
+            else:
+                self._dial_due(peer, now)
+
+    def take(self) -> list[Output]:
+        """What was decided since the last call, in order."""
+        outputs, self._outputs = self._outputs, []
+        return outputs
+
+    def peers(self) -> list[PeerStatus]:
+        """All known peers, by GUID."""
+        return [_status(p) for p in sorted(self._peers.values(), key=lambda p: p.identity.guid)]
+
+    # --- inside ---------------------------------------------------------------------------------------------
+
+    def _add(self, identity: Identity) -> _Peer:
+        backoff = Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng)
+        peer = _Peer(identity, self._ours.guid < identity.guid, backoff)
+        self._peers[_place(identity.guid)] = peer
+        return peer
+
+    def _forget_if_idle(self, peer: _Peer) -> None:
+        """Forget a peer that is gone; one that we are dialling only when the dial was answered."""
+        peer.next_attempt = peer.forget_at = None
+        if peer.link is None and peer.dialling is None:
+            self._peers.pop(_place(peer.identity.guid), None)
+
+    def _restart(self, peer: _Peer, now: float) -> None:
+        """A new instance announced itself: nothing that its ghost did counts."""
+        peer.backoff.reset()
+        peer.tried.clear()
+        peer.said.clear()
+        peer.refused = None
+        link = peer.link
+        ghost = link is not None and link.identity.instance != peer.identity.instance
+        if link is not None and ghost and (link.identity.guid < peer.identity.guid or not self._alive(link.id)):
+            self._drop(peer, link, "the peer restarted", close=True)
+        if peer.link is None and peer.dialling is None:
+            peer.next_attempt = now if peer.lower else now + limits.DIAL_FALLBACK
+
+    def _keeps(self, old: _LinkInfo, new: _LinkInfo) -> bool:
+        """Of two links with one instance: the one that the lower GUID dialled; of one direction, the newer."""
+        if old.identity.instance != new.identity.instance or old.dialled == new.dialled:
+            return False
+        return old.dialled == (self._ours.guid < old.identity.guid)
+
+    def _drop(self, peer: _Peer, link: _LinkInfo, reason: str, *, close: bool = False) -> None:
+        peer.link = None
+        self._by_link.pop(link.id, None)
+        if close:
+            self._outputs.append(CloseLink(link.id, reason))
+        self._outputs.append(LinkDown(link.id, link.identity, reason))
+
+    def _answered(self, guid: Guid) -> _Peer | None:
+        peer = self._peers.get(_place(guid))
+        if peer is None or peer.dialling is None:
+            return None
+        peer.tried.add(peer.dialling)
+        peer.dialling = None
+        if peer.gone:
+            self._forget_if_idle(peer)
+            return None
+        return peer
+
+    def _again(self, peer: _Peer, now: float) -> None:
+        """Try the next endpoint at once, or wait when all were tried."""
+        if peer.link is not None:
+            return
+        if peer.tried.issuperset(peer.endpoints()):
+            peer.tried.clear()
+            peer.good = None
+            peer.next_attempt = now + peer.backoff.delay()
+        else:
+            peer.next_attempt = now
+
+    def _dial_due(self, peer: _Peer, now: float) -> None:
+        due = peer.next_attempt
+        if due is None or now < due or peer.link is not None or peer.dialling is not None:
+            return
+        left = [e for e in peer.endpoints() if e not in peer.tried]
+        if not left:
+            peer.tried.clear()
+            left = peer.endpoints()
+        peer.dialling = peer.last_endpoint = left[0]
+        peer.next_attempt = None
+        peer.attempts += 1
+        self._outputs.append(Dial(peer.identity.guid, left[0]))
+
+
+def _place(guid: Guid) -> int:
+    return guid.value >> 16
+
+
+def _status(peer: _Peer) -> PeerStatus:
+    state: Literal["linked", "dialling", "waiting", "refused"]
+    if peer.link is not None:
+        state = "linked"
+    elif peer.dialling is not None:
+        state = "dialling"
+    else:
+        state = "waiting" if peer.refused is None else "refused"
+    link = peer.link
+    return PeerStatus(
+        peer.identity if link is None else link.identity,
+        state,
+        None if link is None else link.id,
+        peer.lower,
+        None if link is None else link.since,
+        peer.attempts,
+        peer.last_error,
+        peer.next_attempt,
+        peer.last_endpoint,
+    )

@@ -1,0 +1,74 @@
+"""A link's round-trip time and the other side's clock, from four timestamps (RFC 5905, section 8)."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from rmpa.core import limits
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One exchange.
+
+    Args:
+        rtt: Seconds on the wire: the round trip less the other side's own time.
+        offset: Seconds that the other side's wall clock is ahead of ours, ±rtt/2.
+        taken: When, in monotonic seconds.
+    """
+
+    rtt: float
+    offset: float
+    taken: float
+
+
+class LinkClock:
+    """The other side's clock, by the exchange that says it best among the last ``limits.CLOCK_SAMPLES``.
+
+    Queues only make round trips longer, so the shortest has the least error; its error grows with its age, as
+    two clocks drift apart (RFC 5905's PHI).
+    """
+
+    def __init__(self) -> None:
+        self._pings: dict[int, float] = {}
+        self._samples: deque[Sample] = deque(maxlen=limits.CLOCK_SAMPLES)
+        self.rtt: float | None = None
+        """The last round trip, in seconds; ``None`` before the first."""
+
+    def pinged(self, t1: int, now: float) -> None:
+        """A ping with stamp ``t1`` leaves."""
+        self._pings[t1] = now
+        while len(self._pings) > limits.CLOCK_SAMPLES:
+            del self._pings[next(iter(self._pings))]
+
+    def ponged(self, t1: int, t2: int, t3: int, t4: int, now: float) -> Sample | None:
+        """A pong came at wall time ``t4``; all stamps in ns. One that answers no ping of ours says nothing."""
+        sent = self._pings.pop(t1, None)
+        if sent is None:
+            return None
+        rtt = ((t4 - t1) - (t3 - t2)) / 1e9
+        if abs((t4 - t1) / 1e9 - (now - sent)) > limits.CLOCK_STEP or rtt < 0:
+            # A wall clock was set in between: what we knew of the two is void.
+            self._samples.clear()
+            return None
+        sample = Sample(rtt, ((t2 - t1) + (t3 - t4)) / 2e9, now)
+        if self._samples and self._contradicts(sample):
+            self._samples.clear()
+        self._samples.append(sample)
+        self.rtt = sample.rtt
+        return sample
+
+    def estimate(self, now: float) -> tuple[float, float] | None:
+        """Offset and its error bound, in seconds: the true offset lies within ±error; ``None`` if unknown."""
+        best = min(self._samples, key=lambda s: self._error(s, now), default=None)
+        return None if best is None else (best.offset, self._error(best, now))
+
+    def _contradicts(self, sample: Sample) -> bool:
+        """Whether two exchanges cannot both be true: a clock was set."""
+        offset, error = self.estimate(sample.taken) or (sample.offset, 0.0)
+        return abs(sample.offset - offset) > error + sample.rtt / 2 + 1e-6
+
+    @staticmethod
+    def _error(sample: Sample, now: float) -> float:
+        return sample.rtt / 2 + limits.CLOCK_DRIFT * max(0.0, now - sample.taken)
