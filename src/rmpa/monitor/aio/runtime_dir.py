@@ -1,0 +1,122 @@
+"""Where the control sockets of this machine's agents live, and the lock that keeps their names apart."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import stat
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core.errors import StartError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+_SYSTEM: Final = Path("/run/rmpa")
+_REMEDY: Final = "set RMPA_RUNTIME_DIR to a directory of your own"
+
+
+def runtime_dir(environ: Mapping[str, str], setting: str = "") -> Path:
+    """The directory that a new agent of this user uses; it need not exist yet.
+
+    Args:
+        environ: RMPA_RUNTIME_DIR and XDG_RUNTIME_DIR count.
+        setting: ``Settings.runtime_dir``; empty for the usual place.
+    """
+    if setting or environ.get("RMPA_RUNTIME_DIR"):
+        return Path(setting or environ["RMPA_RUNTIME_DIR"])
+    if environ.get("XDG_RUNTIME_DIR"):
+        return Path(environ["XDG_RUNTIME_DIR"]) / "rmpa"
+    if os.geteuid() == 0 and os.access(_SYSTEM.parent, os.W_OK):
+        return _SYSTEM
+    return Path(f"/tmp/rmpa-{os.geteuid()}")  # noqa: S108 - made with mode 0700, its owner checked
+
+
+def runtime_dirs(environ: Mapping[str, str]) -> list[Path]:
+    """The directories that a client looks in, those that are there and that it may read.
+
+    With RMPA_RUNTIME_DIR that one alone; else every usual place, since ``sudo`` and ``systemd`` drop variables.
+    """
+    places = [runtime_dir(environ)]
+    if not environ.get("RMPA_RUNTIME_DIR"):
+        places += [_SYSTEM, Path(f"/run/user/{os.geteuid()}/rmpa"), Path(f"/tmp/rmpa-{os.geteuid()}")]  # noqa: S108 - read, owner checked
+    return [place for place in dict.fromkeys(places) if _usable(place)]
+
+
+def _usable(place: Path) -> bool:
+    """Whether we may read it and nobody else could have put a socket there to fool us."""
+    try:
+        info = place.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(info.st_mode) and info.st_uid in {0, os.geteuid()} and os.access(place, os.R_OK | os.X_OK)
+
+
+def make_runtime_dir(place: Path) -> None:
+    """Make the directory, for this user alone.
+
+    Raises:
+        StartError: It cannot be made, or somebody else owns it.
+    """
+    try:
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        info = place.lstat()
+        if not stat.S_ISDIR(info.st_mode):
+            raise StartError(str(place), "is not a directory", _REMEDY)
+        if info.st_uid != os.geteuid():
+            raise StartError(str(place), f"belongs to user {info.st_uid}, not to us", _REMEDY)
+        if info.st_mode & 0o077:
+            place.chmod(0o700)
+    except OSError as error:
+        raise StartError(str(place), f"cannot be made: {error.strerror}", _REMEDY) from None
+
+
+class NameLock:
+    """Holds ``<name>.lock`` for as long as the agent lives; the kernel lets go of it however the agent ends.
+
+    Args:
+        place: The runtime directory; made if needed.
+        name: The agent's name.
+
+    Raises:
+        StartError: Another agent holds it (its process id is told), or the directory cannot be used.
+    """
+
+    def __init__(self, place: Path, name: str) -> None:
+        make_runtime_dir(place)
+        self.path = place / f"{name}.lock"
+        while True:
+            try:
+                fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+            except OSError as error:
+                raise StartError(str(self.path), f"cannot be opened: {error.strerror}", _REMEDY) from None
+            try:
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                pid = os.read(fd, 32).decode("ascii", "replace").strip()
+                os.close(fd)
+                whose = f" (pid {pid})" if pid else ""
+                problem = f"an agent named {name!r} already runs on this machine{whose}"
+                raise StartError("rmpa up", problem, "stop it, or give this one a --name of its own") from None
+            if self._still_there(fd):
+                break
+            os.close(fd)  # its last holder removed it between our open and our lock
+        self._fd = fd
+        os.ftruncate(fd, 0)
+        os.write(fd, f"{os.getpid()}\n".encode())
+
+    def _still_there(self, fd: int) -> bool:
+        try:
+            return self.path.stat().st_ino == os.fstat(fd).st_ino
+        except FileNotFoundError:
+            return False
+
+    def release(self) -> None:
+        """Remove the file and let go; twice does no harm."""
+        if self._fd >= 0:
+            with contextlib.suppress(OSError):
+                self.path.unlink()
+            os.close(self._fd)
+            self._fd = -1

@@ -1,0 +1,210 @@
+"""What an agent shows of itself: one value, built in ``rmpa.agent``, read by the CLI and the web page.
+
+It crosses the control socket as JSON (``msgspec``). Times are seconds; ``…_ago`` counts back from the snapshot.
+A field that is ``None`` is not known, or not yet.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+
+class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """The agent itself.
+
+    Attributes:
+        name: The module's name.
+        guid: ``10.0.0.1:40001#7``.
+        instance: The random id of this run, 32 hexadecimal digits.
+        domain: Its domain id.
+        core_uri: The ROS core's, as in ROS_MASTER_URI: ``http://127.0.0.1:11311/``.
+        version: Of RMPA.
+        pid: The agent's process.
+        started: Seconds since the epoch.
+        uptime: Seconds.
+        cpu: Share of one core since the snapshot before this one (or since the start), in percent.
+        rss: Resident memory, bytes.
+        addresses: Its numeric IPv4 addresses, best first.
+        interfaces: The interfaces that beacons go out on.
+        config_file: Where its settings were read, or empty.
+    """
+
+    name: str
+    guid: str
+    instance: str
+    domain: int
+    core_uri: str
+    version: str
+    pid: int
+    started: float
+    uptime: float
+    cpu: float | None = None
+    rss: int | None = None
+    addresses: tuple[str, ...] = ()
+    interfaces: tuple[str, ...] = ()
+    config_file: str = ""
+
+
+class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """The live link to a peer.
+
+    Attributes:
+        remote: ``address:port`` of the other end of the TCP connection.
+        dialled: Whether we dialled; else the peer did.
+        up_ago: Seconds since it came up.
+        rtt: Round trip, seconds: the least of the last ones.
+        clock_offset: The peer's wall clock less ours, seconds.
+        clock_error: Bound of that offset's error, ± seconds.
+        bytes_in: Received since it came up.
+        bytes_out: Sent since it came up.
+        queued: Bytes that wait for the peer to take them.
+        dropped: Messages dropped because it took them too slowly.
+        heard_ago: Seconds since anything arrived.
+    """
+
+    remote: str
+    dialled: bool
+    up_ago: float
+    rtt: float | None = None
+    clock_offset: float | None = None
+    clock_error: float | None = None
+    bytes_in: int = 0
+    bytes_out: int = 0
+    queued: int = 0
+    dropped: int = 0
+    heard_ago: float | None = None
+
+
+class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """One peer of the roster.
+
+    Attributes:
+        name: Its name.
+        guid: Its GUID as text.
+        instance: The random id of its run, 32 hexadecimal digits.
+        addresses: Where it can be reached, best first.
+        state: ``linked``; ``linking`` (dialling, or waiting to be dialled); ``refused`` (it said no, or we did);
+            ``conflict`` (shares a GUID or a name with another).
+        since_ago: Seconds since it came into this state.
+        found_ago: Seconds since it was first heard of.
+        beacon_ago: Seconds since its last beacon.
+        source: How it was found: ``multicast``, ``unicast``, ``seed``, ``gossip`` or ``link``.
+        link: The link, while there is one.
+        last_error: Why the last attempt or link failed, ready to read; empty if none did.
+        next_attempt: Seconds until the next attempt to dial.
+        conflicts: What is wrong with its identity, each ready to read.
+        topics_in: Topics that it offers us.
+        topics_out: Topics that we offer it.
+    """
+
+    name: str
+    guid: str
+    instance: str
+    state: str
+    since_ago: float
+    addresses: tuple[str, ...] = ()
+    found_ago: float | None = None
+    beacon_ago: float | None = None
+    source: str = ""
+    link: LinkInfo | None = None
+    last_error: str = ""
+    next_attempt: float | None = None
+    conflicts: tuple[str, ...] = ()
+    topics_in: int = 0
+    topics_out: int = 0
+
+
+class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """One source that crosses the mesh, seen from here.
+
+    Attributes:
+        peer: The peer it comes from, or goes to.
+        node: The publishing node, by its name in its own graph.
+        direction: ``in`` or ``out``.
+        state: ``idle`` (visible, nobody listens), ``opening``, ``open``, ``lingering``, ``waiting`` (it failed and
+            is tried again) or ``hidden`` (not shown: see ``problem``).
+        type: The message type that the source has.
+        md5: Of that type; empty before it is known.
+        messages: That crossed since the route was first open.
+        bytes: Likewise.
+        dropped: Messages dropped because a receiver was slow.
+        last_ago: Seconds since the last message.
+        latched: Whether its publisher latches.
+        problem: Why it does not flow, ready to read; empty if nothing is wrong.
+    """
+
+    peer: str
+    node: str
+    direction: str
+    state: str
+    type: str = ""
+    md5: str = ""
+    messages: int = 0
+    bytes: int = 0
+    dropped: int = 0
+    last_ago: float | None = None
+    latched: bool = False
+    problem: str = ""
+
+
+class TopicInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """One topic of the local graph, or one that peers offer.
+
+    Attributes:
+        name: Its global name.
+        type: The local graph's type; ``*`` or empty where nobody has told it.
+        md5: Of that type; empty before it is known.
+        publishers: Local nodes that publish it (proxies of peers left out).
+        subscribers: Local nodes that subscribe to it (our own left out).
+        routes: What of it crosses.
+        crosses: Whether policy lets it cross.
+        policy: The rule that says so, ready to read.
+        mismatches: Sources with another type or md5, each ready to read.
+    """
+
+    name: str
+    type: str = ""
+    md5: str = ""
+    publishers: tuple[str, ...] = ()
+    subscribers: tuple[str, ...] = ()
+    routes: tuple[RouteInfo, ...] = ()
+    crosses: bool = True
+    policy: str = ""
+    mismatches: tuple[str, ...] = ()
+
+    @property
+    def peers(self) -> tuple[str, ...]:
+        """The peers that publish it, each once, in order."""
+        return tuple(sorted({route.peer for route in self.routes if route.direction == "in"}))
+
+
+class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
+    """Everything at one moment.
+
+    Attributes:
+        agent: The agent itself.
+        taken: When, seconds since the epoch.
+        peers: The roster, by name.
+        topics: The graph's topics, by name.
+        counters: What was refused or dropped, by name: ``beacon.malformed`` …
+        notes: What the user should know (a port taken, no multicast), each ready to read.
+    """
+
+    agent: AgentInfo
+    taken: float
+    peers: tuple[PeerInfo, ...] = ()
+    topics: tuple[TopicInfo, ...] = ()
+    counters: dict[str, int] = {}
+    notes: tuple[str, ...] = ()
+
+
+class PingReply(msgspec.Struct, kw_only=True, frozen=True):
+    """The value of the op ``ping``.
+
+    Attributes:
+        times: Round trips over the mesh in seconds, in order; ``None`` for one that was lost.
+        remote: ``address:port`` of the peer's end of the link.
+    """
+
+    times: tuple[float | None, ...]
+    remote: str = ""
