@@ -77,10 +77,8 @@ GREETING_FIRST: Final = 0.5
 """Before the second greeting to an address known by hearsay; then it doubles."""
 GREETING_MAX: Final = 10.0
 """Between two greetings at the most."""
-GREETING_ATTEMPTS: Final = 6
-"""Unanswered greetings (over some 15 s) after which an address is left alone …"""
-GREETING_FORGET: Final = 60.0
-"""… for this long, even if others still speak of it."""
+GREETING_FORGET: Final = 20.0
+"""An address of which nobody spoke for this long (four heartbeats) is greeted no more."""
 SPREAD_INTERVAL: Final = 0.5
 """News of found peers are gathered this long for those that hear no multicast; the first goes out at once."""
 BEACONS_PER_WAKE: Final = 64
@@ -103,6 +101,8 @@ LINK_LEASE: Final = 1.0
 """A link on which nothing arrived for this long is dead (TCP alone would take two hours)."""
 KEEPALIVE_INTERVAL: Final = 0.25
 """A quarter of the lease: three keepalives may be late before the link falls."""
+KEEPALIVE_ANSWERED: Final = 1.2
+"""The acceptor's interval in those of the dialler: the dialler pings, and the pong counts as a sign of life."""
 HANDSHAKE_TIMEOUT: Final = 3.0
 """From connect to welcome; whoever takes longer is a port scanner or stuck."""
 DIAL_TIMEOUT: Final = 2.0
@@ -190,6 +190,18 @@ SUBSCRIBER_QUEUE_MESSAGES: Final = 1000
 """Messages that wait for one slow local subscriber; the oldest is dropped beyond it."""
 SUBSCRIBER_QUEUE_BYTES: Final = 32 * MIB
 """The same in bytes; one message always fits."""
+DEFINITION_MAX: Final = 1 * MIB
+"""Characters of a message definition that we learn from a publisher; the longest known are some 100 KB."""
+DEFINITION_FIELDS_MAX: Final = 4096
+"""Fields and constants of one message type."""
+DEFINITION_DEPTH_MAX: Final = 32
+"""Types within types; ROS's own go five deep."""
+LEARNT_TYPES_MAX: Final = 256
+"""Message types learnt from publishers that a process remembers; the one unused for longest is forgotten."""
+NODE_MASTER_CHECK: Final = 0.5
+"""Between a node's looks whether its master still knows it: a restarted core has its nodes back within a second."""
+RECEIVED_QUEUE: Final = 1000
+"""Messages that wait for an ``async for``; the oldest is dropped beyond it."""
 HTTP_BODY_MAX: Final = 8 * MIB
 """An XML-RPC call: parameters with maps and URDFs reach a few MB."""
 HTTP_BODY_INLINE: Final = 256 * KIB
@@ -212,6 +224,14 @@ SLAVE_CALL_TIMEOUT: Final = 3.0
 """For one XML-RPC call to a node; a stopped node must not hold the others up."""
 NODE_CHECK_INTERVAL: Final = 5.0
 """How often the core looks whether a registered node still listens."""
+NODE_RECHECK_DELAY: Final = 0.2
+"""Between the two refused connects that make a node dead: it may be restarting its server."""
+NOTIFY_QUEUE_MAX: Final = 4096
+"""Topics and parameters that wait to be told to one slow node; of one topic only the latest waits."""
+NOTIFY_RETRY_FIRST: Final = 0.2
+"""Before a node that did not answer is told again."""
+NOTIFY_RETRY_MAX: Final = 3.0
+"""Between attempts at the most, for as long as the node is registered."""
 ROSOUT_QUEUE: Final = 1000
 """Log messages waiting for a slow reader of /rosout_agg."""
 
@@ -224,6 +244,8 @@ ROUTES_PER_LINK_MAX: Final = 8192
 """Open routes that one peer may hold with us."""
 TOPICS_PER_PEER_MAX: Final = 16384
 """(topic, node) pairs that one peer may advertise."""
+MISMATCHES_MAX: Final = 16
+"""Refused subscribers of one source that are remembered for the user."""
 RECONCILE_INTERVAL: Final = 5.0
 """The plan is compared with what is really open this often, so that nothing stays stuck."""
 

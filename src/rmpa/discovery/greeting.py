@@ -45,11 +45,13 @@ class AnswerLimit:
 class _Greeting:
     backoff: Backoff
     at: float
-    attempts: int = 0
+    told_at: float
 
 
 class Greetings:
-    """Addresses that others told us of: each greeted a few times with back-off, then left alone for a while.
+    """Addresses that others told us of: each greeted with back-off for as long as somebody speaks of it.
+
+    It ends by itself: nobody passes on a peer that has not spoken to it, so the dead are soon spoken of no more.
 
     Args:
         rng: Uniform numbers in [0, 1).
@@ -66,12 +68,14 @@ class Greetings:
         return len(self._all)
 
     def learn(self, address: Address, now: float) -> bool:
-        """Greet ``address`` from now on, unless that is under way; ``False`` if there is no room for it."""
-        if address in self._all:
+        """Somebody spoke of ``address``: greet it for a while; ``False`` if there is no room for it."""
+        greeting = self._all.get(address)
+        if greeting is not None:
+            greeting.told_at = now
             return True
         if len(self._all) >= limits.GREETINGS_MAX:
             return False
-        self._all[address] = _Greeting(Backoff(limits.GREETING_FIRST, limits.GREETING_MAX, self._rng), now)
+        self._all[address] = _Greeting(Backoff(limits.GREETING_FIRST, limits.GREETING_MAX, self._rng), now, now)
         return True
 
     def heard(self, address: Address) -> bool:
@@ -83,13 +87,11 @@ class Greetings:
         greeted = []
         for address in sorted(a for a, g in self._all.items() if g.at <= now):
             greeting = self._all[address]
-            if greeting.attempts >= limits.GREETING_ATTEMPTS:
+            if now - greeting.told_at >= limits.GREETING_FORGET:
                 del self._all[address]
                 continue
             greeted.append(address)
-            greeting.attempts += 1
-            last = greeting.attempts >= limits.GREETING_ATTEMPTS
-            greeting.at = now + (limits.GREETING_FORGET if last else greeting.backoff.delay())
+            greeting.at = now + greeting.backoff.delay()
         return greeted
 
     def next_timer(self) -> float | None:
