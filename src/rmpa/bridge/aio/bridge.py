@@ -75,6 +75,7 @@ class Bridge:
         self._reconciler: asyncio.TimerHandle | None = None
         self._rescan: asyncio.Handle | None = None
         self._closed = False
+        self._mismatches: dict[Source, dict[str, str]] = {}
         self.counters = Counters()
         self._refusals = RefusalLog(_log, self.counters)
 
@@ -92,6 +93,10 @@ class Bridge:
     def outbound(self) -> Outbound:
         """The outbound side, for the monitor."""
         return self._outbound
+
+    def mismatches(self, source: Source) -> tuple[str, ...]:
+        """What did not fit a source, here or over there, ready to read; forgotten with the source."""
+        return tuple(self._mismatches.get(source, {}).values())
 
     def attached(self) -> Iterator[Attached]:
         """Every link that is up, for the monitor."""
@@ -128,9 +133,7 @@ class Bridge:
             self._core,
             prefix,
             on_demand=lambda source, wanted: self._demand(peer, source, wanted=wanted),
-            on_mismatch=lambda source, subscriber, text: self._act(
-                self._imports.mismatched(peer, source, subscriber, text)
-            ),
+            on_mismatch=lambda source, subscriber, text: self._mismatched(peer, source, subscriber, text),
         )
         attached = Attached(peer, link, inbound)
         self._by_number[peer] = self._by_link[link] = attached
@@ -188,6 +191,7 @@ class Bridge:
                 self._act(self._imports.closed(peer, message, now))
             case Mismatch():
                 who = f"{attached.link.name}: {message.source}"
+                self._remember(message.source, f"{attached.link.name}{message.subscriber}", message.text)
                 self._warn("mismatch.remote", who, f"{who}: {message.text}")
 
     def _detach(self, attached: Attached) -> None:
@@ -222,6 +226,9 @@ class Bridge:
         }
         self._act(self._exports.graph(sources))
         self._act(self._imports.local_types({source.topic: local.type for source, local in sources.items()}))
+        known = {*self._exports.offered, *(source for _, source, _ in self._imports)}
+        for source in [source for source in self._mismatches if source not in known]:
+            del self._mismatches[source]
 
     def _reconcile(self) -> None:
         self._reconciler = self._loop.call_later(limits.RECONCILE_INTERVAL, self._reconcile)
@@ -233,6 +240,15 @@ class Bridge:
 
     def _demand(self, peer: int, source: Source, *, wanted: bool) -> None:
         self._act(self._imports.demand(peer, source, self._loop.time(), wanted=wanted))
+
+    def _mismatched(self, peer: int, source: Source, subscriber: str, text: str) -> None:
+        self._remember(source, subscriber, text)
+        self._act(self._imports.mismatched(peer, source, subscriber, text))
+
+    def _remember(self, source: Source, who: str, text: str) -> None:
+        known = self._mismatches.setdefault(source, {})
+        if who in known or len(known) < limits.MISMATCHES_MAX:
+            known[who] = text
 
     def _described(self, source: Source, description: Description) -> None:
         self._act(self._exports.described(source, description))

@@ -1,0 +1,165 @@
+"""Builds the rooms of one agent, wires them, and ends them in order."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import logging
+import os
+import random
+import signal
+import time
+from typing import TYPE_CHECKING, Final
+
+from rmpa.agent.station import Station
+from rmpa.agent.view import View
+from rmpa.bridge.aio.bridge import Bridge
+from rmpa.bridge.policy import Policy
+from rmpa.core.aio.notify import notify_service_manager
+from rmpa.core.config_values import did_you_mean
+from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
+from rmpa.monitor.aio.control_server import ControlServer
+from rmpa.monitor.aio.runtime_dir import runtime_dir
+from rmpa.monitor.snapshot import PingReply, Snapshot
+from rmpa.ros.aio.core import RosCore
+
+if TYPE_CHECKING:
+    from rmpa.core.config import Settings
+    from rmpa.mesh.aio.link import MeshLink
+
+_log = logging.getLogger(__name__)
+
+_RETRY: Final = 1.0
+_PINGS_MAX: Final = 100
+
+
+class Agent:
+    """One module's agent: core, discovery, mesh and bridge.
+
+    Args:
+        settings: Complete: the name is filled in.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._control = ControlServer(
+            runtime_dir(os.environ, settings.runtime_dir),
+            settings.name,
+            {"snapshot": self._snapshot, "ping": self._ping},
+        )
+        self.core = RosCore(settings.core_host, settings.core_port)
+        self.bridge = Bridge(self.core, Policy(settings.policy), rng=random.random)
+        self.station: Station | None = None
+        self._moving: asyncio.Task[None] | None = None
+        self._view = View(settings, self.core, self.bridge, started=time.time())
+
+    async def start(self) -> None:
+        """Start every part; the network last, so that who finds us finds us ready.
+
+        Raises:
+            StartError: The name, the core's port or the mesh's port is taken.
+        """
+        async with contextlib.AsyncExitStack() as undo:
+            self._control.lock()
+            undo.push_async_callback(self._control.close)
+            await self.core.start()
+            undo.push_async_callback(self.core.close)
+            await self.bridge.start()
+            undo.push_async_callback(self.bridge.close)
+            await self._join(self._settings.port)
+            undo.push_async_callback(self._leave)
+            await self._control.start()
+            self._undo = undo.pop_all()
+        # What lives now lives until the end: the collector need not look at it again.
+        gc.collect()
+        gc.freeze()
+        _log.info("= ROS_MASTER_URI=%s", self.core.uri)
+
+    async def close(self) -> None:
+        """End every part: goodbye first, then the local graph's foreign nodes, the core last."""
+        if self._moving is not None:
+            self._moving.cancel()
+        await self._undo.aclose()
+
+    # --- the place in the network ------------------------------------------------------------------------------
+
+    async def _join(self, port: int) -> None:
+        self.station = Station(self._settings, self.bridge, port=port, on_displaced=self._displaced)
+        self._view.station = self.station
+        await self.station.start()
+
+    async def _leave(self) -> None:
+        if self.station is not None:
+            station, self.station = self.station, None
+            self._view.station = None
+            await station.close()
+
+    def _displaced(self) -> None:
+        if self._moving is None:
+            self._moving = asyncio.create_task(self._move(), name="move to the new address")
+
+    async def _move(self) -> None:
+        try:
+            port = self.station.port if self.station is not None else self._settings.port
+            _log.info("= the machine's addresses have changed: taking a new GUID")
+            await self._leave()
+            while self.station is None:
+                try:
+                    await self._join(port)
+                except RmpaError as error:
+                    _log.warning("! cannot join with the new address yet: %s", error)
+                    await asyncio.sleep(_RETRY)
+        finally:
+            self._moving = None
+
+    # --- the control socket's handlers -------------------------------------------------------------------------
+
+    def _snapshot(self, _args: dict[str, object]) -> Snapshot:
+        return self._view.snapshot()
+
+    async def _ping(self, args: dict[str, object]) -> PingReply:
+        link = self._link(str(args.get("peer", "")))
+        count = args.get("count", 1)
+        if not isinstance(count, int) or not 1 <= count <= _PINGS_MAX:
+            raise ConfigError("count", f"{count!r} is not between 1 and {_PINGS_MAX}")
+        times = [await link.ping() for _ in range(count)]
+        host, port = link.remote_endpoint
+        return PingReply(times=tuple(times), remote=f"{host}:{port}")
+
+    def _link(self, peer: str) -> MeshLink:
+        links = [attached.link for attached in self.bridge.attached()]
+        fitting = [link for link in links if peer in {link.name, str(link.guid), str(link.guid).partition("#")[0]}]
+        if len(fitting) == 1:
+            return fitting[0]
+        if fitting:
+            raise PeerRefused(self._settings.name, f"{len(fitting)} peers are named {peer}", "name one by its GUID")
+        near = did_you_mean(peer, [link.name for link in links])
+        remedy = f"did you mean {near}?" if near else "`rmpa peer list` shows who is there, and why one is not linked"
+        raise UnreachableError("linked peer", repr(peer), remedy)
+
+
+async def _serve(settings: Settings) -> None:
+    agent = Agent(settings)
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    await agent.start()
+    try:
+        notify_service_manager("READY=1")
+        await stop.wait()
+        notify_service_manager("STOPPING=1")
+        _log.info("= ending")
+    finally:
+        await agent.close()
+
+
+def run(settings: Settings) -> int:
+    """Run an agent until SIGINT or SIGTERM; return the exit code.
+
+    Raises:
+        StartError: It cannot start on this machine as asked.
+    """
+    asyncio.run(_serve(settings))
+    return 0

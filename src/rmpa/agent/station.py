@@ -1,0 +1,122 @@
+"""An agent's place in the network: one GUID, its port, its discovery and its links.
+
+When the addresses of the machine change so that the GUID's own is no longer among them (an agent that started
+before the network did has 127.0.0.1), the agent leaves with a goodbye and takes a new place; its core and the
+local graph do not notice.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.aio.clock import SystemClock
+from rmpa.core.aio.sockets import open_mesh_port
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+from rmpa.discovery.aio.interfaces import choose_addresses, list_interfaces
+from rmpa.discovery.aio.service import Discovery
+from rmpa.discovery.events import Conflict, PeerChanged, PeerFound, PeerLost, PeerRestarted
+from rmpa.mesh.aio.mesh import Mesh
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from ipaddress import IPv4Address
+
+    from rmpa.bridge.aio.bridge import Bridge
+    from rmpa.core.config import Settings
+    from rmpa.discovery.events import Event
+    from rmpa.mesh.aio.link import MeshLink
+
+_log = logging.getLogger(__name__)
+
+_INCARNATIONS: Final = 1 << 16
+
+
+class Station:
+    """Discovery and mesh under one identity, feeding the bridge.
+
+    Args:
+        settings: The agent's settings.
+        bridge: Told of links, their messages and their end.
+        port: The mesh port to take; 0 lets the system choose.
+        on_displaced: Called when the machine's addresses no longer fit the identity.
+
+    Raises:
+        StartError: The port cannot be had.
+    """
+
+    def __init__(self, settings: Settings, bridge: Bridge, *, port: int, on_displaced: Callable[[], None]) -> None:
+        clock = SystemClock()
+        self._settings = settings
+        self._bridge = bridge
+        self._on_displaced = on_displaced
+        tcp, udp = open_mesh_port(port)
+        self.port: int = tcp.getsockname()[1]
+        addresses = choose_addresses(list_interfaces(settings.interfaces))
+        # Seconds modulo 18 hours: later for each restart. The random instance id is what decides.
+        incarnation = clock.wall_ns() // 1_000_000_000 % _INCARNATIONS
+        self.identity = Identity(
+            Guid.of(addresses[0], self.port, incarnation),
+            os.urandom(limits.INSTANCE_ID_BYTES),
+            settings.name,
+            settings.domain,
+            tuple(addresses[1 : limits.BEACON_ADDRESSES_MAX + 1]),
+        )
+        self.mesh = Mesh(
+            self.identity,
+            tcp,
+            on_link_up=self._link_up,
+            on_link_down=self._link_down,
+            on_control=bridge.control,
+            on_data=bridge.data,
+            clock=clock,
+        )
+        self.discovery = Discovery(
+            self.identity, settings, udp, on_event=self._event, on_addresses=self._addresses, clock=clock
+        )
+
+    async def start(self) -> None:
+        """Accept links, then say that we are here."""
+        await self.mesh.start()
+        await self.discovery.start()
+        _log.info("= %s, domain %d, is on the air", self.identity, self.identity.domain)
+
+    async def close(self) -> None:
+        """Say goodbye, end the links in order."""
+        await self.discovery.close()
+        await self.mesh.close()
+
+    def _event(self, event: Event) -> None:
+        match event:
+            case PeerFound(identity=identity, source=source):
+                _log.info("+ %s found", identity)
+                self.mesh.peer_found(identity, source[0] if source else None)
+            case PeerChanged(identity=identity):
+                self.mesh.peer_found(identity)
+            case PeerRestarted(identity=identity, previous=previous, source=source):
+                _log.info("+ %s restarted, it was %s", identity, previous.guid)
+                self.mesh.peer_gone(previous.guid)
+                self.mesh.peer_found(identity, source[0] if source else None)
+            case PeerLost(identity=identity, reason=reason):
+                _log.info("- %s %s", identity, reason.value)
+                self.mesh.peer_gone(identity.guid)
+            case Conflict():
+                _log.error("! %s", event)
+
+    def _link_up(self, link: MeshLink) -> None:
+        _log.info("+ linked with %s", link.identity)
+        self.discovery.link_up(link.identity, link.remote_endpoint)
+        self._bridge.link_up(link)
+
+    def _link_down(self, link: MeshLink, reason: str) -> None:
+        _log.info("- link with %s: %s", link.identity, reason)
+        self._bridge.link_down(link)
+        self.discovery.link_down(link.identity.guid, link.identity.instance)
+
+    def _addresses(self, addresses: tuple[IPv4Address, ...]) -> None:
+        ours = self.identity.guid.address
+        if addresses and ours not in addresses and (not ours.is_loopback or not addresses[0].is_loopback):
+            self._on_displaced()
