@@ -180,6 +180,9 @@ class Link:
         self._label = label
         self._state = State.HANDSHAKING
         self._keepalive = lease * limits.KEEPALIVE_INTERVAL / limits.LINK_LEASE
+        if role is Role.ACCEPTOR:
+            # A little later than the dialler's, so that its pongs are all that an idle link needs of it.
+            self._keepalive *= limits.KEEPALIVE_ANSWERED
         self._deadline = now + limits.HANDSHAKE_TIMEOUT
         self._reason = ""
         self._heard = now

@@ -7,15 +7,16 @@ keeps to ``core.outbox`` and costs one system call a message each way.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
-import socket
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import URGENT, Outbox
+
+if TYPE_CHECKING:
+    import socket
 
 _log = logging.getLogger(__name__)
 
@@ -34,10 +35,11 @@ class Stream:
     Args:
         sock: Connected, non-blocking; owned by the stream from here on.
         on_bytes: Called with all bytes not yet consumed; returns ``(consumed, wanted)``: how many it took, and
-            how many there must be in all before it can take more (0 if it cannot say). The view is only valid
-            during the call. A ``RemoteProtocolError`` raised here closes the stream with it.
-        on_close: Called once, from the loop, when the socket is gone: with ``None`` after an orderly end, with
-            the error otherwise. Not called after ``close()``.
+            how many there must be in all behind those before it can take more (0 if it cannot say). The view is
+            only valid during the call. A ``RemoteProtocolError`` raised here closes the stream with it; any other
+            exception is a bug, is logged, and closes the stream too.
+        on_close: Called once, from the loop and never from within a method, when the socket is gone: with
+            ``None`` after an orderly end, with the error otherwise. Not called after ``close()``.
         outbox: The bounds for what waits.
     """
 
@@ -54,8 +56,11 @@ class Stream:
         self._writing = False
         self._closed = False
         self._drained: asyncio.Future[None] | None = None
+        self._report: asyncio.Handle | None = None
         self.bytes_in = 0
         self.bytes_out = 0
+        self.last_in = self._loop.time()
+        """When bytes last came (``loop.time()``), whether or not ``on_bytes`` was called for them."""
         self._fd = sock.fileno()
         self._loop.add_reader(self._fd, self._readable)
 
@@ -74,54 +79,72 @@ class Stream:
         """What waits, and what was dropped."""
         return self._outbox
 
-    def feed(self, data: bytes) -> None:
+    def feed(self, data: Buffer) -> None:
         """Take bytes that somebody else read from the socket before the stream had it."""
+        if self._closed:
+            return
         self._reserve(self._filled + len(data))
         self._view[self._filled : self._filled + len(data)] = data
         self._filled += len(data)
+        self.bytes_in += len(data)
         self._deliver()
 
-    def send(self, parts: list[Buffer], key: int) -> int:
+    def send(self, parts: Sequence[Buffer], key: int) -> int:
         """Send one message made of ``parts``, or queue what the socket does not take.
 
         Args:
-            parts: In order; not kept after the call.
+            parts: In order, views of single bytes; not kept after the call.
             key: Which flow it belongs to, for the overflow policy; ``URGENT`` is never dropped.
 
         Returns:
-            How many older messages of the key were dropped to make room.
+            How many older messages, of any key, were dropped to make room.
         """
         if self._closed:
             return 0
         if self._writing:
-            joined = b"".join(parts)
-            if key == URGENT:
-                self._outbox.push_urgent(joined)
-                return 0
-            return self._outbox.push(joined, key)
+            return self._queue(b"".join(parts), key)
         try:
-            sent = self._sock.sendmsg(parts) if len(parts) > 1 else self._sock.send(parts[0])
+            sent = self._sock.sendmsg(parts)
         except (BlockingIOError, InterruptedError):
             sent = 0
         except OSError as error:
             self._lost(error)
             return 0
         self.bytes_out += sent
-        if sent == sum(map(len, parts)):
+        size = 0
+        for part in parts:
+            size += len(part)
+        if sent == size:
             return 0
-        rest = b"".join(parts)[sent:]
         self._writing = True
         self._loop.add_writer(self._fd, self._writable)
-        if sent:
-            self._outbox.push_rest(rest, key)
-        elif key == URGENT:
-            self._outbox.push_urgent(rest)
-        else:
-            return self._outbox.push(rest, key)
+        if not sent:
+            return self._queue(b"".join(parts), key)
+        self._outbox.push_rest(_behind(parts, sent), key)
         return 0
 
     def close(self) -> None:
         """Close at once; what still waits is lost. ``on_close`` is not called."""
+        if self._report is not None:
+            self._report.cancel()
+            self._report = None
+        self._shut()
+
+    async def drained(self, within: float = limits.DRAIN_TIMEOUT) -> None:
+        """Wait until all that was sent has left, the stream is closed, or ``within`` seconds are over."""
+        if self._closed or not self._writing:
+            return
+        if self._drained is None or self._drained.done():
+            self._drained = self._loop.create_future()
+        await asyncio.wait([self._drained], timeout=within)
+
+    def _queue(self, message: bytes, key: int) -> int:
+        if key == URGENT:
+            self._outbox.push_urgent(message)
+            return 0
+        return self._outbox.push(message, key)
+
+    def _shut(self) -> None:
         if self._closed:
             return
         self._closed = True
@@ -131,21 +154,18 @@ class Stream:
         self._sock.close()
         self._view = memoryview(b"")
         self._buffer = bytearray()
+        self._outbox.clear()
+        self._done_draining()
+
+    def _done_draining(self) -> None:
         if self._drained is not None and not self._drained.done():
             self._drained.set_result(None)
 
-    async def drained(self, timeout: float = limits.DRAIN_TIMEOUT) -> None:
-        """Wait until all that was sent has left, the stream is closed, or ``timeout`` seconds are over."""
-        if self._closed or not self._writing:
-            return
-        self._drained = self._loop.create_future()
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._drained, timeout)
-
     def _lost(self, error: Exception | None) -> None:
         if not self._closed:
-            self.close()
-            self._on_close(error)
+            self._shut()
+            # Not from here: this may be a ``send`` in the middle of the owner's loop over its streams.
+            self._report = self._loop.call_soon(self._on_close, error)
 
     def _reserve(self, size: int) -> None:
         if size > len(self._buffer):
@@ -165,6 +185,7 @@ class Stream:
         if count == 0:
             self._lost(None)
             return
+        self.last_in = self._loop.time()
         self.bytes_in += count
         self._filled += count
         if self._filled >= self._wanted or self._filled == len(self._buffer):
@@ -176,20 +197,26 @@ class Stream:
         except RemoteProtocolError as error:
             self._lost(error)
             return
+        except Exception as error:  # noqa: BLE001 - a callback's top: the same bytes must not be offered for ever
+            _log.error("! a reader of bytes failed; its connection is closed", exc_info=error)
+            self._lost(error)
+            return
         if self._closed:
             return
         rest = self._filled - consumed
         if consumed and rest:
-            # Forwards within one buffer: bytearray slicing copies first, so an overlap is safe.
-            self._buffer[:rest] = self._buffer[consumed : self._filled]
+            # Forwards within one buffer: memoryview assignment is a memmove, so an overlap is safe.
+            self._view[:rest] = self._view[consumed : self._filled]
         self._filled = rest
         self._wanted = wanted
         if rest == len(self._buffer) or wanted > len(self._buffer):
             # What a peer only claims is not allocated: the buffer grows with what has really come.
             self._reserve(min(max(wanted, 2 * rest), max(4 * rest, _FIRST_BUFFER)))
-        elif rest == 0 and wanted <= _FIRST_BUFFER and len(self._buffer) > _KEPT_BUFFER:
+        elif rest <= _FIRST_BUFFER // 2 and wanted <= _FIRST_BUFFER and len(self._buffer) > _KEPT_BUFFER:
+            view = self._view
             self._buffer = bytearray(_FIRST_BUFFER)
             self._view = memoryview(self._buffer)
+            self._view[:rest] = view[:rest]
 
     def _writable(self) -> None:
         try:
@@ -204,5 +231,14 @@ class Stream:
         if not self._outbox:
             self._writing = False
             self._loop.remove_writer(self._fd)
-            if self._drained is not None and not self._drained.done():
-                self._drained.set_result(None)
+            self._done_draining()
+
+
+def _behind(parts: Sequence[Buffer], sent: int) -> bytes:
+    """What is left of ``parts`` behind the first ``sent`` bytes, copied once."""
+    left: list[memoryview] = []
+    for part in parts:
+        if sent < len(part):
+            left.append(memoryview(part)[sent:])
+        sent = max(0, sent - len(part))
+    return b"".join(left)
