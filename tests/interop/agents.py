@@ -174,7 +174,7 @@ class Agent:
     def peers(self) -> dict[str, dict[str, object]]:
         """What ``rmpa peer list --json`` says, by peer name."""
         code, output = self.rmpa("peer", "list", "--json", "--agent", self.name)
-        assert code == 0, output
+        assert code == 0, f"{output}\n{self.process.output[-4000:]}"
         answer = json.loads(output)
         rows = answer["peers"] if isinstance(answer, dict) else answer
         return {str(row["name"]): row for row in rows}
@@ -210,7 +210,7 @@ class Agent:
 
 def is_linked(row: dict[str, object]) -> bool:
     """Whether a row of ``rmpa peer list --json`` is of a peer with a live link."""
-    return row.get("linked") is True or row.get("state") in {"linked", "up"}
+    return row.get("state") == "linked"
 
 
 def _short_dir(home: Path, host: Host) -> Path:

@@ -10,6 +10,7 @@ import pytest
 
 from tests.interop import namespaces
 from tests.interop.agents import Agent
+from tests.interop.modules import Module
 from tests.interop.namespaces import MACHINE, Host, Lab
 from tests.interop.ros import Ros, free_port
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
 ShellFactory = Callable[..., Ros]
 AgentFactory = Callable[..., Agent]
+ModuleFactory = Callable[..., list[Module]]
 
 
 @pytest.fixture(scope="session")
@@ -57,3 +59,18 @@ def agent(tmp_path: Path) -> Iterator[AgentFactory]:
             return made
 
         yield make
+
+
+@pytest.fixture
+def modules(lab: Lab, shell: ShellFactory, agent: AgentFactory) -> ModuleFactory:
+    """Make linked modules on one network: ``a, b = modules("a", "b")``. Mark the test ``ros`` and ``netns``."""
+
+    def make(*names: str, linked: bool = True, **options: object) -> list[Module]:
+        hosts = lab.hosts(*names)
+        made = [Module(host, agent(host, name=host.name, **options), shell(host)) for host in hosts]
+        for first, one in enumerate(made if linked else []):
+            for other in made[first + 1 :]:
+                one.agent.wait_peer(other.name)
+        return made
+
+    return make
