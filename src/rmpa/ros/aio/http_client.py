@@ -22,7 +22,7 @@ from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, UnreachableError
 from rmpa.ros.xmlrpc import Reply, RosFault, XmlRpcValue, brief, parse_response, serialize_call
 
-__all__ = ["RosFault", "call", "call_api", "connect", "split_uri"]
+__all__ = ["RosFault", "call", "call_api", "connect", "is_own_name", "split_uri"]
 
 _log = logging.getLogger(__name__)
 
@@ -47,13 +47,14 @@ def split_uri(uri: str) -> tuple[str, int, str]:
     return host, port, parts.path or "/"
 
 
-def _is_own_name(host: str) -> bool:
+def is_own_name(host: str) -> bool:
+    """Whether a host's name is this machine's, so that loopback will do."""
     return host in {"localhost", socket.gethostname()}
 
 
 async def _addresses(host: str, port: int) -> list[tuple[str, int]]:
     """Where to connect, best first: names of this machine and numbers without asking the resolver."""
-    if _is_own_name(host):
+    if is_own_name(host):
         return [(_LOOPBACK, port)]
     try:
         return [(str(ipaddress.IPv4Address(host)), port)]
@@ -106,7 +107,7 @@ async def connect(host: str, port: int) -> socket.socket:
             return await _connect_one(address)
         except OSError as refused:
             error = refused
-    if _is_own_name(host) and host != "localhost":
+    if is_own_name(host) and host != "localhost":
         # A node may listen at this machine's outer address only.
         for address in await _resolve(host, port):
             if address not in addresses:

@@ -1,0 +1,71 @@
+"""``rmpa core``: the ROS core alone, in place of ``roscore``."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+import sys
+
+import click
+
+from rmpa.core.errors import StartError, UnreachableError
+
+_FALLBACK_PORT = 11311
+
+
+def _default_port() -> int:
+    """The port of ``ROS_MASTER_URI`` if that names this machine, as roscore has it; else ROS's own."""
+    from rmpa.ros.aio.http_client import is_own_name, split_uri
+
+    try:
+        host, port, _ = split_uri(os.environ.get("ROS_MASTER_URI", ""))
+    except UnreachableError:
+        return _FALLBACK_PORT
+    return port if is_own_name(host) or host.startswith("127.") else _FALLBACK_PORT
+
+
+@click.command()
+@click.option(
+    "-p",
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=None,
+    help="Port to listen at; 0 lets the system choose. [default: the port of ROS_MASTER_URI, or 11311]",
+)
+@click.option(
+    "--host", default="127.0.0.1", show_default=True, help="Address to listen at; 0.0.0.0 opens it to the network."
+)
+@click.option("--advertise", default="", metavar="NAME", help="Host name or address to tell nodes, if not --host.")
+@click.option("-v", "--verbose", is_flag=True, help="Log every registration.")
+@click.option("--debug", is_flag=True, help="Log every call.")
+def core(port: int | None, host: str, advertise: str, verbose: bool, debug: bool) -> None:
+    """Run a ROS core: master, parameter server and /rosout, as roscore does."""
+    level = logging.DEBUG if debug else logging.INFO if verbose else logging.WARNING
+    logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(name)s %(message)s")
+    try:
+        asyncio.run(_run(host, _default_port() if port is None else port, advertise))
+    except StartError as error:
+        click.echo(f"rmpa core: {error}", err=True)
+        sys.exit(1)
+
+
+async def _run(host: str, port: int, advertise: str) -> None:
+    from rmpa import __version__
+    from rmpa.ros.aio.core import ROS_VERSION, RosCore
+
+    ended = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, ended.set)
+    core = RosCore(host, port, advertised_host=advertise, on_shutdown=lambda _: ended.set())
+    await core.start()
+    click.echo(f"rmpa core {__version__}, in place of ros_comm {ROS_VERSION.strip()}")
+    click.echo(f"ROS_MASTER_URI={core.uri}")
+    click.echo(f"setting /run_id to {core.call('getParam', '/rmpa_core', '/run_id').value}")
+    click.echo("started core service [/rosout]")
+    sys.stdout.flush()
+    await ended.wait()
+    click.echo("shutting down")
+    await core.close()

@@ -1,0 +1,187 @@
+"""The ROS core of this machine: master, parameter server and /rosout, for nodes as they are.
+
+Every call is answered at once, in the loop: what follows from it (notifications) leaves later, in tasks of its own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import uuid
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core.counters import Counters
+from rmpa.ros.aio.http_server import XmlRpcServer
+from rmpa.ros.aio.liveness import Liveness
+from rmpa.ros.aio.notifier import Notifier
+from rmpa.ros.aio.rosout import Rosout
+from rmpa.ros.master.api import MasterApi
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.ros.master.effects import GraphChange, GraphState
+    from rmpa.ros.xmlrpc import Reply, XmlRpcValue
+
+_log = logging.getLogger(__name__)
+
+DEFAULT_PORT: Final = 11311
+CALLER_ID: Final = "/rmpa_core"
+ROS_DISTRO: Final = "noetic\n"
+"""With the line break that roscore's ``rosversion -d`` leaves in it; programs strip it."""
+ROS_VERSION: Final = "1.15.15\n"
+"""Of ros_comm, whose master this one stands in for."""
+
+
+class RosCore:
+    """A drop-in for ``roscore``.
+
+    Args:
+        host: The address to listen at; loopback unless the whole network shall see this core.
+        port: 0 lets the system choose.
+        advertised_host: What ``uri`` says; default: ``host``, or this machine's name where ``host`` is 0.0.0.0.
+        rosout: Whether to aggregate ``/rosout``.
+        counters: Where refusals, calls and notifications are counted.
+        on_shutdown: ``(reason)``: a client called ``shutdown``; the owner closes the core then.
+    """
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: int = DEFAULT_PORT,
+        *,
+        advertised_host: str = "",
+        rosout: bool = True,
+        counters: Counters | None = None,
+        on_shutdown: Callable[[str], None] | None = None,
+    ) -> None:
+        self.counters = counters if counters is not None else Counters()
+        self._host = host
+        self._advertised = advertised_host or (os.uname().nodename if host in {"", "0.0.0.0"} else host)  # noqa: S104
+        self._on_shutdown = on_shutdown
+        self._api = MasterApi("", os.getpid(), self._asked_to_end)
+        self._server = XmlRpcServer(self._answer, host, port, counters=self.counters, name="ROS core")
+        self._notifier: Notifier | None = None
+        self._liveness: Liveness | None = None
+        self._with_rosout = rosout
+        self._rosout: Rosout | None = None
+        self._callbacks: list[Callable[[GraphChange], None]] = []
+
+    # --- its life ---------------------------------------------------------------------------------------------
+
+    async def start(self) -> None:
+        """Listen; set ``/run_id``, ``/rosdistro`` and ``/rosversion``; start ``/rosout``.
+
+        Raises:
+            StartError: The port is taken, or the address cannot be used.
+        """
+        registrations = self._api.registrations
+        self._notifier = Notifier(
+            nodes_at=registrations.nodes_at, on_unreachable=self._unreachable, counters=self.counters
+        )
+        self._liveness = Liveness(nodes=registrations.nodes, on_dead=self._dead)
+        await self._server.start()
+        self._api.uri = f"http://{self._advertised}:{self.port}/"
+        # roslaunch's convention: nodes of one run find their logs by it.
+        self.call("setParam", CALLER_ID, "/run_id", str(uuid.uuid1()))
+        self.call("setParam", CALLER_ID, "/rosversion", ROS_VERSION)
+        self.call("setParam", CALLER_ID, "/rosdistro", ROS_DISTRO)
+        self._liveness.start()
+        if self._with_rosout:
+            self._rosout = Rosout(self._host, self._advertised, self.uri, self.call, self.counters)
+            try:
+                await self._rosout.start()
+            except BaseException:
+                self._rosout = None
+                await self.close()
+                raise
+
+    async def close(self) -> None:
+        """End: /rosout first, then what looks after the nodes, then the server."""
+        rosout, self._rosout = self._rosout, None
+        if rosout is not None:
+            await rosout.close()
+        if self._liveness is not None:
+            await self._liveness.close()
+        if self._notifier is not None:
+            await self._notifier.close()
+        await self._server.close()
+
+    @property
+    def uri(self) -> str:
+        """``http://127.0.0.1:11311/``; empty before ``start()``."""
+        return self._api.uri
+
+    @property
+    def port(self) -> int:
+        """The port that it listens at."""
+        return self._server.port
+
+    # --- asking it --------------------------------------------------------------------------------------------
+
+    def call(self, method: str, *params: XmlRpcValue) -> Reply:
+        """Call a method of the Master or Parameter Server API, as over XML-RPC but at once.
+
+        Returns:
+            ``(code, status, value)``; the value must not be changed.
+
+        Raises:
+            RosFault: There is no such method.
+        """
+        reply = self._api.call(method, params)
+        self._carry_out()
+        return reply
+
+    def state(self) -> GraphState:
+        """All registrations at this moment; the same object until one changes."""
+        return self._api.state()
+
+    def on_change(self, callback: Callable[[GraphChange], None]) -> None:
+        """Call ``callback`` in the loop after each change of a registration, before the reply to it leaves.
+
+        A callback may call the core; an exception of one is logged and does not reach the node.
+        """
+        self._callbacks.append(callback)
+
+    def suspect(self, node: str) -> None:
+        """Say that this node may be dead: it is checked now, and purged if it is."""
+        if self._liveness is not None:
+            self._liveness.suspect(node)
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _answer(self, method: str, params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
+        try:
+            return self._api.answer(method, params)
+        finally:
+            self._carry_out()
+
+    def _carry_out(self) -> None:
+        effects, changes = self._api.take()
+        # Queued before anybody hears of the change: a callback that registers something must not be overtaken by
+        # the list as it was before.
+        if self._notifier is not None:
+            for effect in effects:
+                self._notifier.add(effect)
+        for change in changes:
+            _log.info("= %s %s %s of %s", "+" if change.added else "-", change.kind.value, change.name, change.node)
+            for callback in self._callbacks:
+                try:
+                    callback(change)
+                except Exception:  # noqa: BLE001 - a stranger's code within a call
+                    _log.exception("! a listener failed at %s", change)
+
+    def _unreachable(self, api: str) -> None:
+        for node in self._api.registrations.nodes_at(api):
+            self.suspect(node)
+
+    def _dead(self, node: str, api: str) -> None:
+        if self._api.registrations.purge(node, api):
+            self.counters.add("node.dead")
+            self._carry_out()
+
+    def _asked_to_end(self, reason: str) -> None:
+        if self._on_shutdown is not None:
+            # Behind the reply, which the caller waits for.
+            asyncio.get_running_loop().call_soon(self._on_shutdown, reason)

@@ -1,0 +1,126 @@
+"""Notices nodes that died without a word, so that their registrations can go.
+
+A killed node leaves its registrations behind, and roscpp does so even on SIGTERM. Whether a node still listens is
+read from the kernel's own table where the node is on this machine, because rospy starts a thread for everybody who
+only knocks; others are connected to. Only a refused connect, twice, is death: a network that is down is none.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.errors import UnreachableError
+from rmpa.ros.aio.http_client import connect, is_own_name, split_uri
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+_log = logging.getLogger(__name__)
+
+_TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
+_LISTEN: Final = "0A"
+
+
+def listening_ports() -> set[int] | None:
+    """TCP ports that somebody listens at in this network namespace, or ``None`` where the kernel does not tell."""
+    ports: set[int] = set()
+    try:
+        for table in _TABLES:
+            if table == _TABLES[0] or table.exists():
+                for line in table.read_text(encoding="ascii").splitlines()[1:]:
+                    _, local, _, state, *_ = line.split()
+                    if state == _LISTEN:
+                        ports.add(int(local.rpartition(":")[2], 16))
+    except (OSError, ValueError):
+        return None
+    return ports
+
+
+class Liveness:
+    """Looks after the nodes of one master.
+
+    Args:
+        nodes: All nodes with their slave APIs.
+        on_dead: ``(node, api)`` of a node that refused two connects.
+        interval: Seconds in which every node is looked at once.
+    """
+
+    def __init__(
+        self,
+        *,
+        nodes: Callable[[], dict[str, str]],
+        on_dead: Callable[[str, str], None],
+        interval: float = limits.NODE_CHECK_INTERVAL,
+    ) -> None:
+        self._nodes = nodes
+        self._on_dead = on_dead
+        self._interval = interval
+        self._rounds: asyncio.Task[None] | None = None
+        self._checks: dict[str, asyncio.Task[None]] = {}
+
+    def start(self) -> None:
+        """Look from now on."""
+        self._rounds = asyncio.get_running_loop().create_task(self._go_round(), name="node liveness")
+
+    async def close(self) -> None:
+        """Look no longer."""
+        tasks = [*self._checks.values()]
+        if self._rounds is not None:
+            tasks.append(self._rounds)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    def suspect(self, node: str) -> None:
+        """Check one node now."""
+        api = self._nodes().get(node)
+        if api is None or node in self._checks:
+            return
+        task = asyncio.get_running_loop().create_task(self._check(node, api), name=f"check {node}")
+        self._checks[node] = task
+        task.add_done_callback(lambda _: self._checks.pop(node, None))
+
+    async def _go_round(self) -> None:
+        while True:
+            ports = await asyncio.to_thread(listening_ports)
+            nodes = self._nodes()
+            pause = self._interval / max(1, len(nodes))
+            for node, api in nodes.items():
+                await asyncio.sleep(pause)
+                if not _listens(api, ports):
+                    self.suspect(node)
+            if not nodes:
+                await asyncio.sleep(pause)
+
+    async def _check(self, node: str, api: str) -> None:
+        if not await _refuses(api):
+            return
+        await asyncio.sleep(limits.NODE_RECHECK_DELAY)
+        if await _refuses(api) and self._nodes().get(node) == api:
+            _log.warning("= node %s at %s is dead: nobody listens there", node, api)
+            self._on_dead(node, api)
+
+
+def _listens(api: str, ports: set[int] | None) -> bool:
+    try:
+        host, port, _ = split_uri(api)
+    except UnreachableError:
+        return True  # what cannot be asked is left alone
+    return ports is not None and (is_own_name(host) or host.startswith("127.")) and port in ports
+
+
+async def _refuses(api: str) -> bool:
+    try:
+        host, port, _ = split_uri(api)
+        async with asyncio.timeout(limits.TCPROS_CONNECT_TIMEOUT):
+            sock = await connect(host, port)
+    except ConnectionRefusedError:
+        return True
+    except (OSError, UnreachableError):
+        return False
+    sock.close()
+    return False
