@@ -1,0 +1,262 @@
+"""Message definitions as text: parse them, put them together, and compute their MD5 sums.
+
+Pure and without numpy. Sources: wiki.ros.org/msg, and genmsg, whose full text (``gendeps --cat``) and MD5 sum these
+must equal to the byte: publishers and subscribers compare the sums, bags keep the text.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import re
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.errors import LimitExceeded, RmpaError
+from rmpa.core.names import is_type_name
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+SEPARATOR: Final = "=" * 80
+_NUMBERS: Final = (
+    "bool",
+    "int8",
+    "uint8",
+    "int16",
+    "uint16",
+    "int32",
+    "uint32",
+    "int64",
+    "uint64",
+    "float32",
+    "float64",
+)
+PRIMITIVES: Final = frozenset((*_NUMBERS, "string", "time", "duration", "char", "byte"))
+_HEADER: Final = "std_msgs/Header"
+_FIELD_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+_FIELD_TYPE: Final = re.compile(r"(?P<base>[A-Za-z0-9_/]+)(?P<array>\[(?P<size>[0-9]*)\])?")
+
+
+@dataclass
+class DefinitionError(RmpaError):
+    """A message definition cannot be used."""
+
+    type: str
+    problem: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        """Say which type, what is wrong, and what to do."""
+        remedy = f"; {self.remedy}" if self.remedy else ""
+        return f"message type {self.type}: {self.problem}{remedy}"
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One field.
+
+    Args:
+        name: As written.
+        type: A primitive, or ``package/Name``.
+        array: Whether it is an array.
+        size: Of an array of fixed size; 0 for one of any length.
+    """
+
+    name: str
+    type: str
+    array: bool = False
+    size: int = 0
+
+    @property
+    def primitive(self) -> bool:
+        """Whether its type is built in."""
+        return self.type in PRIMITIVES
+
+    def __str__(self) -> str:
+        """The type with its brackets."""
+        return f"{self.type}[{self.size or ''}]" if self.array else self.type
+
+
+@dataclass(frozen=True, slots=True)
+class Specification:
+    """One message type by itself.
+
+    Args:
+        name: ``package/Name``.
+        text: Its own part of the definition.
+        fields: In order.
+        constants: ``type name=value`` in order, as the MD5 sum has them.
+    """
+
+    name: str
+    text: str
+    fields: tuple[Field, ...]
+    constants: tuple[str, ...]
+
+    @classmethod
+    def parse(cls, name: str, text: str) -> Specification:
+        """Read one type's text.
+
+        Raises:
+            DefinitionError: A line is neither a field nor a constant.
+        """
+        if not is_type_name(name):
+            raise DefinitionError(name[:80], "is not a type's name", "write it like std_msgs/String")
+        fields: list[Field] = []
+        constants: list[str] = []
+        for line in text.split("\n"):
+            clean = line.partition("#")[0].strip()
+            if not clean:
+                continue
+            if "=" in clean:
+                constants.append(_constant(name, line, clean))
+            else:
+                fields.append(_field(name, clean))
+        if len(fields) + len(constants) > limits.DEFINITION_FIELDS_MAX:
+            raise LimitExceeded(f"definition of {name} (in lines)", len(fields), limits.DEFINITION_FIELDS_MAX)
+        return cls(name, text, tuple(fields), tuple(constants))
+
+    def depends(self) -> Iterator[str]:
+        """The embedded types, each once, in the order of the fields."""
+        return iter(dict.fromkeys(field.type for field in self.fields if not field.primitive))
+
+
+def _constant(name: str, line: str, clean: str) -> str:
+    kind, _, rest = clean.partition(" ")
+    if kind not in PRIMITIVES or kind in ("time", "duration"):
+        raise DefinitionError(name, f"{clean[:80]!r} is not a constant")
+    if kind == "string":
+        # A string constant takes all that is behind its "=", a comment's mark included.
+        left, _, value = line.partition("=")
+        return f"string {left.strip().partition(' ')[2]}={value.strip()}"
+    constant, _, value = rest.partition("=")
+    return f"{kind} {constant.strip()}={value.strip()}"
+
+
+def _field(name: str, clean: str) -> Field:
+    parts = clean.split()
+    match = _FIELD_TYPE.fullmatch(parts[0])
+    if len(parts) != 2 or match is None or not _FIELD_NAME.fullmatch(parts[1]):
+        raise DefinitionError(name, f"{clean[:80]!r} is neither a field nor a constant")
+    base = match["base"]
+    if base == "Header":
+        base = _HEADER
+    elif base not in PRIMITIVES and "/" not in base:
+        base = f"{name.partition('/')[0]}/{base}"
+    if base not in PRIMITIVES and not is_type_name(base):
+        raise DefinitionError(name, f"{base[:80]!r} is not a type")
+    size = int(match["size"] or 0) if match["array"] and len(match["size"]) < 10 else 0
+    return Field(parts[1], base, match["array"] is not None, size)
+
+
+def parse_definition(name: str, text: str) -> dict[str, Specification]:
+    """Read a full definition: the type's own text, then ``MSG:`` blocks of all embedded types.
+
+    Returns:
+        By name; the type itself comes first.
+
+    Raises:
+        DefinitionError: It is malformed, an embedded type is missing, or a type contains itself.
+        LimitExceeded: It is larger than ``limits.DEFINITION_MAX``.
+    """
+    if len(text) > limits.DEFINITION_MAX:
+        raise LimitExceeded(f"definition of {name[:80]}", len(text), limits.DEFINITION_MAX)
+    blocks = re.split(rf"\n?^{SEPARATOR}=*\n", text, flags=re.MULTILINE)
+    found = {name: Specification.parse(name, blocks[0])}
+    for block in blocks[1:]:
+        head, _, rest = block.partition("\n")
+        if not head.startswith("MSG:"):
+            raise DefinitionError(name, f"{head[:80]!r} stands where 'MSG: package/Name' must be")
+        embedded = head[4:].strip()
+        found.setdefault(embedded, Specification.parse(embedded, rest))
+    _walk(name, found)
+    return found
+
+
+def _walk(name: str, known: Mapping[str, Specification]) -> list[str]:
+    """All embedded types, each once, depth first: the order of ``gendeps``."""
+    order: dict[str, None] = {}
+    _visit(name, known, order, ())
+    return list(order)
+
+
+def _visit(name: str, known: Mapping[str, Specification], order: dict[str, None], inside: tuple[str, ...]) -> None:
+    if len(inside) > limits.DEFINITION_DEPTH_MAX:
+        raise DefinitionError(name, f"is nested deeper than {limits.DEFINITION_DEPTH_MAX} types")
+    if name not in known:
+        raise DefinitionError(name, "is not defined", f"{inside[-1]} embeds it" if inside else "")
+    for embedded in known[name].depends():
+        if embedded in inside or embedded == name:
+            raise DefinitionError(embedded, "contains itself")
+        # One seen before is not entered again: a hostile definition could make that take for ever.
+        if embedded not in order:
+            order[embedded] = None
+            _visit(embedded, known, order, (*inside, name))
+
+
+def md5sum(name: str, known: Mapping[str, Specification]) -> str:
+    """The MD5 sum that ROS knows a type by.
+
+    Raises:
+        DefinitionError: An embedded type is missing, or a type contains itself.
+    """
+    _walk(name, known)
+    return _md5sum(name, known, {})
+
+
+def _md5sum(name: str, known: Mapping[str, Specification], sums: dict[str, str]) -> str:
+    if name not in sums:
+        lines = list(known[name].constants)
+        lines += [
+            f"{field if field.primitive else _md5sum(field.type, known, sums)} {field.name}"
+            for field in known[name].fields
+        ]
+        sums[name] = hashlib.md5("\n".join(lines).strip().encode(), usedforsecurity=False).hexdigest()
+    return sums[name]
+
+
+def full_text(name: str, known: Mapping[str, Specification]) -> str:
+    """The full definition, as rospy and roscpp send it.
+
+    Raises:
+        DefinitionError: An embedded type is missing, or a type contains itself.
+    """
+    parts = [known[name].text + "\n"]
+    parts += [f"{SEPARATOR}\nMSG: {embedded}\n{known[embedded].text}\n" for embedded in _walk(name, known)]
+    return "".join(parts)[:-1]
+
+
+@functools.cache
+def _texts() -> Mapping[str, str]:
+    texts: dict[str, str] = json.loads(files("rmpa.ros").joinpath("definitions.json").read_text("utf-8"))
+    return texts
+
+
+def known_types() -> tuple[str, ...]:
+    """The names of all types that come with us."""
+    return tuple(_texts())
+
+
+@functools.lru_cache(maxsize=256)
+def known_specifications(name: str) -> Mapping[str, Specification]:
+    """A type that comes with us, and all that it embeds.
+
+    Raises:
+        DefinitionError: It does not come with us.
+    """
+    if name not in _texts():
+        raise DefinitionError(
+            name, "is not one that comes with rmpa", "its definition is learnt from a publisher of that type"
+        )
+    found: dict[str, Specification] = {}
+    todo = [name]
+    while todo:
+        each = todo.pop()
+        if each not in found:
+            found[each] = Specification.parse(each, _texts()[each])
+            todo += found[each].depends()
+    return found
