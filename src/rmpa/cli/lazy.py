@@ -1,0 +1,54 @@
+"""A group of commands each of which is imported when it is called: ``rmpa --help`` stays quick."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+import click
+
+from rmpa.core.config_values import did_you_mean
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+class LazyGroup(click.Group):
+    """A click group whose commands live in modules of their own, under their own names.
+
+    Args:
+        commands_at: By name: the module, and the one line that the group's help shows.
+        arguments: For ``click.Group``.
+    """
+
+    def __init__(self, *, commands_at: Mapping[str, tuple[str, str]], **arguments: object) -> None:
+        super().__init__(**arguments)  # type: ignore[arg-type] # handed through as they came
+        self.commands_at = commands_at
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
+        """The names, in the order of the table."""
+        return list(self.commands_at)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002 - click's signature
+        """Import one command, or ``None``."""
+        if cmd_name not in self.commands_at:
+            return None
+        module = importlib.import_module(self.commands_at[cmd_name][0])
+        command = getattr(module, cmd_name.replace("-", "_"), None) or getattr(module, f"{cmd_name}_")
+        assert isinstance(command, click.Command)  # noqa: S101 - a mistake in our own table
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find a command; a misspelt one is told the nearest."""
+        if args and args[0] not in self.commands_at and not args[0].startswith("-"):
+            near = did_you_mean(args[0], self.commands_at)
+            hint = f"Did you mean {near}?" if near else f"There are {', '.join(self.commands_at)}."
+            ctx.fail(f"No such command {args[0]!r}. {hint}")
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 - click's
+        """Write the table's lines, without importing anything."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in self.commands_at.items()])

@@ -1,0 +1,84 @@
+"""The program ``rmpa``: finds the command, and turns its end into an exit code.
+
+Exit codes: 0 done; 1 it could not be done, and why is on stderr; 2 it was asked in a way that cannot be
+(a flag, a variable, a line of ``rmpa.toml``); 130 and 141 as shells have them for Ctrl-C and a closed pipe.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import TYPE_CHECKING
+
+import click
+
+from rmpa import __version__
+from rmpa.cli.lazy import LazyGroup
+from rmpa.core.errors import ConfigError, RmpaError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+COMMANDS = {
+    "up": ("rmpa.cli.up", "Run this machine's agent: ROS core, discovery, mesh and bridge."),
+    "core": ("rmpa.cli.core", "Run the ROS core alone: a drop-in for roscore."),
+    "peer": ("rmpa.cli.peer", "See the peers that the agent knows."),
+    "topic": ("rmpa.cli.topic", "See topics, listen to them, publish on them."),
+    "completion": ("rmpa.cli.completion", "Print the script that completes rmpa's commands in a shell."),
+}
+EPILOG = """\
+\b
+Examples:
+  rmpa up --name base            the agent of this machine
+  rmpa peer list                 who is there
+  rmpa topic list                what they have to say
+  rmpa topic echo joystick:/cmd  one peer's messages
+"""
+
+
+@click.group(
+    cls=LazyGroup,
+    commands_at=COMMANDS,
+    epilog=EPILOG,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+@click.version_option(__version__, "--version", "-V", message="rmpa %(version)s")
+def cli() -> None:
+    """ROS 1 modules with a core of their own that share topics, with no master between them."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command line; the console script's entry.
+
+    Args:
+        arguments: Without the program's name; ``sys.argv`` by default.
+    """
+    try:
+        code = _run(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader has enough (`| head`). What is left in the buffer must not fail again at the interpreter's end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    return code
+
+
+def _run(arguments: Sequence[str] | None) -> int:
+    try:
+        code = cli.main(args=arguments, prog_name="rmpa", standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        return 130
+    except ConfigError as error:
+        click.echo(f"rmpa: {error}", err=True)
+        return 2
+    except RmpaError as error:
+        click.echo(f"rmpa: {error}", err=True)
+        return 1
+    return code if isinstance(code, int) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,240 @@
+"""``rmpa peer``: the peers that this machine's agent knows."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import TYPE_CHECKING, Final
+
+import click
+
+from rmpa.cli.lazy import LazyGroup
+from rmpa.cli.options import agent_option, json_option
+from rmpa.cli.output import Column, duration, print_json, print_line, print_table, printable, size, warn
+from rmpa.core.config_values import did_you_mean
+from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.core.stats import Summary
+from rmpa.monitor.aio.control_client import ControlClient, choose_agent
+from rmpa.monitor.snapshot import PingReply
+
+if TYPE_CHECKING:
+    from rmpa.monitor.snapshot import PeerInfo, Snapshot
+
+_HERE: Final = "rmpa.cli.peer"
+_COLOURS: Final = {"linked": "green", "linking": "yellow", "refused": "red", "conflict": "red"}
+_COLUMNS: Final = (
+    Column("PEER"),
+    Column("STATE"),
+    Column("SINCE", right=True),
+    Column("ADDRESS"),
+    Column("DIALLED"),
+    Column("RTT", right=True),
+    Column("CLOCK", right=True),
+    Column("IN", right=True),
+    Column("OUT", right=True),
+    Column("QUEUE", right=True),
+    Column("DROPS", right=True),
+)
+
+
+@click.group(
+    cls=LazyGroup,
+    commands_at={
+        "list": (_HERE, "List the peers, and how their links are."),
+        "info": (_HERE, "Show all that is known of one peer."),
+        "ping": (_HERE, "Measure the round trip to a peer over the mesh."),
+    },
+)
+def peer() -> None:
+    """See the peers that the agent knows."""
+
+
+def connect(agent: str | None) -> ControlClient:
+    """A connection to the agent that is meant."""
+    return ControlClient(choose_agent(os.environ, agent).path)
+
+
+@click.command("list", epilog="\b\nExamples:\n  rmpa peer list\n  rmpa peer list --json | jq '.[].name'\n")
+@json_option
+@agent_option
+def list_(as_json: bool, agent: str | None) -> None:
+    """List the peers, and how their links are.
+
+    CLOCK is the peer's wall clock less ours, with the bound of its error.
+    """
+    with connect(agent) as client:
+        snapshot = client.snapshot()
+    if as_json:
+        print_json(snapshot.peers)
+        return
+    if not snapshot.peers:
+        where = ", ".join(snapshot.agent.interfaces) or "no interface"
+        click.echo(f"{snapshot.agent.name} knows no peers yet (domain {snapshot.agent.domain}, looking on {where})")
+    else:
+        colours = [_COLOURS.get(p.state, "") for p in snapshot.peers]
+        print_table(_COLUMNS, [_row(p) for p in snapshot.peers], colours=colours)
+    for trouble in _troubles(snapshot):
+        warn(trouble)
+
+
+def _row(info: PeerInfo) -> list[str]:
+    name = printable(info.name)
+    link = info.link
+    if link is None:
+        address = info.guid.partition("#")[0]
+        return [name, info.state, duration(info.since_ago), address, "-", "-", "-", "-", "-", "-", "-"]
+    clock = "-" if link.clock_offset is None else f"{duration(link.clock_offset)} ±{duration(link.clock_error)}"
+    return [
+        name,
+        info.state,
+        duration(info.since_ago),
+        link.remote,
+        "by us" if link.dialled else "by it",
+        duration(link.rtt),
+        clock,
+        size(link.bytes_in),
+        size(link.bytes_out),
+        size(link.queued),
+        str(link.dropped),
+    ]
+
+
+def _troubles(snapshot: Snapshot) -> list[str]:
+    found = list(snapshot.notes)
+    for info in snapshot.peers:
+        found += [f"{info.name}: {conflict}" for conflict in info.conflicts]
+        if info.last_error and info.state != "linked":
+            again = "" if info.next_attempt is None else f"; next attempt in {duration(info.next_attempt)}"
+            found.append(f"{info.name}: {info.last_error}{again}")
+    return [printable(text) for text in found]
+
+
+def find_peer(snapshot: Snapshot, wanted: str) -> PeerInfo:
+    """The peer of a name, or of a GUID.
+
+    Raises:
+        RmpaError: There is none; the nearest name is offered.
+    """
+    for info in snapshot.peers:
+        if wanted in (info.name, info.guid, info.guid.partition("#")[0]):
+            return info
+    names = [info.name for info in snapshot.peers]
+    near = did_you_mean(wanted, names)
+    known = f"known are {', '.join(names)}" if names else "no peer is known yet"
+    raise RmpaError(
+        f"{snapshot.agent.name} knows no peer {wanted!r}; " + (f"did you mean {near}?" if near else known)
+    )
+
+
+@click.command(epilog="\b\nExamples:\n  rmpa peer info base\n")
+@click.argument("name")
+@json_option
+@agent_option
+def info(name: str, as_json: bool, agent: str | None) -> None:
+    """Show all that is known of the peer NAME (or of one by its GUID)."""
+    with connect(agent) as client:
+        snapshot = client.snapshot()
+    found = find_peer(snapshot, name)
+    if as_json:
+        print_json(found)
+        return
+    for label, text in _facts(found):
+        click.echo(f"{label + ':':<13} {printable(text)}")
+    for direction, title in (("in", "it publishes"), ("out", "we publish to it")):
+        routes = [
+            (t, r) for t in snapshot.topics for r in t.routes if r.peer == found.name and r.direction == direction
+        ]
+        if not routes:
+            continue
+        click.echo(f"\nTopics that {title}:")
+        columns = (Column("  TOPIC"), Column("TYPE"), Column("NODE"), Column("ROUTE"), Column("MESSAGES", right=True))
+        print_table(
+            columns,
+            [[f"  {t.name}", r.type or t.type or "-", r.node, r.state, str(r.messages)] for t, r in routes],
+        )
+
+
+def _facts(info: PeerInfo) -> list[tuple[str, str]]:
+    facts = [
+        ("Peer", info.name),
+        ("GUID", info.guid),
+        ("State", f"{info.state} for {duration(info.since_ago)}"),
+        ("Addresses", ", ".join(info.addresses) or "-"),
+        ("Found", f"{duration(info.found_ago)} ago by {info.source or 'a link'}"),
+        ("Last beacon", f"{duration(info.beacon_ago)} ago" if info.beacon_ago is not None else "-"),
+    ]
+    link = info.link
+    if link is not None:
+        who = "dialled by us" if link.dialled else "dialled by it"
+        clock = "-" if link.clock_offset is None else f"{duration(link.clock_offset)} ± {duration(link.clock_error)}"
+        facts += [
+            ("Link", f"{link.remote}, {who}, up for {duration(link.up_ago)}, heard {duration(link.heard_ago)} ago"),
+            ("Round trip", duration(link.rtt)),
+            ("Clock", f"{clock} (its clock less ours)"),
+            ("Traffic", f"{size(link.bytes_in)} in, {size(link.bytes_out)} out, {size(link.queued)} queued"),
+            ("Drops", f"{link.dropped} messages"),
+        ]
+    if info.last_error:
+        facts.append(("Last error", info.last_error))
+    if info.next_attempt is not None:
+        facts.append(("Next attempt", f"in {duration(info.next_attempt)}"))
+    return facts + [("Conflict", conflict) for conflict in info.conflicts]
+
+
+@click.command(epilog="\b\nExamples:\n  rmpa peer ping base\n  rmpa peer ping base -c 10 -i 0.1\n")
+@click.argument("name")
+@click.option("-c", "--count", type=click.IntRange(1), help="Stop after so many. [default: at Ctrl-C]")
+@click.option(
+    "-i", "--interval", type=click.FloatRange(0.01), default=1.0, show_default=True, help="Seconds between."
+)
+@json_option
+@agent_option
+def ping(name: str, count: int | None, interval: float, as_json: bool, agent: str | None) -> int:
+    """Measure the round trip to the peer NAME over the mesh.
+
+    Exits 1 if no answer came.
+    """
+    times: list[float] = []
+    sent = 0
+    with connect(agent) as client:
+        found = find_peer(client.snapshot(), name)
+        try:
+            while count is None or sent < count:
+                if sent:
+                    time.sleep(interval)
+                sent += 1
+                _ping_once(client, found.name, sent, times, as_json=as_json)
+        except KeyboardInterrupt:
+            pass
+    _ping_summary(found.name, sent, times, as_json=as_json)
+    return 0 if times else 1
+
+
+def _ping_once(client: ControlClient, name: str, number: int, times: list[float], *, as_json: bool) -> None:
+    try:
+        reply = client.call("ping", PingReply, peer=name, count=1)
+        elapsed, problem = (reply.times[0] if reply.times else None), "no answer"
+    except PeerRefused as error:
+        reply, elapsed, problem = PingReply(times=()), None, error.reason
+    if elapsed is not None:
+        times.append(elapsed)
+    if as_json:
+        answer = {"peer": name, "seq": number, "time": elapsed, "remote": reply.remote}
+        print_json(answer if elapsed is not None else answer | {"error": problem}, flush=True)
+    elif elapsed is None:
+        print_line(f"{name}: seq={number} {problem}")
+    else:
+        print_line(f"{name} ({reply.remote}): seq={number} time={elapsed * 1e3:.3f} ms")
+
+
+def _ping_summary(name: str, sent: int, times: list[float], *, as_json: bool) -> None:
+    summary = Summary.of(times)
+    figures = {"min": summary.minimum, "avg": summary.mean, "max": summary.maximum, "sd": summary.sd}
+    if as_json:
+        print_json({"peer": name, "sent": sent, "received": len(times), **figures})
+        return
+    lost = 100 * (sent - len(times)) / sent if sent else 0
+    click.echo(f"\n--- {name} ping statistics ---")
+    click.echo(f"{sent} sent, {len(times)} received, {lost:.0f} % lost")
+    if times:
+        click.echo(f"rtt min/avg/max/sd = {'/'.join(f'{v * 1e3:.3f}' for v in figures.values())} ms")

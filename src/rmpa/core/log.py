@@ -1,0 +1,68 @@
+"""How log records look: one line of text, or one JSON object a line. Rooms only ever call ``logging``."""
+
+from __future__ import annotations
+
+import json
+import logging
+from datetime import UTC, datetime
+from typing import TextIO
+
+
+def room_of(logger: str) -> str:
+    """The room that a logger belongs to: ``rmpa.mesh.aio.mesh`` gives ``mesh``."""
+    parts = logger.split(".")
+    return parts[1] if parts[0] == "rmpa" and len(parts) > 1 else parts[0]
+
+
+def _one_line(text: str) -> str:
+    """Text from outside must not forge lines or move the terminal's cursor."""
+    return "".join(c if c.isprintable() or c == "\t" else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+class TextFormatter(logging.Formatter):
+    """``12:00:01.250 warning mesh       ! text``; local time, a traceback on the lines behind it."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One record."""
+        when = datetime.fromtimestamp(record.created).astimezone()
+        clock = f"{when:%H:%M:%S}.{int(record.msecs):03d}"
+        line = f"{clock} {record.levelname.lower():<7} {room_of(record.name):<9} {_one_line(record.getMessage())}"
+        if record.exc_info:
+            line += "\n" + self.formatException(record.exc_info)
+        return line
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object a line: time (ISO 8601, UTC), level, room, logger, text, and traceback if there is one."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One record."""
+        fields = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "room": room_of(record.name),
+            "logger": record.name,
+            "text": record.getMessage(),
+        }
+        if record.exc_info:
+            fields["traceback"] = self.formatException(record.exc_info)
+        return json.dumps(fields, ensure_ascii=False)
+
+
+def configure_logging(level: str, stream: TextIO, *, as_json: bool) -> None:
+    """Send every record of ``level`` and above to ``stream``, in place of whatever was set up before.
+
+    Args:
+        level: As in ``Settings.log_level``.
+        stream: Usually stderr: stdout belongs to a command's answer.
+        as_json: JSON lines instead of text.
+    """
+    handler = logging.StreamHandler(stream)
+    handler.setFormatter(JsonFormatter() if as_json else TextFormatter())
+    root = logging.getLogger()
+    for old in root.handlers[:]:
+        root.removeHandler(old)
+    root.addHandler(handler)
+    root.setLevel(level.upper())
+    # A lost log line (the reader of a pipe is gone) must not print a traceback for every further line.
+    logging.raiseExceptions = False
