@@ -168,12 +168,13 @@ class Agent:
 
     def rmpa(self, *words: str, timeout: float = DEADLINE) -> tuple[int, str]:
         """Run another ``rmpa`` command on its host; return exit status and output."""
-        with Process(self.host.command([RMPA, *words]), env=self.env) as process:
+        env = {**self.env, "RMPA_AGENT": self.name}  # several may share the runtime directory
+        with Process(self.host.command([RMPA, *words]), env=env) as process:
             return process.wait(timeout), process.output
 
     def peers(self) -> dict[str, dict[str, object]]:
         """What ``rmpa peer list --json`` says, by peer name."""
-        code, output = self.rmpa("peer", "list", "--json", "--agent", self.name)
+        code, output = self.rmpa("peer", "list", "--json")
         assert code == 0, f"{output}\n{self.process.output[-4000:]}"
         answer = json.loads(output)
         rows = answer["peers"] if isinstance(answer, dict) else answer
@@ -198,9 +199,9 @@ class Agent:
         eventually(gone, timeout, what=f"{self.name} without {name}", every=0.2)
 
     def sockets(self) -> list[Path]:
-        """The files that it left, or has, in its runtime directory."""
+        """The sockets that it left, or has, in its runtime directory."""
         assert self.runtime_dir
-        return sorted(path for path in self.runtime_dir.rglob("*") if not path.is_dir())
+        return sorted(path for path in self.runtime_dir.rglob("*") if path.is_socket())
 
     def _close_notify(self) -> None:
         if self._notify:

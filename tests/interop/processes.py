@@ -261,9 +261,15 @@ class Process:
                     return result
                 rest = deadline - time.monotonic()
                 if self._ended or rest <= 0:
-                    state = f"ended with status {self._child.poll()}" if self._ended else f"{timeout} s are over"
-                    raise Deadline(f"waited for {what} of {self.name}, but {state}\n{self._tail()}")
+                    state = self._how_it_ended() if self._ended else f"{timeout} s are over"
+                    raise Deadline(f"waited for {what} of {self.name}; {state}\n{self._tail()}")
                 self._news.wait(rest)
+
+    def _how_it_ended(self) -> str:
+        """Its output has ended, and its end follows at once: unless it only closed its output."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            return f"it ended with status {self._child.wait(1.0)}"
+        return "it closed its output"
 
     def _tail(self) -> str:
         return "\n".join(f"    {self.name}| {line}" for line in self.lines[-40:])

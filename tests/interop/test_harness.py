@@ -14,7 +14,7 @@ import pytest
 from tests.interop import namespaces
 from tests.interop.agents import NotifySocket
 from tests.interop.namespaces import Lab
-from tests.interop.processes import Deadline, Process, run
+from tests.interop.processes import Deadline, Process, eventually, run
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -135,8 +135,7 @@ def test_process_that_ends_early_fails_the_wait_at_once() -> None:
 def test_group_of_a_process_ends_with_it() -> None:
     with Process(["sh", "-c", "sleep 1000 & echo $!; trap '' TERM; wait; wait"]) as child:
         grandchild = int(child.wait_for(r"^(\d+)$").group(1))
-    state = Path(f"/proc/{grandchild}/stat")
-    assert not state.exists() or state.read_text().split()[2] == "Z"
+    eventually(lambda: not _lives(grandchild), what="the grandchild gone")
 
 
 async def test_waits_leave_the_loop_running() -> None:
@@ -195,6 +194,13 @@ def pytester_like(tmp_path: Path) -> Callable[[str], str]:
         return done.stdout
 
     return outcome
+
+
+def _lives(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
 
 
 def _has(word: str) -> bool:
