@@ -62,6 +62,11 @@ class Outbox:
     def __bool__(self) -> bool:
         return bool(self._started or self._urgent or self._flows)
 
+    def set_bounds(self, max_entries: int, max_bytes: int) -> None:
+        """Change the bounds; they count from the next ``push()`` on. A subscriber's are known with its topic only."""
+        self._max_entries = max_entries
+        self._max_bytes = max_bytes
+
     @property
     def urgent_bytes(self) -> int:
         """Bytes of whole urgent entries that wait; they have no bound here, the owner watches this."""
