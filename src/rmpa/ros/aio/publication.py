@@ -6,6 +6,7 @@ publisher learns it when the route to that publisher opens, and holds its subscr
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from typing import TYPE_CHECKING
 
@@ -182,6 +183,11 @@ class Publication:
             self._refuse(link, text)
         if held and not self.subscribers:
             self._on_last()
+
+    async def drained(self, timeout: float = limits.DRAIN_TIMEOUT) -> None:  # noqa: ASYNC109 - for all together
+        """Wait until all that was published has left, or ``timeout`` seconds are over."""
+        if self._open:
+            await asyncio.gather(*(link.stream.drained(timeout) for link in self._open))
 
     def withdraw(self) -> None:
         """Publish no more: close all connections, without a callback."""

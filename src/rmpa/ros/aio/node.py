@@ -1,0 +1,403 @@
+"""A small ROS node for our own tools, demos and tests.
+
+::
+
+    async with Node("talker") as node:
+        publisher = await node.advertise("/chatter", "std_msgs/String")
+        publisher.publish(publisher.make("hello"))
+
+    async with Node("echo", anonymous=True) as node:
+        async for received in await node.subscribe("/chatter"):
+            print(received.message.data)
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import time
+from typing import TYPE_CHECKING, Final, Self
+
+from rmpa.core import limits
+from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.ros.aio.http_client import call_api
+from rmpa.ros.aio.local_addresses import local_addresses
+from rmpa.ros.aio.slave_server import SlaveNode
+from rmpa.ros.aio.topics import Publisher, Received, Subscriber
+from rmpa.ros.environment import RosEnvironment, host_of, is_loopback
+from rmpa.ros.messages import MessageType
+from rmpa.ros.tcpros import ANY, Description
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import TracebackType
+
+    from rmpa.ros.xmlrpc import Reply, XmlRpcValue
+
+__all__ = ["Node", "Publisher", "Received", "Subscriber"]
+
+_log = logging.getLogger(__name__)
+_REMEDY: Final = "start one (rmpa up, or roscore), or set ROS_MASTER_URI to one that runs"
+_SHORT: Final = 1.0
+_NO_DEFAULT: Final = object()
+
+
+class Node:
+    """One node, registered at a master as long as the ``async with`` lasts.
+
+    A master that is killed and started again is noticed within ``limits.NODE_MASTER_CHECK`` and gets all
+    registrations anew; connections that stand are kept meanwhile. When the master wants the node to end, it closes
+    itself: ``async for`` loops end and ``stopped`` is set.
+
+    Args:
+        name: As the user writes it; resolved in the namespace. ``__name:=`` replaces it.
+        master_uri: Instead of the environment's.
+        anonymous: Whether the name is made unique.
+        environment: Instead of this process's variables (its arguments are only read through here).
+        on_shutdown: ``(reason)``: the master wants the node to end.
+        on_param_update: ``(key, value)``: a parameter followed by ``follow_param`` has changed.
+
+    Raises:
+        ConfigError: A ROS variable cannot be used.
+        ValueError: The name is not a legal one.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        master_uri: str = "",
+        anonymous: bool = False,
+        environment: RosEnvironment | None = None,
+        on_shutdown: Callable[[str], None] | None = None,
+        on_param_update: Callable[[str, XmlRpcValue], None] | None = None,
+    ) -> None:
+        if environment is None:
+            environment = RosEnvironment.read(os.environ, (), local_addresses())
+        if anonymous:
+            name = f"{name}_{os.getpid()}_{time.time_ns() // 1_000_000}"
+        self.environment = environment
+        self.name = environment.node_name(name)
+        self.master_uri = master_uri or environment.master_uri
+        self.stopped = asyncio.Event()
+        """Set when the node is closed, by whomever."""
+        self._on_shutdown = on_shutdown
+        self._on_param_update = on_param_update
+        self._publishers: dict[str, Publisher] = {}
+        self._subscribers: dict[str, Subscriber] = {}
+        self._followed: set[str] = set()
+        self._watch: asyncio.Task[None] | None = None
+        self._ending: asyncio.Task[None] | None = None
+        self._closing: asyncio.Task[None] | None = None
+        host, self._bind = self._hosts()
+        self._slave = SlaveNode(
+            self.name,
+            self._bind,
+            self.master_uri,
+            advertised_host=host,
+            on_shutdown=self._told_to_stop,
+            on_param_update=self._param_update,
+        )
+
+    @property
+    def uri(self) -> str:
+        """The slave API, ``http://host:port/``."""
+        return self._slave.uri
+
+    @property
+    def slave(self) -> SlaveNode:
+        """The serving side, for its connections and counters."""
+        return self._slave
+
+    async def __aenter__(self) -> Self:
+        """Listen, and see whether the master answers.
+
+        Raises:
+            UnreachableError: It does not.
+        """
+        await self._slave.start()
+        try:
+            await self.call_master("getPid")
+        except BaseException:
+            await self._slave.close()
+            raise
+        self._watch = asyncio.get_running_loop().create_task(self._watch_master(), name=f"watch master {self.name}")
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Unregister everything and close; may be called twice."""
+        if self._closing is None:
+            self._closing = asyncio.get_running_loop().create_task(self._close(), name=f"close {self.name}")
+        await asyncio.shield(self._closing)
+
+    # --- topics -----------------------------------------------------------------------------------------------
+
+    async def advertise(
+        self,
+        topic: str,
+        kind: str | MessageType | Description,
+        *,
+        latch: bool = False,
+        queue_messages: int = limits.SUBSCRIBER_QUEUE_MESSAGES,
+    ) -> Publisher:
+        """Publish a topic.
+
+        Args:
+            topic: Resolved in the namespace; ``~name`` is the node's own.
+            kind: The type: its name, one that was learnt, or, for raw bytes only, just a description.
+            latch: Whether each new subscriber gets the last message.
+            queue_messages: Messages that wait for one slow subscriber; the oldest is dropped beyond it.
+
+        Raises:
+            DefinitionError: The type is not known.
+            UnreachableError: The master does not answer.
+            PeerRefused: The master refuses the registration.
+        """
+        resolved = self._resolve(topic)
+        if isinstance(kind, str):
+            kind = MessageType(kind)
+        description = kind if isinstance(kind, Description) else kind.describe(latching=latch)
+        publisher = Publisher(
+            resolved,
+            self.name,
+            description,
+            kind if isinstance(kind, MessageType) else None,
+            queue_messages,
+            self._unadvertise,
+        )
+        self._slave.add_publication(publisher.publication)
+        self._publishers[resolved] = publisher
+        try:
+            await self._register_publisher(publisher)
+        except BaseException:
+            self._publishers.pop(resolved, None)
+            self._slave.remove_publication(resolved)
+            raise
+        return publisher
+
+    async def subscribe(
+        self,
+        topic: str,
+        kind: str | MessageType | None = None,
+        callback: Callable[[Received], None] | None = None,
+        *,
+        nodelay: bool = True,
+        queue_messages: int = limits.RECEIVED_QUEUE,
+    ) -> Subscriber:
+        """Subscribe to a topic.
+
+        Args:
+            topic: Resolved in the namespace.
+            kind: The type; ``None`` takes any, and reads its definition from the publisher.
+            callback: Called in the loop with each message; what it raises is logged. Without one, use
+                ``async for`` on the result.
+            nodelay: Whether to ask publishers for TCP_NODELAY.
+            queue_messages: Messages that wait for the ``async for``; the oldest is dropped beyond it.
+
+        Raises:
+            DefinitionError: The type is not known.
+            UnreachableError: The master does not answer.
+            PeerRefused: The master refuses the registration.
+            ValueError: The node subscribes to that topic already.
+        """
+        resolved = self._resolve(topic)
+        if resolved in self._subscribers:
+            raise ValueError(f"{self.name} subscribes to {resolved} already")
+        if isinstance(kind, str) and kind != ANY:
+            kind = MessageType(kind)
+        subscriber = Subscriber(
+            resolved,
+            self.name,
+            kind if isinstance(kind, MessageType) else None,
+            callback,
+            own_uri=self.uri,
+            nodelay=nodelay,
+            queue_messages=queue_messages,
+            number=self._slave.next_number,
+            on_close=self._unsubscribe,
+        )
+        self._slave.add_subscription(subscriber.subscription)
+        self._subscribers[resolved] = subscriber
+        try:
+            await self._register_subscriber(subscriber)
+        except BaseException:
+            self._subscribers.pop(resolved, None)
+            await self._slave.remove_subscription(resolved)
+            raise
+        return subscriber
+
+    # --- the master -------------------------------------------------------------------------------------------
+
+    async def call_master(self, method: str, *params: XmlRpcValue) -> XmlRpcValue:
+        """Call the Master or Parameter API; the caller id is put in front.
+
+        Raises:
+            UnreachableError: The master does not answer.
+            PeerRefused: It answers with a code other than 1.
+        """
+        reply = await self._call(method, *params)
+        if reply.code != 1:
+            raise PeerRefused(f"the ROS master at {self.master_uri}", f"{method}: {reply.status}")
+        return reply.value
+
+    async def _call(self, method: str, *params: XmlRpcValue) -> Reply:
+        try:
+            return await call_api(self.master_uri, method, self.name, *params)
+        except UnreachableError as error:
+            raise UnreachableError("ROS master", f"{self.master_uri} (ROS_MASTER_URI)", _REMEDY) from error
+
+    async def get_published_topics(self, subgraph: str = "") -> list[tuple[str, str]]:
+        """Topics that have a publisher, with their types."""
+        value = await self.call_master("getPublishedTopics", subgraph)
+        return [(str(p[0]), str(p[1])) for p in value if isinstance(p, list)] if isinstance(value, list) else []
+
+    async def get_param(self, key: str, default: XmlRpcValue | object = _NO_DEFAULT) -> XmlRpcValue:
+        """A parameter's value, or ``default`` where one is given and the parameter does not exist.
+
+        Raises:
+            PeerRefused: It does not exist.
+        """
+        reply = await self._call("getParam", self._resolve(key))
+        if reply.code == 1:
+            return reply.value
+        if default is _NO_DEFAULT:
+            raise PeerRefused(f"the ROS master at {self.master_uri}", reply.status)
+        return default  # type: ignore[return-value]
+
+    async def set_param(self, key: str, value: XmlRpcValue) -> None:
+        """Set a parameter."""
+        await self.call_master("setParam", self._resolve(key), value)
+
+    async def has_param(self, key: str) -> bool:
+        """Whether a parameter exists."""
+        return bool(await self.call_master("hasParam", self._resolve(key)))
+
+    async def delete_param(self, key: str) -> None:
+        """Delete a parameter.
+
+        Raises:
+            PeerRefused: It does not exist.
+        """
+        await self.call_master("deleteParam", self._resolve(key))
+
+    async def search_param(self, key: str) -> str | None:
+        """The full name of the nearest parameter of this name, up through the namespaces."""
+        reply = await self._call("searchParam", key)
+        return str(reply.value) if reply.code == 1 else None
+
+    async def follow_param(self, key: str) -> XmlRpcValue:
+        """Have ``on_param_update`` called when a parameter changes; return its value now, ``{}`` for none."""
+        resolved = self._resolve(key)
+        self._followed.add(resolved)
+        return await self.call_master("subscribeParam", self.uri, resolved)
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _hosts(self) -> tuple[str, str]:
+        """The host to tell others, and the address to listen at.
+
+        Where nobody asked for an address and the master is on this machine, loopback it is: no other machine can
+        reach that master, and the node goes on when its network is lost.
+        """
+        host = self.environment.host
+        if not self.environment.host_given and is_loopback(host_of(self.master_uri)):
+            host = "127.0.0.1"
+        return host, "127.0.0.1" if is_loopback(host) else "0.0.0.0"  # noqa: S104 - as every ROS node does
+
+    def _resolve(self, name: str) -> str:
+        return self.environment.resolve(name, self.name)
+
+    async def _register_publisher(self, publisher: Publisher) -> None:
+        await self.call_master("registerPublisher", publisher.topic, publisher.description.type, self.uri)
+
+    async def _register_subscriber(self, subscriber: Subscriber, *, keep: bool = False) -> None:
+        uris = await self.call_master("registerSubscriber", subscriber.topic, subscriber.type_name, self.uri)
+        if isinstance(uris, list):
+            subscriber.subscription.update([str(uri) for uri in uris], keep=keep)
+
+    async def _unadvertise(self, topic: str) -> None:
+        if self._publishers.pop(topic, None) is not None:
+            with contextlib.suppress(RmpaError):
+                await self.call_master("unregisterPublisher", topic, self.uri)
+            self._slave.remove_publication(topic)
+
+    async def _unsubscribe(self, topic: str) -> None:
+        if self._subscribers.pop(topic, None) is not None:
+            with contextlib.suppress(RmpaError):
+                await self.call_master("unregisterSubscriber", topic, self.uri)
+            await self._slave.remove_subscription(topic)
+
+    async def _watch_master(self) -> None:
+        while True:
+            await asyncio.sleep(limits.NODE_MASTER_CHECK)
+            if not (self._publishers or self._subscribers or self._followed):
+                continue
+            try:
+                if await self._is_forgotten():
+                    _log.info(
+                        "= %s: the master at %s was started anew; registering again", self.name, self.master_uri
+                    )
+                    await self._register_all()
+            except RmpaError as error:
+                _log.debug("! %s: %s", self.name, error)
+
+    async def _is_forgotten(self) -> bool:
+        """Whether the master does not know us any more, which only a new one does."""
+        reply = await self._call("lookupNode", self.name)
+        return reply.code != 1
+
+    async def _register_all(self) -> None:
+        for publisher in tuple(self._publishers.values()):
+            await self._register_publisher(publisher)
+        for subscriber in tuple(self._subscribers.values()):
+            await self._register_subscriber(subscriber, keep=True)
+        for key in tuple(self._followed):
+            await self.call_master("subscribeParam", self.uri, key)
+
+    def _param_update(self, key: str, value: XmlRpcValue) -> bool:
+        # The update of a namespace or of one member concerns those who follow the other.
+        if not any(
+            key == f or key.startswith(f + "/") or f.startswith(key.rstrip("/") + "/") for f in self._followed
+        ):
+            return False
+        if self._on_param_update is not None:
+            self._on_param_update(key, value)
+        return True
+
+    def _told_to_stop(self, reason: str) -> None:
+        if self._ending is None and self._closing is None:
+            if self._on_shutdown is not None:
+                self._on_shutdown(reason)
+            # Behind the answer to this very call.
+            self._ending = asyncio.get_running_loop().create_task(self.close(), name=f"shut down {self.name}")
+
+    async def _close(self) -> None:
+        if self._watch is not None:
+            self._watch.cancel()
+            await asyncio.wait([self._watch])
+        self.stopped.set()
+        try:
+            async with asyncio.timeout(_SHORT):
+                await self._unregister_all()
+        except (TimeoutError, RmpaError) as error:
+            _log.debug("! %s: could not unregister: %s", self.name, error)
+        for publisher in self._publishers.values():
+            await publisher.drained()
+        for subscriber in self._subscribers.values():
+            subscriber.ended()
+        await self._slave.close()
+
+    async def _unregister_all(self) -> None:
+        for topic in self._publishers:
+            await self.call_master("unregisterPublisher", topic, self.uri)
+        for topic in self._subscribers:
+            await self.call_master("unregisterSubscriber", topic, self.uri)
+        for key in self._followed:
+            await self.call_master("unsubscribeParam", self.uri, key)
