@@ -228,6 +228,8 @@ NODE_RECHECK_DELAY: Final = 0.2
 """Between the two refused connects that make a node dead: it may be restarting its server."""
 NOTIFY_QUEUE_MAX: Final = 4096
 """Topics and parameters that wait to be told to one slow node; of one topic only the latest waits."""
+NOTIFY_COALESCE: Final = 64
+"""From this many on, of one parameter too only the latest waits; before, a node hears each as from rosmaster."""
 NOTIFY_RETRY_FIRST: Final = 0.2
 """Before a node that did not answer is told again."""
 NOTIFY_RETRY_MAX: Final = 3.0

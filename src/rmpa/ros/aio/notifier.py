@@ -1,8 +1,8 @@
 """Carries the master's notifications to the slaves: in order, one call at a time to each URI, none for another.
 
 rosmaster gives all slaves three threads together, so that three stopped nodes stop every notification; here each
-URI has a queue of its own. What waits is kept by topic or key, and the latest wins: a list of publishers that is out
-of date is not sent.
+URI has a queue of its own. Of one topic only the latest list of publishers waits; parameters are told one by one
+until many wait.
 """
 
 from __future__ import annotations
@@ -30,13 +30,7 @@ _log = logging.getLogger(__name__)
 MASTER_ID = "/master"
 """The caller id that slaves know masters by."""
 
-_Key: TypeAlias = tuple[type[Effect], str]
-
-
-def _key(effect: Effect) -> _Key:
-    match effect:
-        case PublisherUpdate(topic=name) | ParamUpdate(key=name) | Shutdown(node=name):
-            return type(effect), name
+_Key: TypeAlias = tuple[type[Effect], str, int]
 
 
 class Notifier:
@@ -61,6 +55,7 @@ class Notifier:
         self._queues: dict[str, dict[_Key, Effect]] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._closed = False
+        self._serial = 0
 
     @property
     def waiting(self) -> int:
@@ -72,9 +67,10 @@ class Notifier:
         if self._closed:
             return
         queue = self._queues.setdefault(effect.api, {})
+        key = self._key(effect, len(queue))
         # Behind what waits: parameters' updates overlap, so one that is newer must also come later.
-        queue.pop(_key(effect), None)
-        queue[_key(effect)] = effect
+        queue.pop(key, None)
+        queue[key] = effect
         if len(queue) > limits.NOTIFY_QUEUE_MAX:
             del queue[next(iter(queue))]
             self._counters.add("notify.dropped")
@@ -82,6 +78,15 @@ class Notifier:
             self._tasks[effect.api] = asyncio.get_running_loop().create_task(
                 self._empty(effect.api, queue), name=f"notify {effect.api}"
             )
+
+    def _key(self, effect: Effect, waiting: int) -> _Key:
+        """What a newer notification replaces an older one by."""
+        match effect:
+            case PublisherUpdate(topic=name) | Shutdown(node=name):
+                return type(effect), name, 0
+            case ParamUpdate(key=name):
+                self._serial += 1
+                return ParamUpdate, name, self._serial if waiting < limits.NOTIFY_COALESCE else 0
 
     async def close(self) -> None:
         """Stop at once; what waits is not sent."""
