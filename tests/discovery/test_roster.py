@@ -396,6 +396,15 @@ def test_a_peer_that_changes(one: Harness) -> None:
     assert one.roster.events() == [PeerChanged(speaker.identity, who(2))]
 
 
+def test_a_handshake_without_addresses_changes_nothing(one: Harness) -> None:
+    full = replace(who(2), addresses=(IPv4Address("192.0.2.2"),))
+    one.hear(Speaker(full)())
+    one.roster.events()
+    one.roster.link_up(who(2), one.now)
+    assert one.roster.events() == []
+    assert one.roster.peers()[0].identity == full
+
+
 def test_gossip_only_leads_to_greetings_that_end(one: Harness) -> None:
     one.hear(Speaker(who(2))(BeaconKind.ANSWER, who(3).guid), multicast=False)
     sent = one.roster.outputs() + one.run(limits.GREETING_FORGET)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
+from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.scenario import Scenario
 
 
@@ -13,9 +14,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.simulation", description=__doc__)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--peers", type=int, required=True)
-    parser.add_argument("--kind", choices=["rosters"], default="rosters")
+    parser.add_argument("--kind", choices=["rosters", "mesh"], default="rosters")
     arguments = parser.parse_args()
-    scenario = Scenario(arguments.seed, arguments.peers, keep=True)
+    make = MeshScenario if arguments.kind == "mesh" else Scenario
+    scenario = make(arguments.seed, arguments.peers, keep=True)
     problem = ""
     try:
         scenario.play()

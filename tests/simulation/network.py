@@ -95,6 +95,8 @@ class Network:
     sockets: dict[Address, OnDatagram] = field(default_factory=dict)
     listeners: dict[Address, OnAccept] = field(default_factory=dict)
     streams: list[Stream] = field(default_factory=list)
+    walled: set[str] = field(default_factory=set)
+    """Hosts behind a firewall: they can dial but not be dialled."""
     datagrams: int = 0
 
     def reaches(self, host: str, other: str) -> bool:
@@ -135,7 +137,7 @@ class Network:
         """Connect a byte stream; ``on_done(None)`` if nobody listens there, nothing at all while parted."""
 
         def arrive() -> None:
-            if not self.reaches(host, to[0]):
+            if to[0] in self.walled or not self.reaches(host, to[0]):
                 return
             accept = self.listeners.get(to)
             if accept is None:

@@ -51,11 +51,15 @@ class RosterPeer:
         rng = random.Random(self.world.rng.getrandbits(64))
         self.identity = Identity(Guid.of(*self.address, self.run & 0xFFFF), rng.randbytes(16), self.name)
         self.roster = Roster(self.identity, rng=rng.random, multicast=self.multicast)
+        self.prepare(rng)
         self.network.sockets[self.address] = self._datagram
         self.world.note(self.name, f"starts run {self.run}")
         self.roster.start(self.world.now)
         self.roster.set_seeds(self.seeds)
         self.flush()
+
+    def prepare(self, rng: random.Random) -> None:
+        """What else a run has; nothing here."""
 
     def kill(self) -> None:
         """Gone without a word."""

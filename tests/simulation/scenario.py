@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from rmpa.core import limits
 from rmpa.core.guid import Guid
@@ -21,7 +21,7 @@ CALM: Final = limits.ROSTER_LEASE + 2 * limits.HEARTBEAT_INTERVAL + 2.0
 AFTER_FORGERY: Final = limits.ROSTER_LEASE_MAX + CALM
 """The same where forged beacons asked for the longest lease."""
 
-MakePeer = Callable[..., RosterPeer]
+MakePeer = Callable[..., Any]
 
 
 class Disagreement(AssertionError):  # noqa: N818 - it is no error of the code that raises it
@@ -56,6 +56,7 @@ class Scenario:
         self.network = Network(self.world)
         self.hostile = False
         self.peers = self._place(make_peer)
+        self.prepare()
 
     def play(self) -> Outcome:
         """Bad times, healing, agreement.
@@ -79,6 +80,9 @@ class Scenario:
             raise Disagreement(self._report(error)) from error
         return Outcome(self.world.trace_hash, tuple(self.world.lines), self.network.datagrams)
 
+    def prepare(self) -> None:
+        """What else is set up before the first peer starts; nothing here."""
+
     def heal(self) -> None:
         """The network is whole and quiet again; the dead that others need are started again."""
         self.world.note("network", "heals")
@@ -97,7 +101,7 @@ class Scenario:
                 assert peer.view() == expected, f"{peer.name} sees {_names(peer.view())}, not {_names(expected)}"
                 assert not peer.troubles(), f"{peer.name} reports {peer.troubles()}"
 
-    def _place(self, make_peer: MakePeer) -> list[RosterPeer]:
+    def _place(self, make_peer: MakePeer) -> list[Any]:
         """One network, or two joined by a seed, or none with multicast and one seed for all."""
         shape = self.world.rng.choice(["one", "one", "one", "two", "none"])
         peers = [make_peer(self.network, n + 1, multicast=shape != "none") for n in range(self.count)]

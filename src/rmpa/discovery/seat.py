@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
@@ -120,12 +120,13 @@ class Seat:
         if voice is None:
             voice = Voice(identity, now, now, limits.ROSTER_LEASE, Heard.LINK, Heard.LINK)
         previous = voice.identity
-        voice.identity = identity
+        # A handshake carries no further addresses; those of the beacons stay.
+        voice.identity = identity if identity.addresses else replace(identity, addresses=previous.addresses)
         voice.linked = True
         voice.leaving = False
         voice.heard = now
         if voice is self.current:
-            return Verdict.KNOWN if identity == previous else Verdict.CHANGED
+            return Verdict.KNOWN if voice.identity == previous else Verdict.CHANGED
         if self.current is None:
             return self._promote(voice, now, Verdict.NEW)
         return self._promote(voice, now, Verdict.RESTARTED)

@@ -7,7 +7,6 @@ import contextlib
 import logging
 import os
 import socket
-from collections.abc import AsyncIterator, Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -23,6 +22,8 @@ from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.events import Conflict, Event, Heard, LossReason, PeerFound, PeerLost, PeerRestarted
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
     from rmpa.discovery.events import PeerView
 
 DEADLINE = 15.0

@@ -235,9 +235,7 @@ class Discovery:
             self._warn(_ALONE)
         if self._membership is not None:
             for name, error in self._membership.update(self._interfaces).items():
-                self._warn(
-                    f"{name}: the group cannot be joined ({error.strerror}); tried again when interfaces change"
-                )
+                self._warn(f"{name}: the group cannot be joined ({error.strerror}); tried again when it changes")
 
     def _seeds_changed(self, addresses: tuple[Address, ...]) -> None:
         self._roster.set_seeds(addresses)
