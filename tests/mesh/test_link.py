@@ -73,7 +73,7 @@ def test_data_arrives_as_a_view_without_a_copy() -> None:
     time = Time()
     _, acceptor = pair(time)
     seen: list[memoryview] = []
-    acceptor.link._on_data = lambda _r, _s, _t, view: seen.append(view)
+    acceptor.link.on_data = lambda _r, _s, _t, view: seen.append(view)
     whole = bytearray(pack_data_header(3, 1, 1, 1) + b"abc")
     acceptor.link.receive(memoryview(whole), time.now)
     whole[24] = ord("X")
@@ -289,7 +289,7 @@ def test_closing_from_within_the_data_callback_stops_the_reading() -> None:
         got.append(sequence)
         acceptor.link.lost("closed by its user")
 
-    acceptor.link._on_data = on_data
+    acceptor.link.on_data = on_data
     both = pack_data_header(0, 1, 1, 0) + pack_data_header(0, 1, 2, 0)
     assert acceptor.link.receive(memoryview(both), time.now) == (len(both), 0)
     assert got == [1]

@@ -143,6 +143,9 @@ REFUSED_RETRY: Final = 5.0
 """Before a peer is called again that said no for a reason which waiting seldom mends (version, domain)."""
 FORGET_UNANNOUNCED: Final = ROSTER_LEASE
 """A peer known by its link alone is called again for this long after the link fell."""
+LINK_UNACKED: Final = 2.0
+"""Sent bytes that nobody acknowledged for this long end a connection (TCP_USER_TIMEOUT): two leases, so that the
+lease, which can say why, is the first to speak."""
 LINK_URGENT_BYTES: Final = 32 * MIB
 """Control frames that wait for one link: two of the longest. Beyond it the link is closed: they are never dropped."""
 CLOCK_SAMPLES: Final = 16

@@ -149,7 +149,7 @@ class Link:
         wall_ns: The wall clock; only asked where a stamp is needed.
         on_event: Called from within the methods below; it may call any of them but ``receive``.
         on_data: Called with ``(route, sequence, stamp_ns, payload)`` for each data frame; the payload is a view
-            into the bytes given to ``receive`` and only valid during the call.
+            into the bytes given to ``receive`` and only valid during the call. An attribute that may be changed.
         expected: Dialler: whom we believe we dialled, ``None`` if only the address is known.
         lease: What we promise: seconds after which our silence means that we are dead.
         label: For log lines, until the other side's name is known.
@@ -174,7 +174,7 @@ class Link:
         self._ours = ours
         self._wall_ns = wall_ns
         self._on_event = on_event
-        self._on_data = on_data
+        self.on_data = on_data
         self._expected = expected
         self._lease = lease
         self._label = label
@@ -244,7 +244,7 @@ class Link:
                     return offset, end - offset
                 offset = end
                 if kind == _DATA:
-                    self._on_data(route, sequence, stamp_ns, view[start:end])
+                    self.on_data(route, sequence, stamp_ns, view[start:end])
                 else:
                     self._handle(Kind(kind), view[start:end], stamp_ns, now)
         except RemoteProtocolError as error:
