@@ -115,6 +115,8 @@ class Agent:
         words += ["--log-level", self.log_level]
         if self.multicast:
             words += ["--multicast", self.multicast]
+        if not self.host.namespace:
+            words += ["--interface", "lo"]  # tests keep to this machine
         if self.config:
             path = self.home / f"{self.name}.toml"
             path.write_text(self.config, encoding="utf-8")

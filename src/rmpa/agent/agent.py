@@ -71,8 +71,8 @@ class Agent:
             undo.push_async_callback(self._leave)
             await self._control.start()
             self._undo = undo.pop_all()
-        # What lives now lives until the end: the collector need not look at it again.
-        gc.collect()
+        # What lives now lives until the end: the collector need not look at it again. (Collecting first would cost
+        # 20 ms of the start and find next to nothing.)
         gc.freeze()
         _log.info("= ROS_MASTER_URI=%s", self.core.uri)
 

@@ -16,17 +16,17 @@ from rmpa.core.aio.clock import SystemClock
 from rmpa.core.aio.sockets import open_mesh_port
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
-from rmpa.discovery.aio.interfaces import choose_addresses, list_interfaces
+from rmpa.discovery.aio.interfaces import choose, further_addresses, list_interfaces, pick_address
 from rmpa.discovery.aio.service import Discovery
 from rmpa.discovery.events import Conflict, PeerChanged, PeerFound, PeerLost, PeerRestarted
 from rmpa.mesh.aio.mesh import Mesh
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from ipaddress import IPv4Address
 
     from rmpa.bridge.aio.bridge import Bridge
     from rmpa.core.config import Settings
+    from rmpa.discovery.aio.interfaces import Interface
     from rmpa.discovery.events import Event
     from rmpa.mesh.aio.link import MeshLink
 
@@ -55,15 +55,16 @@ class Station:
         self._on_displaced = on_displaced
         tcp, udp = open_mesh_port(port)
         self.port: int = tcp.getsockname()[1]
-        addresses = choose_addresses(list_interfaces(settings.interfaces))
+        usable = choose(list_interfaces(), settings.interfaces)
+        address = pick_address(usable)
         # Seconds modulo 18 hours: later for each restart. The random instance id is what decides.
         incarnation = clock.wall_ns() // 1_000_000_000 % _INCARNATIONS
         self.identity = Identity(
-            Guid.of(addresses[0], self.port, incarnation),
+            Guid.of(address, self.port, incarnation),
             os.urandom(limits.INSTANCE_ID_BYTES),
             settings.name,
             settings.domain,
-            tuple(addresses[1 : limits.BEACON_ADDRESSES_MAX + 1]),
+            further_addresses(usable, address),
         )
         self.mesh = Mesh(
             self.identity,
@@ -75,8 +76,9 @@ class Station:
             clock=clock,
         )
         self.discovery = Discovery(
-            self.identity, settings, udp, on_event=self._event, on_addresses=self._addresses, clock=clock
+            self.identity, settings, udp, on_event=self._event, on_interfaces=self._interfaces, clock=clock
         )
+        self._udp = udp
 
     async def start(self) -> None:
         """Accept links, then say that we are here."""
@@ -87,6 +89,7 @@ class Station:
     async def close(self) -> None:
         """Say goodbye, end the links in order."""
         await self.discovery.close()
+        self._udp.close()
         await self.mesh.close()
 
     def _event(self, event: Event) -> None:
@@ -107,16 +110,18 @@ class Station:
                 _log.error("! %s", event)
 
     def _link_up(self, link: MeshLink) -> None:
-        _log.info("+ linked with %s", link.identity)
         self.discovery.link_up(link.identity, link.remote_endpoint)
         self._bridge.link_up(link)
 
-    def _link_down(self, link: MeshLink, reason: str) -> None:
-        _log.info("- link with %s: %s", link.identity, reason)
+    def _link_down(self, link: MeshLink, _reason: str) -> None:
         self._bridge.link_down(link)
         self.discovery.link_down(link.identity.guid, link.identity.instance)
 
-    def _addresses(self, addresses: tuple[IPv4Address, ...]) -> None:
+    def _interfaces(self, usable: tuple[Interface, ...]) -> None:
         ours = self.identity.guid.address
-        if addresses and ours not in addresses and (not ours.is_loopback or not addresses[0].is_loopback):
+        there = {address for interface in usable for address in interface.addresses}
+        better = ours.is_loopback and not pick_address(usable).is_loopback
+        # An address that is only gone (a cable pulled, a lease renewed) may come back; one that has been replaced
+        # will not, and until then those who know us by the old one are not confused.
+        if better or (ours not in there and not pick_address(usable).is_loopback):
             self._on_displaced()

@@ -76,7 +76,7 @@ class View:
             cpu=self._process.cpu_percent(),
             rss=self._process.memory_info().rss,
             addresses=tuple(str(a) for a in (identity.guid.address, *identity.addresses)) if identity else (),
-            interfaces=self.station.discovery.interface_names() if self.station is not None else (),
+            interfaces=tuple(i.name for i in self.station.discovery.interfaces) if self.station else (),
             config_file=str(self._settings.config_file or ""),
         )
 
@@ -99,7 +99,7 @@ class View:
         identity = (view or status or attached.link).identity  # type: ignore[union-attr] # one of the three is there
         conflicts = view.conflicts if view is not None else ()
         if attached is not None:
-            state, since = "linked", attached.link.since
+            state, since = "linked", attached.link.since or now
         elif view is not None and not view.present:
             state, since = "conflict", view.since
         elif status is not None and status.state == "refused":
@@ -134,15 +134,15 @@ class View:
         return LinkInfo(
             remote=f"{host}:{port}",
             dialled=link.dialled,
-            up_ago=now - link.since,
+            up_ago=now - (link.since or now),
             rtt=link.rtt,
             clock_offset=link.clock_offset,
             clock_error=link.clock_error,
             bytes_in=link.bytes_in,
             bytes_out=link.bytes_out,
-            queued=link.pending_bytes,
-            dropped=link.dropped,
-            heard_ago=now - link.heard,
+            queued=link.queue_bytes,
+            dropped=link.dropped.total(),
+            heard_ago=now - link.heard_at,
         )
 
     # --- topics ------------------------------------------------------------------------------------------------

@@ -127,6 +127,8 @@ LINK_QUEUE_BYTES: Final = 64 * MIB
 """Data that waits for one slow link, over all topics; the oldest of the same topic is dropped beyond it."""
 ROUTE_QUEUE_MESSAGES: Final = 1000
 """Messages of one topic that wait for one slow link."""
+PING_TIMEOUT: Final = 2.0
+"""For the answer to a ping that somebody asked for."""
 DRAIN_TIMEOUT: Final = 1.0
 """How long an agent that ends waits for its last bytes to leave."""
 LINK_LEASE_MIN: Final = 0.1

@@ -109,6 +109,19 @@ class ControlReceived:
 
 
 @dataclass(frozen=True, slots=True)
+class Ponged:
+    """A ping was answered.
+
+    Args:
+        stamp: The ping's.
+        rtt: Seconds on the wire, without the other side's own time.
+    """
+
+    stamp: int
+    rtt: float
+
+
+@dataclass(frozen=True, slots=True)
 class Refused:
     """No link: one of the two said no. ``Closed`` follows.
 
@@ -134,7 +147,7 @@ class Closed:
     orderly: bool
 
 
-Event = HelloReceived | Up | ControlReceived | Refused | Closed
+Event = HelloReceived | Up | ControlReceived | Ponged | Refused | Closed
 OnEvent = Callable[[Event], None]
 OnData = Callable[[int, int, int, memoryview], None]
 
@@ -298,6 +311,16 @@ class Link:
         if self._state is not State.CLOSED:
             self._end(self._reason or reason, orderly=self._state is State.CLOSING)
 
+    def ping(self, now: float) -> int:
+        """Measure a round trip on demand; ``Ponged`` with the stamp that this returns is the answer.
+
+        Raises:
+            LocalProtocolError: The link is not up.
+        """
+        if self._state is not State.UP:
+            raise LocalProtocolError(f"no ping on a link that is {self._state.name}")
+        return self._ping(now)
+
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due, in monotonic seconds."""
         if self._state is State.CLOSED:
@@ -349,7 +372,9 @@ class Link:
             self._sent = now
         elif kind is Kind.PONG:
             t1, t2 = frames.parse_pong(payload)
-            self.clock.ponged(t1, t2, stamp_ns, self._wall_ns(), now)
+            sample = self.clock.ponged(t1, t2, stamp_ns, self._wall_ns(), now)
+            if sample is not None:
+                self._on_event(Ponged(t1, sample.rtt))
         elif kind is Kind.CONTROL:
             self._on_event(ControlReceived(bytes(payload)))
         elif kind is Kind.BYE:
@@ -407,11 +432,12 @@ class Link:
         _log.debug("= %s: closed: %s", self._name, reason)
         self._on_event(Closed(reason, orderly))
 
-    def _ping(self, now: float) -> None:
+    def _ping(self, now: float) -> int:
         stamp = self._wall_ns()
         self.clock.pinged(stamp, now)
         self._send(Frame(Kind.PING, stamp_ns=stamp))
         self._sent = self._pinged = now
+        return stamp
 
     def _send(self, frame: Frame) -> None:
         if _log.isEnabledFor(logging.DEBUG):

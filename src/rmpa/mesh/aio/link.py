@@ -13,7 +13,7 @@ from rmpa.core.aio.stream import Stream
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import URGENT, Outbox
 from rmpa.mesh.frames import pack_data_header
-from rmpa.mesh.link import Closed, ControlReceived, Event, HelloReceived, Link, Refused, Role, State, Up
+from rmpa.mesh.link import Closed, ControlReceived, Event, HelloReceived, Link, Ponged, Refused, Role, State, Up
 
 if TYPE_CHECKING:
     import socket
@@ -89,6 +89,7 @@ class MeshLink:
         self._clock = clock
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
+        self._pings: dict[int, asyncio.Future[float]] = {}
         self._end: asyncio.Future[None] = self._loop.create_future()
         self._ended = False
         self._leaving = False
@@ -219,6 +220,22 @@ class MeshLink:
         self._stream.send((self._machine.control(payload),), URGENT)
         self._check_urgent()
 
+    async def ping(self) -> float | None:
+        """Measure one round trip now, in seconds; ``None`` if no answer came within ``limits.PING_TIMEOUT``."""
+        if not self.up:
+            return None
+        answer: asyncio.Future[float] = self._loop.create_future()
+        stamp = self._machine.ping(self._clock.now())
+        self._pings[stamp] = answer
+        self._after()
+        try:
+            async with asyncio.timeout(limits.PING_TIMEOUT):
+                return await answer
+        except TimeoutError:
+            return None
+        finally:
+            self._pings.pop(stamp, None)
+
     def close_route(self, route: int) -> int:
         """Discard what waits of a closed route; return how many messages that were. Its drop count ends too."""
         self._outbox.dropped.pop(route, None)
@@ -264,6 +281,9 @@ class MeshLink:
     def _event(self, event: Event) -> None:
         if isinstance(event, ControlReceived):
             self._owner.link_control(self, event.payload)
+        elif isinstance(event, Ponged):
+            if (answer := self._pings.get(event.stamp)) is not None and not answer.done():
+                answer.set_result(event.rtt)
         elif isinstance(event, HelloReceived):
             verdict = self._owner.link_judge(self, event.hello)
             if verdict is None:
