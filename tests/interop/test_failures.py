@@ -168,8 +168,8 @@ def _wait_no_publisher(module: Module, topic: str) -> None:
     """Wait until nobody publishes a topic in a module's graph (a listener there may keep its name alive)."""
 
     def gone() -> bool:
-        if topic not in module.topics():
-            return True
-        return "Publishers: None" in module.ros.tool("rostopic", "info", topic)
+        with module.ros.start("rostopic", "info", topic) as info:
+            info.wait()
+            return "Publishers: None" in info.output or "Unknown topic" in info.output
 
     eventually(gone, what=f"no publisher of {topic} at {module.name}")
