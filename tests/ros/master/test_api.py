@@ -1,0 +1,298 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.core import limits
+from rmpa.ros.master.api import MasterApi
+from rmpa.ros.master.effects import Effect, GraphChange, Kind, ParamUpdate, PublisherUpdate, Shutdown
+from rmpa.ros.xmlrpc import RosFault, XmlRpcValue, serialize_response
+
+if TYPE_CHECKING:
+    from rmpa.ros.xmlrpc import Reply
+
+A, B, C = "http://a:1/", "http://b:2/", "http://c:3/"
+STRING = "std_msgs/String"
+RPC = "rosrpc://a:9"
+
+
+class Master:
+    """A master, and what came out of it with the last call."""
+
+    def __init__(self) -> None:
+        self.ended: list[str] = []
+        self.api = MasterApi("http://m:11311/", 42, self.ended.append)
+        self.effects: list[Effect] = []
+        self.changes: list[GraphChange] = []
+
+    def __call__(self, method: str, *params: XmlRpcValue) -> Reply:
+        reply = self.api.call(method, params)
+        self.effects, self.changes = self.api.take()
+        serialize_response(list(reply))  # whatever is answered can be said
+        return reply
+
+    def value(self, method: str, *params: XmlRpcValue) -> XmlRpcValue:
+        reply = self(method, *params)
+        assert reply.code == 1, reply
+        return reply.value
+
+
+@pytest.fixture
+def master() -> Master:
+    return Master()
+
+
+def test_a_publisher_is_told_its_subscribers_and_they_of_it(master: Master) -> None:
+    assert master.value("registerSubscriber", "/s", "/t", "*", B) == []
+    assert master.effects == []
+    assert master.value("registerPublisher", "/p", "/t", STRING, A) == [B]
+    assert master.effects == [PublisherUpdate(B, "/t", (A,))]
+    assert master.changes == [GraphChange(Kind.PUBLISHER, True, "/t", "/p", A, STRING)]
+
+
+def test_the_reply_to_a_subscriber_contains_the_publishers(master: Master) -> None:
+    """Trap 32."""
+    master("registerPublisher", "/p", "/t", STRING, A)
+    master("registerPublisher", "/q", "/t", STRING, C)
+    assert master.value("registerSubscriber", "/s", "/t", STRING, B) == [A, C]
+
+
+def test_a_repeated_registration_is_told_again_but_is_no_change(master: Master) -> None:
+    """Trap 14: rospy connects again only because of it."""
+    master("registerSubscriber", "/s", "/t", "*", B)
+    master("registerPublisher", "/p", "/t", STRING, A)
+    master("registerPublisher", "/p", "/t", STRING, A)
+    assert master.effects == [PublisherUpdate(B, "/t", (A,))]
+    assert master.changes == []
+
+
+def test_a_new_type_is_a_change(master: Master) -> None:
+    master("registerSubscriber", "/s", "/t", "*", B)
+    assert master.value("getTopicTypes", "/x") == []
+    master("registerSubscriber", "/s", "/t", STRING, B)
+    assert master.changes == [GraphChange(Kind.SUBSCRIBER, True, "/t", "/s", B, STRING)]
+    master("registerPublisher", "/p", "/t", "*", A)
+    assert master.value("getTopicTypes", "/x") == [["/t", STRING]]
+    master("registerPublisher", "/p", "/t", "std_msgs/Int8", A)
+    assert master.changes == [GraphChange(Kind.PUBLISHER, True, "/t", "/p", A, "std_msgs/Int8")]
+
+
+def test_a_withdrawn_publisher_leaves_the_list(master: Master) -> None:
+    master("registerSubscriber", "/s", "/t", "*", B)
+    master("registerPublisher", "/p", "/t", STRING, A)
+    assert master.value("unregisterPublisher", "/p", "/t", A) == 1
+    assert master.effects == [PublisherUpdate(B, "/t", ())]
+    assert master.value("unregisterPublisher", "/p", "/t", A) == 0
+    assert master.effects == []
+    assert master("lookupNode", "/x", "/p").code == -1
+
+
+def test_uris_are_kept_as_they_are(master: Master) -> None:
+    """Trap 30: roscpp recognises itself by the exact text."""
+    for uri in ("http://HOST:1/", "http://host:1", "http://host:1//", "http://[::1]:5/x?y"):
+        master("registerPublisher", uri.replace(":", "_").replace("/", "_"), "/t", STRING, uri)
+    assert master.value("registerSubscriber", "/s", "/t", STRING, B) == [
+        "http://HOST:1/", "http://host:1", "http://host:1//", "http://[::1]:5/x?y",
+    ]  # fmt: skip
+
+
+def test_nodelets_with_one_uri_are_told_once(master: Master) -> None:
+    master("registerSubscriber", "/n1", "/t", "*", B)
+    master("registerSubscriber", "/n2", "/t", "*", B)
+    assert master.value("registerPublisher", "/p", "/t", STRING, A) == [B, B]
+    assert master.effects == [PublisherUpdate(B, "/t", (A,))]
+
+
+@pytest.mark.parametrize(
+    "taking",
+    [
+        ("registerPublisher", "/twin", "/new", STRING, C),
+        ("registerSubscriber", "/twin", "/new", STRING, C),
+        ("registerService", "/twin", "/new", RPC, C),
+        ("subscribeParam", "/twin", C, "/p"),
+    ],
+)
+def test_a_node_of_the_same_name_is_pushed_out(master: Master, taking: tuple[str, ...]) -> None:
+    """Trap 33: by any registration, subscribeParam included."""
+    master("registerPublisher", "/twin", "/t", STRING, A)
+    master("registerSubscriber", "/twin", "/u", STRING, A)
+    master("registerService", "/twin", "/s", RPC, A)
+    master("subscribeParam", "/twin", A, "/p")
+    master(*taking)
+    assert Shutdown(A, "/twin", ("/t",)) in master.effects
+    gone = [change for change in master.changes if not change.added]
+    assert master.value("lookupNode", "/x", "/twin") == C
+    assert [(change.kind, change.name, change.api) for change in gone] == [
+        (Kind.PUBLISHER, "/t", A), (Kind.SUBSCRIBER, "/u", A), (Kind.SERVICE, "/s", A),
+    ]  # fmt: skip
+    master("setParam", "/x", "/p", 1)
+    assert ParamUpdate(A, "/p/", 1) not in master.effects
+
+
+def test_late_unregisters_do_not_hit_the_new_node(master: Master) -> None:
+    """Trap 33: what the old node says on its way out is about its own URI."""
+    for uri, service in ((A, RPC), (C, RPC + "1")):
+        master("registerPublisher", "/twin", "/t", STRING, uri)
+        master("registerSubscriber", "/twin", "/u", STRING, uri)
+        master("registerService", "/twin", "/s", service, uri)
+        master("subscribeParam", "/twin", uri, "/p")
+    before = master.api.state()
+    assert master.value("unregisterPublisher", "/twin", "/t", A) == 0
+    assert master.value("unregisterSubscriber", "/twin", "/u", A) == 0
+    assert master.value("unregisterService", "/twin", "/s", RPC) == 0
+    master("unsubscribeParam", "/twin", A, "/p")
+    assert master.effects == []
+    assert master.api.state() == before
+    master("setParam", "/x", "/p", 1)
+    assert master.effects == [ParamUpdate(C, "/p/", 1)]
+
+
+def test_a_dead_node_is_purged_and_its_subscribers_told(master: Master) -> None:
+    master("registerSubscriber", "/s", "/t", "*", B)
+    master("registerPublisher", "/dead", "/t", STRING, A)
+    master("registerService", "/dead", "/srv", RPC, A)
+    master("subscribeParam", "/dead", A, "/p")
+    registrations = master.api.registrations
+    assert not registrations.purge("/dead", C), "it came back at another URI"
+    assert registrations.purge("/dead", A)
+    effects, changes = master.api.take()
+    assert effects == [PublisherUpdate(B, "/t", ())]
+    assert [(change.kind, change.added) for change in changes] == [(Kind.PUBLISHER, False), (Kind.SERVICE, False)]
+    assert master("lookupNode", "/x", "/dead").code == -1
+    assert master("lookupService", "/x", "/srv")[0] == -1
+    master("setParam", "/x", "/p", 1)
+    assert master.effects == []
+    assert not registrations.purge("/dead", A)
+
+
+def test_a_purged_node_that_lost_its_service_to_another_does_not_take_it_along(master: Master) -> None:
+    master("registerService", "/old", "/s", RPC, A)
+    master("registerService", "/new", "/s", RPC + "1", B)
+    assert [(change.node, change.added) for change in master.changes] == [("/old", False), ("/new", True)]
+    master.api.registrations.purge("/old", A)
+    assert master.value("lookupService", "/x", "/s") == RPC + "1"
+
+
+def test_states_are_snapshots(master: Master) -> None:
+    master("registerPublisher", "/p", "/t", STRING, A)
+    state = master.api.state()
+    assert master.api.state() is state
+    assert (state.publishers, state.types, state.nodes) == ({"/t": {"/p": A}}, {"/t": STRING}, {"/p": A})
+    master("registerService", "/p", "/s", RPC, A)
+    assert state.services == {}
+    assert master.api.state().services == {"/s": {"/p": RPC}}
+
+
+def test_parameters_handed_out_do_not_change(master: Master) -> None:
+    given: dict[str, XmlRpcValue] = {"b": [1, 2]}
+    master("setParam", "/x", "/a", given)
+    before = master.value("getParam", "/x", "/")
+    given["c"] = 1
+    master("setParam", "/x", "/a/b", 5)
+    master("deleteParam", "/x", "/a")
+    assert before == {"a": {"b": [1, 2]}}
+
+
+def test_updates_have_slashes_and_deletion_is_an_empty_dict(master: Master) -> None:
+    """Trap 34."""
+    master("subscribeParam", "/s", B, "/a/b")
+    master("setParam", "/x", "/a/b", 1)
+    assert master.effects == [ParamUpdate(B, "/a/b/", 1)]
+    master("setParam", "/s", "/a/b", 2)
+    assert master.effects == [], "the setter itself is not told"
+    master("deleteParam", "/x", "/a")
+    assert master.effects == [ParamUpdate(B, "/a/b/", {})]
+    master("setParam", "/x", "/", {"a": {"b": 3}})
+    assert master.effects == [ParamUpdate(B, "/a/b/", 3)]
+
+
+def test_empty_namespaces_exist_but_have_no_names(master: Master) -> None:
+    """Trap 35."""
+    master("setParam", "/x", "/empty", {})
+    assert master.value("hasParam", "/x", "/empty") is True
+    assert master.value("getParamNames", "/x") == []
+    assert master.value("getParam", "/x", "/empty") == {}
+
+
+@pytest.mark.parametrize("value", [None, [None], {"a": {"b": [1, None]}}])
+def test_nil_is_refused_before_it_is_stored(master: Master, value: XmlRpcValue) -> None:
+    assert master("setParam", "/x", "/p", value)[0] == -1
+    assert master.value("hasParam", "/x", "/p") is False
+
+
+def test_names_too_deep_are_refused(master: Master) -> None:
+    deep = "/a" * (limits.PARAM_DEPTH_MAX + 1)
+    for method in ("getParam", "hasParam", "deleteParam"):
+        assert master(method, "/x", deep)[0] == -1
+    assert master("setParam", "/x", deep, 1)[0] == -1
+    assert master("setParam", "/x", "/a" * limits.PARAM_DEPTH_MAX, 1)[0] == 1
+
+
+def test_validators_say_which_parameter_is_wrong(master: Master) -> None:
+    reply = master("registerPublisher", "/p", "/t", "String", A)
+    assert reply == (-1, "topic_type must be a type like std_msgs/String or *, not 'String'", [])
+    reply = master("registerPublisher", "/p", "/t")
+    assert reply.status == "registerPublisher takes (caller_id, topic, topic_type, caller_api), not 2 parameters"
+    assert master("getUri", 5).status == "caller_id must be a string, not 5"
+
+
+def test_its_own_api(master: Master) -> None:
+    assert master.value("getUri", "/x") == "http://m:11311/"
+    assert master.value("getPid", "/x") == 42
+    assert master.value("shutdown", "/x", "enough") == 0
+    assert master.ended == ["/x: 'enough'"]
+
+
+def test_unknown_methods_are_faults(master: Master) -> None:
+    for method in ("getName", "_table", "call", "__init__", "", "system.multicall"):
+        with pytest.raises(RosFault, match="has no method"):
+            master(method, "/x")
+
+
+def test_list_methods_names_what_there_is() -> None:
+    api = Master().api
+    listed = api.answer("system.listMethods", [])
+    assert isinstance(listed, list)
+    assert {"registerPublisher", "getParamNames", "system.multicall", "system.listMethods"} <= set(listed)
+    for method in listed:
+        assert isinstance(method, str)
+        if not method.startswith("system."):
+            assert api.call(method, [])[0] == -1
+
+
+def test_multicall() -> None:
+    api = Master().api
+    calls: list[XmlRpcValue] = [
+        {"methodName": "setParam", "params": ["/x", "/p", 1]},
+        {"methodName": "getParam", "params": ["/x", "/p"]},
+        {"methodName": "nothing", "params": []},
+        {"methodName": "system.multicall", "params": [[]]},
+        {"methodName": "getPid"},
+        5,
+    ]
+    answers = api.answer("system.multicall", [calls])
+    assert isinstance(answers, list)
+    assert answers[1] == [[1, "the value of /p", 1]]
+    for fault in answers[2:]:
+        assert isinstance(fault, dict)
+        assert fault["faultCode"] == 1
+    for wrong in (["/x"], [5], ["/x", 5]):
+        with pytest.raises(RosFault):
+            api.answer("system.multicall", wrong)
+
+
+@pytest.mark.parametrize(
+    ("name", "caller", "resolved"),
+    [
+        ("rel", "/ns/node", "/ns/rel"),
+        ("~priv", "/ns/node", "/ns/node/priv"),
+        ("/a//b/", "/n", "/a/b"),
+        ("rel", "", "/rel"),
+        ("rel", "noslash", "/rel"),
+        ("~x", "/", "/x"),
+    ],
+)
+def test_names_are_resolved_for_the_caller(master: Master, name: str, caller: str, resolved: str) -> None:
+    assert master.value("hasParam", caller, name) is False
+    assert master("hasParam", caller, name).status == resolved
