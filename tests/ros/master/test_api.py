@@ -277,7 +277,8 @@ def test_multicall() -> None:
     for fault in answers[2:]:
         assert isinstance(fault, dict)
         assert fault["faultCode"] == 1
-    for wrong in (["/x"], [5], ["/x", 5]):
+    wrongs: list[list[XmlRpcValue]] = [["/x"], [5], [[], 5]]
+    for wrong in wrongs:
         with pytest.raises(RosFault):
             api.answer("system.multicall", wrong)
 
