@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
+import os
 import random
 import socket
 from collections.abc import Callable
@@ -308,7 +309,7 @@ class Mesh:
         except OSError as error:  # TimeoutError is one
             sock.close()
             self.counters.add("link.dial_failed")
-            problem = error.strerror or f"no answer within {limits.DIAL_TIMEOUT:g} s"
+            problem = os.strerror(error.errno) if error.errno else f"no answer within {limits.DIAL_TIMEOUT:g} s"
             self._peering.dial_failed(dial.guid, f"{host}:{port}: {problem}", self._clock.now())
             self._act()
         except BaseException:

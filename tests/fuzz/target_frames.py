@@ -1,0 +1,33 @@
+"""Fuzz target: the frame parser."""
+
+from __future__ import annotations
+
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.mesh.frames import Frame, Kind, parse_pong, parse_text, pong
+
+SEEDS: list[bytes] = [
+    b"",
+    Frame(Kind.PING, stamp_ns=1).serialize(),
+    pong(1, 2, 3).serialize(),
+    Frame(Kind.CONTROL, b'{"op":"x"}').serialize(),
+    Frame(Kind.DATA, b"\x04\x00\x00\x00abcd", 7, 1, 99).serialize(),
+    Frame(Kind.BYE, b"ends").serialize() + Frame(Kind.DATA, flags=1).serialize(),
+]
+
+
+def fuzz(data: bytes) -> None:
+    """Whatever comes in: a frame that survives its round trip, nothing yet, or a documented error."""
+    try:
+        parsed = Frame.parse(data)
+        if parsed is None:
+            return
+        frame, taken = parsed
+        if frame.kind is Kind.PONG:
+            parse_pong(frame.payload)
+    except RemoteProtocolError as error:
+        str(error)
+        return
+    if Frame.parse(frame.serialize()) != (frame, taken):
+        raise AssertionError(f"{frame} does not survive its round trip")
+    if not parse_text(frame.payload).isprintable() or not str(frame).isprintable():
+        raise AssertionError("a frame's text is not safe to log")

@@ -1,0 +1,69 @@
+"""Fuzz target: a link's machine, in both roles, before and after its handshake."""
+
+from __future__ import annotations
+
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+from rmpa.mesh.frames import Frame, Kind, pack_data_header, pong
+from rmpa.mesh.handshake import Hello, Refuse
+from rmpa.mesh.link import Event, HelloReceived, Link, Role, State
+
+_OURS = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")
+_THEIRS = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")
+_HELLO = Frame(Kind.HELLO, Hello.of(_THEIRS, lease=1.0, expected=_OURS.guid).serialize()).serialize()
+_WELCOME = Frame(Kind.WELCOME, Hello.of(_THEIRS, lease=1.0, expected=_OURS.guid).serialize()).serialize()
+_TALK = Frame(Kind.PING, stamp_ns=5).serialize() + pong(1, 2, 3).serialize() + Frame(Kind.CONTROL, b"{}").serialize()
+_DATA = pack_data_header(4, 1, 1, 9) + b"\0\0\0\0"
+
+SEEDS: list[bytes] = [
+    b"",
+    _HELLO,
+    _WELCOME,
+    Frame(Kind.REFUSE, Refuse(8, "busy").serialize()).serialize(),
+    _HELLO + _TALK + _DATA,
+    _TALK + _DATA + Frame(Kind.BYE, b"ends").serialize(),
+]
+
+
+def fuzz(data: bytes) -> None:
+    """The same bytes whole and in two pieces, to a fresh link of either role and to one that is up."""
+    for role in Role:
+        for prefix in (b"", _HELLO if role is Role.ACCEPTOR else _WELCOME):
+            whole = _feed(role, [prefix + data])
+            parts = _feed(role, [prefix, data[: len(data) // 2], data[len(data) // 2 :]])
+            if whole != parts:
+                raise AssertionError(f"{whole} whole, but {parts} in pieces")
+
+
+def _feed(role: Role, pieces: list[bytes]) -> tuple[str, int, int]:
+    """What the link says and how it ends."""
+    events: list[Event] = []
+    data = 0
+
+    def on_event(event: Event) -> None:
+        events.append(event)
+        if isinstance(event, HelloReceived):
+            link.accept(0.0)
+
+    def on_data(_route: int, _sequence: int, _stamp_ns: int, payload: memoryview) -> None:
+        nonlocal data
+        data += len(payload)
+
+    link = Link(role, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event, on_data=on_data)
+    kept = b""
+    for piece in pieces:
+        if link.state is State.CLOSED:
+            break
+        kept += piece
+        try:
+            consumed, wanted = link.receive(memoryview(kept), 0.0)
+        except RemoteProtocolError as error:
+            str(error)
+            if link.state is not State.CLOSED:
+                raise AssertionError("a broken protocol left the link open") from None
+            break
+        if not 0 <= consumed <= len(kept) or wanted < 0:
+            raise AssertionError(f"consumed {consumed} of {len(kept)}, wants {wanted}")
+        kept = kept[consumed:]
+    return repr(events), data, link.state.value

@@ -1,0 +1,341 @@
+"""Meshes on loopback: every wait is for an event, with a generous deadline."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import hashlib
+import socket
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+import pytest
+
+from rmpa.core import limits
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+from rmpa.mesh.aio.link import MeshLink
+from rmpa.mesh.aio.mesh import Mesh
+from rmpa.mesh.frames import Frame, Kind
+from rmpa.mesh.handshake import Hello, Refusal, Refuse
+
+DEADLINE = 20.0
+
+
+async def until(condition: Callable[[], bool], what: str) -> None:
+    """Wait for a condition that the loop's own events bring about."""
+    try:
+        async with asyncio.timeout(DEADLINE):
+            while not condition():
+                await asyncio.sleep(0.002)
+    except TimeoutError:
+        raise AssertionError(f"not within {DEADLINE} s: {what}") from None
+
+
+class Peer:
+    """A mesh and what it was told."""
+
+    def __init__(self, number: int, instance: int = 0, port: int = 0) -> None:
+        sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        sock.bind(("127.0.0.1", port))
+        sock.listen(32)
+        self.number = number
+        self.port = sock.getsockname()[1]
+        instance_id = bytes([number, instance]) + bytes(14)
+        guid = Guid.of("127.0.0.1", self.port, instance)
+        self.identity = Identity(guid, instance_id, f"peer{number}")
+        self.ups: list[MeshLink] = []
+        self.downs: list[tuple[MeshLink, str]] = []
+        self.controls: list[bytes] = []
+        self.data: list[tuple[int, int, int, bytes]] = []
+        self.bytes_got = 0
+        self.keep = True
+        self.mesh = Mesh(
+            self.identity,
+            sock,
+            on_link_up=self.ups.append,
+            on_link_down=lambda link, reason: self.downs.append((link, reason)),
+            on_control=lambda _link, payload: self.controls.append(payload),
+            on_data=self.on_data,
+        )
+
+    def on_data(self, _link: MeshLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
+        self.bytes_got += len(payload)
+        if self.keep:
+            self.data.append((route, sequence, stamp_ns, bytes(payload)))
+
+    def linked(self, *others: Peer) -> bool:
+        return all((link := self.mesh.link(o.identity.guid)) is not None and link.up for o in others)
+
+    def link(self, other: Peer) -> MeshLink:
+        link = self.mesh.link(other.identity.guid)
+        assert link is not None
+        return link
+
+    def kill(self) -> None:
+        """As kill -9: the kernel closes the sockets, nobody says bye."""
+        self.mesh._running = False
+        asyncio.get_running_loop().remove_reader(self.mesh._listen.fileno())
+        self.mesh._listen.close()
+        for timer in (self.mesh._timer, self.mesh._accept_timer):
+            if timer is not None:
+                timer.cancel()
+        for link in self.mesh._links.values():
+            link.abort("killed")
+
+
+@asynccontextmanager
+async def peers(count: int, *, found: bool = True) -> AsyncIterator[list[Peer]]:
+    made = [Peer(n) for n in range(count)]
+    try:
+        for peer in made:
+            await peer.mesh.start()
+        if found:
+            introduce(made)
+        yield made
+    finally:
+        await asyncio.gather(*(p.mesh.close() for p in made))
+
+
+def introduce(made: list[Peer]) -> None:
+    for one in made:
+        for other in made:
+            if one is not other:
+                one.mesh.peer_found(other.identity)
+
+
+@pytest.mark.parametrize("count", [2, 5])
+async def test_a_full_mesh_with_one_link_a_pair(count: int) -> None:
+    async with peers(count) as made:
+        await until(lambda: all(p.linked(*(o for o in made if o is not p)) for p in made), "a full mesh")
+        for peer in made:
+            assert len(peer.mesh.links()) == count - 1
+            for link in peer.mesh.links():
+                assert link.guid is not None
+                assert link.dialled == (peer.identity.guid < link.guid)
+            assert {s.state for s in peer.mesh.peers()} == {"linked"}
+        link = made[0].link(made[1])
+        await until(lambda: link.rtt is not None, "a round trip")
+        assert link.clock_offset is not None
+        assert link.clock_error is not None
+        assert abs(link.clock_offset) <= link.clock_error
+        assert not any(p.downs for p in made)
+    for peer in made:
+        assert len(peer.downs) == count - 1
+        assert not peer.mesh.links()
+
+
+async def test_one_side_alone_knows_the_other() -> None:
+    async with peers(2, found=False) as (one, other):
+        one.mesh.peer_found(other.identity)
+        await until(lambda: one.linked(other) and other.linked(one), "a link")
+        assert other.ups[0].identity == one.identity
+
+
+async def test_small_and_large_messages_in_order_and_byte_exact() -> None:
+    async with peers(2) as (one, other):
+        await until(lambda: one.linked(other) and other.linked(one), "a link")
+        link = one.link(other)
+        large = [hashlib.sha256(bytes([i])).digest() * (limits.MIB // 32) for i in range(20)]
+        sent: list[tuple[int, int, int, bytes]] = []
+        for i in range(10_000):
+            sent.append((1, i, i, b"%064d" % i))
+            assert link.send_data(*sent[-1]) == 0
+            if i % 500 == 0:
+                sent.append((2, i, i, large[i // 500]))
+                assert link.send_data(*sent[-1]) == 0
+            if link.queue_bytes or i % 500 == 0:
+                await until(lambda: link.queue_bytes < 65536, "room")
+        link.send_control(b'{"op":"end"}')
+        await until(lambda: len(other.data) == len(sent), "all messages")
+        assert other.data == sent
+        assert other.controls == [b'{"op":"end"}']
+        assert not link.dropped
+
+
+async def test_a_killed_peer_comes_back_with_a_new_instance_on_the_same_port() -> None:
+    async with peers(3) as (one, two, three):
+        await until(lambda: one.linked(two, three) and two.linked(one, three) and three.linked(one, two), "a mesh")
+        one.kill()
+        await until(lambda: len(two.downs) == 1 and len(three.downs) == 1, "both see it gone")
+        again = Peer(one.number, instance=1, port=one.port)
+        try:
+            await again.mesh.start()
+            again.mesh.peer_found(two.identity)
+            again.mesh.peer_found(three.identity)
+            await until(lambda: two.linked(again, three) and three.linked(again, two), "the mesh is whole again")
+            assert two.mesh.link(one.identity.guid) is None
+            assert {s.identity.instance for s in two.mesh.peers()} == {
+                again.identity.instance,
+                three.identity.instance,
+            }
+        finally:
+            await again.mesh.close()
+
+
+@pytest.mark.parametrize("garbage", [b"GET / HTTP/1.1\r\n\r\n" * 4, bytes(64), b"\xff" * 64])
+async def test_garbage_on_the_port_closes_that_connection_only(
+    garbage: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with peers(2) as (one, other):
+        await until(lambda: one.linked(other), "a link")
+        for _ in range(3):
+            reader, writer = await asyncio.open_connection("127.0.0.1", one.port)
+            writer.write(garbage)
+            with_reset: bytes | None
+            try:
+                with_reset = await asyncio.wait_for(reader.read(), DEADLINE)
+            except ConnectionResetError:
+                with_reset = b""
+            assert with_reset == b""
+            writer.close()
+        await until(lambda: one.mesh.counters["link.malformed"] == 3, "counted")
+        assert sum("broke the protocol" in r.message for r in caplog.records) == 1
+        assert one.linked(other)
+
+
+async def raw(peer: Peer, identity: Identity, **changes: object) -> tuple[socket.socket, Frame]:
+    """A hand-made dialler: its socket, and the first frame that it is answered."""
+    loop = asyncio.get_running_loop()
+    sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
+    await loop.sock_connect(sock, ("127.0.0.1", peer.port))
+    hello = Hello.of(identity, lease=float(str(changes.get("lease", 1.0))), expected=peer.identity.guid)
+    await loop.sock_sendall(sock, Frame(Kind.HELLO, hello.serialize()).serialize())
+    got = b""
+    while (parsed := Frame.parse(got)) is None:
+        chunk = await asyncio.wait_for(loop.sock_recv(sock, 4096), DEADLINE)
+        assert chunk
+        got += chunk
+    return sock, parsed[0]
+
+
+async def test_another_domain_is_refused_with_what_to_do(caplog: pytest.LogCaptureFixture) -> None:
+    async with peers(1) as (one,):
+        stranger = Identity(Guid.of("127.0.0.1", 9), b"s" * 16, "stranger", domain=7)
+        sock, answer = await raw(one, stranger)
+        sock.close()
+        assert answer.kind is Kind.REFUSE
+        assert Refuse.parse(answer.payload).code == Refusal.DOMAIN
+        assert "--domain" in Refuse.parse(answer.payload).text
+        assert one.mesh.counters["link.refused.domain"] == 1
+        assert any("refused a link with stranger" in r.message for r in caplog.records)
+
+
+async def test_a_stopped_peer_is_down_after_its_lease_and_its_memory_is_bounded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(limits, "LINK_QUEUE_BYTES", 4 * limits.MIB)
+    async with peers(1) as (one,):
+        stopped = Identity(Guid.of("127.0.0.1", 9), b"s" * 16, "stopped")
+        sock, answer = await raw(one, stopped, lease=0.5)
+        assert answer.kind is Kind.WELCOME
+        await until(lambda: bool(one.ups), "a link")
+        link = one.ups[0]
+        began = asyncio.get_running_loop().time()
+        block = bytes(limits.MIB)
+        for i in range(64):
+            link.send_data(5, i, i, block)
+            assert link.queue_bytes <= 6 * limits.MIB
+        assert link.dropped[5] >= 50
+        assert link.close_route(5) <= 4
+        await until(lambda: bool(one.downs), "the lease is over")
+        assert asyncio.get_running_loop().time() - began >= 0.4
+        assert "silent for its lease of 0.5 s" in one.downs[0][1]
+        sock.close()
+
+
+async def test_control_that_nobody_reads_closes_the_link_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "LINK_URGENT_BYTES", limits.MIB)
+    async with peers(1) as (one,):
+        sock, _ = await raw(one, Identity(Guid.of("127.0.0.1", 9), b"s" * 16, "deaf"), lease=60.0)
+        await until(lambda: bool(one.ups), "a link")
+        for _ in range(64):
+            one.ups[0].send_control(bytes(limits.MIB // 2))
+        await until(lambda: bool(one.downs), "closed")
+        assert "deaf does not read" in one.downs[0][1]
+        sock.close()
+
+
+async def test_a_bye_says_why() -> None:
+    async with peers(2) as (one, other):
+        await until(lambda: one.linked(other) and other.linked(one), "a link")
+        one.mesh.peer_gone(other.identity.guid)
+        other.mesh.peer_gone(one.identity.guid)
+        assert one.linked(other)
+        one.link(other).close("maintenance")
+        await until(lambda: bool(one.downs) and bool(other.downs), "both down")
+        assert one.downs[0][1] == "maintenance"
+        assert other.downs[0][1] == "peer0 left: maintenance"
+        assert not one.mesh.peers()
+
+
+async def test_a_peer_that_is_not_there_says_why_it_is_not_linked() -> None:
+    async with peers(1) as (one,):
+        free = socket.socket()
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+        free.close()
+        ghost = Identity(Guid.of("127.0.0.1", port, 65535), b"g" * 16, "ghost")
+        if ghost.guid < one.identity.guid:
+            ghost = Identity(Guid.of("127.255.255.254", port), b"g" * 16, "ghost")
+        one.mesh.peer_found(ghost)
+        await until(lambda: one.mesh.counters["link.dial_failed"] >= 2, "two attempts")
+        (status,) = one.mesh.peers()
+        assert status.state in ("waiting", "dialling")
+        assert "refused" in status.last_error.lower()
+
+
+async def test_no_file_descriptors_left_pauses_and_recovers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "ACCEPT_PAUSE", 0.01)
+    async with peers(2, found=False) as (one, other):
+        real = one.mesh._listen
+        fails = 2
+
+        class Exhausted:
+            def fileno(self) -> int:
+                return real.fileno()
+
+            def close(self) -> None:
+                real.close()
+
+            def accept(self) -> tuple[socket.socket, tuple[str, int]]:
+                nonlocal fails
+                if fails:
+                    fails -= 1
+                    raise OSError(errno.EMFILE, "Too many open files")
+                return real.accept()
+
+        monkeypatch.setattr(one.mesh, "_listen", Exhausted())
+        other.mesh.peer_found(one.identity)
+        await until(lambda: one.linked(other), "a link after the pause")
+        assert one.mesh.counters["link.accept_failed"] == 2
+
+
+async def test_silent_connections_from_one_address_are_bounded() -> None:
+    async with peers(1) as (one,):
+        writers = []
+        for _ in range(limits.PENDING_PER_ADDRESS + 4):
+            _, writer = await asyncio.open_connection("127.0.0.1", one.port)
+            writers.append(writer)
+        await until(lambda: one.mesh.counters["link.pending_full"] == 4, "four closed")
+        assert len(one.mesh.links()) == limits.PENDING_PER_ADDRESS
+        for writer in writers:
+            writer.close()
+
+
+async def test_both_dial_at_once_and_one_link_stays() -> None:
+    async with peers(2, found=False) as (one, other):
+        for a, b in ((one, other), (other, one)):
+            a.mesh._peering.peer_found(b.identity, asyncio.get_running_loop().time() - limits.DIAL_FALLBACK)
+        for peer in (one, other):
+            peer.mesh._peering.handle_timer(asyncio.get_running_loop().time())
+            peer.mesh._act()
+        await until(
+            lambda: one.linked(other) and other.linked(one) and len(one.mesh.links()) == len(other.mesh.links()) == 1,
+            "one link",
+        )
+        low, high = sorted((one, other), key=lambda p: p.identity.guid)
+        assert low.link(high).dialled
+        assert not high.link(low).dialled

@@ -1,0 +1,134 @@
+"""Hello, welcome, refuse: golden bytes, malformed, and every reason to say no."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+from rmpa.mesh.handshake import HandshakeError, Hello, KnownLink, Refusal, Refuse, judge, judge_welcome
+from tests.mesh.worlds import HIGH, LOW
+
+HELLO = Hello(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base", 5, 1000, Guid.of("10.0.0.2", 2), features=9)
+WIRE = bytes.fromhex(
+    "524d5041 01 01 0005 0a0000019c410007 000102030405060708090a0b0c0d0e0f 000003e8 0a00000200020000 00000009 04"
+    "62617365"
+)
+
+
+def test_golden_bytes() -> None:
+    assert HELLO.serialize() == WIRE
+    assert Hello.parse(WIRE) == HELLO
+    assert Hello.parse(WIRE + b"later") == HELLO
+    assert Hello.parse(memoryview(WIRE)) == HELLO
+    assert Refuse(2, "no").serialize() == b"\x00\x02no"
+    assert Refuse.parse(b"\x00\x02no") == Refuse(2, "no")
+    assert str(Refuse.parse(b"\x01\x00?")) == "code 256: ?"
+
+
+@pytest.mark.parametrize("cut", range(len(WIRE)))
+def test_every_shorter_hello_is_malformed(cut: int) -> None:
+    with pytest.raises(HandshakeError) as caught:
+        Hello.parse(WIRE[:cut])
+    assert caught.value.refuse.code == Refusal.MALFORMED
+
+
+def test_another_version_is_told_from_garbage_whatever_follows() -> None:
+    with pytest.raises(HandshakeError, match="same release") as caught:
+        Hello.parse(b"RMPA\x02\x01\x00\x00")
+    assert caught.value.refuse.code == Refusal.VERSION
+
+
+@pytest.mark.parametrize("name", [b"\xff\xff", b"a/b", b"a b", b"", b"a" * 65])
+def test_names_that_are_not(name: bytes) -> None:
+    with pytest.raises(HandshakeError) as caught:
+        Hello.parse(WIRE[:48] + bytes([len(name)]) + name)
+    assert caught.value.refuse.code == Refusal.MALFORMED
+
+
+def test_a_lease_of_nothing_and_a_refusal_of_nothing() -> None:
+    with pytest.raises(HandshakeError):
+        Hello.parse(WIRE[:32] + bytes(4) + WIRE[36:])
+    with pytest.raises(RemoteProtocolError):
+        Refuse.parse(b"\x00")
+
+
+def hello_of(identity: Identity, expected: Guid | None = None) -> Hello:
+    return Hello.of(identity, lease=1.0, expected=expected)
+
+
+GHOST = KnownLink(LOW.guid, b"g" * 16, dialled=False, alive=True)
+
+REFUSED: list[tuple[Hello, list[KnownLink], Refusal, str]] = [
+    (hello_of(replace(LOW, domain=3)), [], Refusal.DOMAIN, "--domain"),
+    (hello_of(HIGH), [], Refusal.MYSELF, "its own port"),
+    (hello_of(replace(HIGH, instance=b"x" * 16)), [], Refusal.DUPLICATE, "--port"),
+    (hello_of(LOW), [GHOST], Refusal.DUPLICATE, "--port"),
+    (hello_of(LOW, Guid.of("10.0.0.9", 9)), [], Refusal.WRONG_PEER, "two machines"),
+    (replace(hello_of(LOW), lane=2), [], Refusal.LANE, "same release"),
+]
+
+
+@pytest.mark.parametrize(("hello", "links", "code", "advice"), REFUSED)
+def test_refused(hello: Hello, links: list[KnownLink], code: Refusal, advice: str) -> None:
+    verdict = judge(hello, HIGH, links)
+    assert verdict is not None
+    assert verdict.code == code
+    assert advice in verdict.text
+
+
+def test_busy_only_for_strangers() -> None:
+    verdict = judge(hello_of(LOW), HIGH, [], busy=True)
+    assert verdict is not None
+    assert verdict.code == Refusal.BUSY
+    assert judge(hello_of(LOW), HIGH, [KnownLink(LOW.guid, LOW.instance, False, True)], busy=True) is None
+
+
+def test_welcome_cases() -> None:
+    assert judge(hello_of(LOW, HIGH.guid), HIGH, []) is None
+    older = Guid.of(HIGH.guid.address, HIGH.guid.port, 0)
+    assert judge(hello_of(LOW, older), HIGH, []) is None, "a restarted peer is welcome under its old number"
+    assert judge(hello_of(LOW), HIGH, [replace(GHOST, alive=False)]) is None, "the ghost of a new instance"
+    theirs = KnownLink(LOW.guid, LOW.instance, dialled=True, alive=True)
+    assert judge(hello_of(LOW), HIGH, [theirs]) is None, "the lower GUID's call replaces ours"
+    ours = KnownLink(HIGH.guid, HIGH.instance, dialled=True, alive=True)
+    verdict = judge(hello_of(HIGH), LOW, [ours])
+    assert verdict is not None
+    assert verdict.code == Refusal.ALREADY_LINKED
+
+
+def test_the_answer_is_judged_too() -> None:
+    good = hello_of(HIGH, LOW.guid)
+    assert judge_welcome(good, LOW, HIGH.guid) is None
+    assert judge_welcome(good, LOW, None) is None
+    cases = [
+        (replace(good, expected=None), Refusal.MALFORMED),
+        (replace(good, domain=1), Refusal.DOMAIN),
+        (replace(good, guid=Guid.of("10.0.0.3", 1)), Refusal.WRONG_PEER),
+        (replace(good, instance=LOW.instance), Refusal.MYSELF),
+    ]
+    for welcome, code in cases:
+        verdict = judge_welcome(welcome, LOW, HIGH.guid)
+        assert verdict is not None
+        assert verdict.code == code
+
+
+@given(
+    guid=st.integers(0, 2**64 - 1),
+    instance=st.binary(min_size=16, max_size=16),
+    name=st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,63}", fullmatch=True),
+    domain=st.integers(0, 0xFFFF),
+    lease=st.integers(1, 2**32 - 1),
+    expected=st.integers(1, 2**64 - 1),
+    lane=st.integers(0, 255),
+)
+def test_any_hello_survives(
+    guid: int, instance: bytes, name: str, domain: int, lease: int, expected: int, lane: int
+) -> None:
+    hello = Hello(Guid(guid), instance, name, domain, lease, Guid(expected), lane)
+    assert Hello.parse(hello.serialize()) == hello
