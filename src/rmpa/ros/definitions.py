@@ -215,7 +215,9 @@ def _md5sum(name: str, known: Mapping[str, Specification], sums: dict[str, str])
             f"{field if field.primitive else _md5sum(field.type, known, sums)} {field.name}"
             for field in known[name].fields
         ]
-        sums[name] = hashlib.md5("\n".join(lines).strip().encode(), usedforsecurity=False).hexdigest()
+        sums[name] = hashlib.md5(
+            "\n".join(lines).strip().encode(errors="surrogateescape"), usedforsecurity=False
+        ).hexdigest()
     return sums[name]
 
 

@@ -133,7 +133,7 @@ class TcprosServer:
         except OSError:  # it is gone already
             sock.close()
             return
-        if len(self._accepted) >= self._forget_at:
+        if len(self._accepted) >= min(self._forget_at, limits.TCPROS_CONNECTIONS_MAX):
             self._forget_closed()
         if len(self._accepted) >= limits.TCPROS_CONNECTIONS_MAX or len(self._waiting) >= limits.TCPROS_HANDSHAKES_MAX:
             self._refuse("full", link.peer[0], f"{self._name}: too many connections, one from {link.peer[0]} closed")
@@ -147,7 +147,7 @@ class TcprosServer:
     def _forget_closed(self) -> None:
         """Publications do not report back who left, so the closed ones are sorted out each time they may be half."""
         self._accepted = {link for link in self._accepted if not link.stream.closed}
-        self._forget_at = min(2 * len(self._accepted) + 16, limits.TCPROS_CONNECTIONS_MAX)
+        self._forget_at = 2 * len(self._accepted) + 16
 
     def _header(self, link: Inbound, fields: Header) -> None:
         timer = self._waiting.pop(link, None)

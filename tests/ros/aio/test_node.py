@@ -1,0 +1,243 @@
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.core import limits
+from rmpa.core.errors import LocalProtocolError, PeerRefused, UnreachableError
+from rmpa.ros.aio.core import RosCore
+from rmpa.ros.aio.http_client import call
+from rmpa.ros.aio.node import Node
+from rmpa.ros.definitions import DefinitionError
+from rmpa.ros.environment import RosEnvironment
+from rmpa.ros.messages import MessageType
+from tests.ros.aio.peers import DEADLINE, STRING, until
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from rmpa.ros.aio.node import Received
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _warm() -> None:
+    """Import numpy and rosbags outside of any loop: that takes a while, and a test's time is not for it."""
+    kind = MessageType("std_msgs/String")
+    kind.deserialize(kind.serialize(kind.make()))
+
+
+@pytest.fixture
+async def core() -> AsyncIterator[RosCore]:
+    made = RosCore("127.0.0.1", 0)
+    await made.start()
+    yield made
+    await made.close()
+
+
+def node(core: RosCore, name: str, **options: object) -> Node:
+    return Node(name, master_uri=core.uri, environment=RosEnvironment(), **options)  # type: ignore[arg-type]
+
+
+async def test_messages_go_from_one_node_to_another(core: RosCore) -> None:
+    async with node(core, "talker") as talker, node(core, "listener") as listener:
+        publisher = await talker.advertise("chatter", "std_msgs/String")
+        got: list[Received] = []
+        subscriber = await listener.subscribe("chatter", "std_msgs/String", got.append)
+        await publisher.wait_for_subscriber()
+        publisher.publish(publisher.make("hello"))
+        publisher.publish_raw(b"\x03\x00\x00\x00raw")
+        await until(lambda: len(got) == 2)
+        assert got[0].message.data == "hello"
+        assert got[1].plain == {"data": "raw"}
+        assert (got[0].caller_id, got[0].raw) == ("/talker", b"\x05\x00\x00\x00hello")
+        assert got[0].header["topic"] == "/chatter"
+        assert got[0].stamp_ns > 0
+        assert (publisher.subscribers, subscriber.publishers) == (1, 1)
+        assert ("/chatter", "std_msgs/String") in await listener.get_published_topics()
+    state = core.state()
+    assert "/chatter" not in state.publishers
+    assert "/chatter" not in state.subscribers
+
+
+async def test_any_type_is_learnt_from_its_publisher_and_iterated(core: RosCore) -> None:
+    kind = MessageType.learn("my_msgs/Pair", "int32 a\nint32 b\n")
+    async with node(core, "talker") as talker, node(core, "echo", anonymous=True) as echo:
+        subscriber = await echo.subscribe("/pair")
+        publisher = await talker.advertise("/pair", kind, latch=True)
+        for n in range(3):
+            publisher.publish(kind.make({"a": n, "b": 7}))
+        got = []
+        async with asyncio.timeout(DEADLINE):
+            async for received in subscriber:
+                got.append(received.plain)
+                if received.plain["a"] == 2:
+                    break
+        assert got[-1] == {"a": 2, "b": 7}
+        assert echo.name.startswith("/echo_")
+
+
+async def test_the_iteration_ends_with_its_subscriber_and_with_its_node(core: RosCore) -> None:
+    async with node(core, "n") as one:
+        for end in (lambda s: s.close(), lambda _: one.close()):
+            subscriber = await one.subscribe("/t")
+
+            async def read(subscriber: object = subscriber) -> list[object]:
+                return [received async for received in subscriber]  # type: ignore[attr-defined]
+
+            reading = asyncio.get_running_loop().create_task(read())
+            await asyncio.sleep(0)
+            await end(subscriber)
+            assert await asyncio.wait_for(reading, DEADLINE) == []
+
+
+async def test_a_slow_iteration_loses_the_oldest(core: RosCore) -> None:
+    async with node(core, "talker") as talker, node(core, "listener") as listener:
+        publisher = await talker.advertise("/t", "std_msgs/String")
+        subscriber = await listener.subscribe("/t", queue_messages=2)
+        await publisher.wait_for_subscriber()
+        for n in range(5):
+            publisher.publish(publisher.make(str(n)))
+        await until(lambda: subscriber.dropped == 3)
+        iterator = aiter(subscriber)
+        assert [(await anext(iterator)).plain["data"] for _ in range(2)] == ["3", "4"]
+
+
+async def test_a_failing_callback_is_logged_and_called_again(core: RosCore, caplog: pytest.LogCaptureFixture) -> None:
+    calls: list[bytes] = []
+
+    def fail(received: Received) -> None:
+        calls.append(received.raw)
+        raise RuntimeError("the user's mistake")
+
+    async with node(core, "talker") as talker, node(core, "listener") as listener:
+        publisher = await talker.advertise("/t", STRING)
+        await listener.subscribe("/t", callback=fail)
+        await publisher.wait_for_subscriber()
+        publisher.publish_raw(b"1")
+        publisher.publish_raw(b"2")
+        await until(lambda: calls == [b"1", b"2"])
+        with pytest.raises(LocalProtocolError, match="use publish_raw"):
+            publisher.publish("x")
+    assert "the user's mistake" in caplog.text
+
+
+async def test_another_md5_sum_is_told_to_both_sides(core: RosCore, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.WARNING)
+    async with node(core, "talker") as talker, node(core, "listener") as listener:
+        publisher = await talker.advertise("/t", "std_msgs/String")
+        subscriber = await listener.subscribe("/t", "std_msgs/Int32")
+        await until(lambda: subscriber.refusals)
+        assert "client [/listener] wants topic /t" in subscriber.refusals[talker.uri]
+        assert publisher.subscribers == 0
+    assert "client [/listener] wants topic /t" in caplog.text
+
+
+async def test_parameters(core: RosCore) -> None:
+    changes: list[tuple[str, object]] = []
+    async with (
+        node(core, "n", on_param_update=lambda key, value: changes.append((key, value))) as one,
+        node(core, "other") as other,
+    ):
+        await one.set_param("~gains", {"p": 1.5, "names": ["a", True]})
+        assert await other.get_param("/n/gains/p") == 1.5
+        assert await one.get_param("~gains") == {"p": 1.5, "names": ["a", True]}
+        assert await one.search_param("gains") == "/n/gains"
+        assert await one.search_param("nothing") is None
+        assert not await one.has_param("/nothing")
+        assert await one.get_param("/nothing", 7) == 7
+        with pytest.raises(PeerRefused, match="nothing"):
+            await one.get_param("/nothing")
+        assert await one.follow_param("~gains") == {"p": 1.5, "names": ["a", True]}
+        await other.set_param("/n/gains/p", 2.5)
+        await until(lambda: changes)
+        assert changes == [("/n/gains/p", 2.5)]
+        await one.delete_param("~gains")
+        assert not await one.has_param("~gains")
+
+
+async def test_nodes_survive_a_master_that_is_started_anew(core: RosCore) -> None:
+    async with node(core, "talker") as talker, node(core, "listener") as listener:
+        publisher = await talker.advertise("/t", "std_msgs/String")
+        got: list[Received] = []
+        subscriber = await listener.subscribe("/t", None, got.append)
+        await publisher.wait_for_subscriber()
+        port = core.port
+        await core.close()
+        publisher.publish(publisher.make("meanwhile"))
+        await until(lambda: len(got) == 1)
+        again = RosCore("127.0.0.1", port)
+        await again.start()
+        await until(lambda: again.state().publishers.get("/t") == {"/talker": talker.uri})
+        await until(lambda: again.state().subscribers.get("/t") == {"/listener": listener.uri})
+        publisher.publish(publisher.make("afterwards"))
+        await until(lambda: len(got) == 2)
+        assert [received.plain["data"] for received in got] == ["meanwhile", "afterwards"]
+        assert subscriber.publishers == 1
+        await talker.close()
+        await listener.close()
+        await again.close()
+
+
+async def test_the_master_ends_a_node_whose_name_is_taken(core: RosCore) -> None:
+    reasons: list[str] = []
+    async with node(core, "twin", on_shutdown=reasons.append) as first:
+        await first.advertise("/t", "std_msgs/String")
+        async with node(core, "twin") as second:
+            await second.advertise("/u", "std_msgs/String")
+            await asyncio.wait_for(first.stopped.wait(), DEADLINE)
+            await first.close()
+            assert len(reasons) == 1
+            assert core.state().publishers["/u"] == {"/twin": second.uri}
+            assert "/t" not in core.state().publishers
+
+
+async def test_no_master_is_a_clear_error() -> None:
+    core = RosCore("127.0.0.1", 0)
+    await core.start()
+    await core.close()
+    with pytest.raises(UnreachableError) as caught:
+        async with Node("n", master_uri=core.uri, environment=RosEnvironment()):
+            pass
+    assert f"no ROS master answers at {core.uri} (ROS_MASTER_URI); start one" in str(caught.value)
+
+
+async def test_unadvertised_and_unsubscribed(core: RosCore) -> None:
+    async with node(core, "n") as one:
+        publisher = await one.advertise("~out", "std_msgs/String")
+        subscriber = await one.subscribe("/in")
+        assert core.state().publishers["/n/out"] == {"/n": one.uri}
+        with pytest.raises(ValueError, match="publishes /n/out already"):
+            await one.advertise("/n/out", "std_msgs/String")
+        with pytest.raises(ValueError, match="subscribes to /in already"):
+            await one.subscribe("/in")
+        with pytest.raises(DefinitionError):
+            await one.advertise("/x", "no_msgs/Such")
+        await publisher.close()
+        await subscriber.close()
+        assert "/n/out" not in core.state().publishers
+        assert "/in" not in core.state().subscribers
+
+
+async def test_names_are_remapped_and_loopback_is_used_for_a_local_master(core: RosCore) -> None:
+    environment = RosEnvironment.read({"ROS_NAMESPACE": "robot"}, ["out:=there", "__name:=bob"], ["192.0.2.1"])
+    async with Node("n", master_uri=core.uri, environment=environment) as one:
+        await one.advertise("out", "std_msgs/String")
+        assert core.state().publishers["/robot/there"] == {"/robot/bob": one.uri}
+        assert one.uri.startswith("http://127.0.0.1:")
+        assert await call(one.uri, "getPublications", "/x") == [
+            1,
+            "publications",
+            [["/robot/there", "std_msgs/String"]],
+        ]
+
+
+async def test_closing_twice_is_closing_once(core: RosCore) -> None:
+    one = node(core, "n")
+    async with one:
+        await one.close()
+    await one.close()
+    assert one.stopped.is_set()
+    assert limits.NODE_MASTER_CHECK < 1

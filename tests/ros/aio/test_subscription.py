@@ -1,0 +1,273 @@
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.core import limits
+from rmpa.ros.aio.subscription import PublisherConnection, Subscription
+from rmpa.ros.tcpros import Description, encode_header, frame_message, publisher_header
+from tests.ros.aio.peers import MD5, STRING, RawPublisher, until
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Mapping
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "TCPROS_RETRY_FIRST", 0.001)
+    monkeypatch.setattr(limits, "TCPROS_RETRY_MAX", 0.01)
+
+
+@pytest.fixture
+async def publisher() -> AsyncIterator[RawPublisher]:
+    async with RawPublisher() as made:
+        yield made
+
+
+class Said:
+    """One connection to one publisher, and what it said."""
+
+    def __init__(self, uri: str, **options: str) -> None:
+        self.headers: list[Mapping[str, str]] = []
+        self.messages: list[bytes] = []
+        self.refused: list[str] = []
+        self.lost: list[str] = []
+        self.link = PublisherConnection(
+            "/t",
+            uri,
+            "/s",
+            on_header=self.headers.append,
+            on_message=lambda framed: self.messages.append(bytes(framed)),
+            on_refused=self.refused.append,
+            on_lost=self.lost.append,
+            type_name=options.get("type_name", "*"),
+            md5sum=options.get("md5sum", "*"),
+        )
+        self.link.start()
+
+    async def close(self) -> None:
+        self.link.close()
+        await self.link.closed()
+
+
+async def test_it_asks_for_tcpros_only_and_sends_its_header_at_once(publisher: RawPublisher) -> None:
+    said = Said(publisher.uri)
+    link, fields = await publisher.serve()
+    assert publisher.asked == [("/s", "/t", [["TCPROS"]])]
+    assert fields == {"callerid": "/s", "md5sum": "*", "tcp_nodelay": "1", "topic": "/t", "type": "*"}
+    await until(lambda: said.headers)
+    assert said.headers[0]["message_definition"] == "string data\n"
+    await said.close()
+    link.close()
+
+
+async def test_header_and_messages_in_one_segment_or_byte_by_byte(publisher: RawPublisher) -> None:
+    wire = encode_header(publisher_header("/t", "/p", STRING)) + frame_message(b"one") + frame_message(b"")
+    for chunk in (len(wire), 1):
+        said = Said(publisher.uri)
+        link = await publisher.accept()
+        await link.header()
+        for start in range(0, len(wire), chunk):
+            await link.send(wire[start : start + chunk])
+        await until(lambda: len(said.messages) == 2)  # noqa: B023 - awaited within the turn
+        assert said.messages == [b"\x03\x00\x00\x00one", b"\x00\x00\x00\x00"]
+        await said.close()
+        link.close()
+
+
+async def test_large_messages_come_whole(publisher: RawPublisher) -> None:
+    said = Said(publisher.uri)
+    link, _ = await publisher.serve()
+    payloads = [bytes([n]) * 1_000_000 for n in range(5)]
+    for payload in payloads:
+        await link.send(frame_message(payload))
+    await until(lambda: len(said.messages) == 5)
+    assert [m[4:] for m in said.messages] == payloads
+    connection = said.link.connection()
+    assert (connection.messages, connection.bytes, connection.connected) == (5, 5_000_020, True)
+    assert (connection.direction, connection.other) == ("i", publisher.uri)
+    await said.close()
+    link.close()
+
+
+async def test_a_lost_publisher_is_found_again_and_half_a_message_is_dropped(publisher: RawPublisher) -> None:
+    said = Said(publisher.uri)
+    link, _ = await publisher.serve()
+    await link.send(frame_message(b"whole") + b"\x10\x00\x00\x00half")
+    link.close()
+    again, _ = await publisher.serve()
+    await again.send(frame_message(b"after"))
+    await until(lambda: len(said.messages) == 2)
+    assert [m[4:] for m in said.messages] == [b"whole", b"after"]
+    assert said.lost == ["the publisher closed the connection"]
+    assert len(said.headers) == 2
+    await said.close()
+    again.close()
+
+
+async def test_an_unreachable_publisher_is_tried_for_ever() -> None:
+    async with RawPublisher() as gone:
+        uri = gone.uri
+    said = Said(uri)
+    await until(lambda: len(said.lost) > 5)
+    assert f"no XML-RPC server answers at {uri}" in said.lost[0]
+    assert not said.refused
+    await said.close()
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        [-1, "Not a publisher of [/t]", []],
+        [0, "no supported protocol", []],
+        [1, "ok", []],
+        [1, "ok", ["TCPROS", "127.0.0.1", "80"]],
+        [1, "ok", ["TCPROS", "127.0.0.1", 70000]],
+        [1, "ok", ["UDPROS", "127.0.0.1", 80]],
+        [1, "ok"],
+        "nonsense",
+    ],
+)
+async def test_a_publisher_that_is_not_ready_is_asked_again(
+    publisher: RawPublisher, answer: list[object] | str
+) -> None:
+    publisher.answer = answer  # type: ignore[assignment]  # what peers send has any shape
+    said = Said(publisher.uri)
+    await until(lambda: len(said.lost) > 2)
+    publisher.answer = None
+    link, _ = await publisher.serve()
+    await until(lambda: said.headers)
+    await said.close()
+    link.close()
+
+
+async def test_an_error_header_is_final(publisher: RawPublisher) -> None:
+    said = Said(publisher.uri)
+    link = await publisher.accept()
+    await link.header()
+    await link.send(encode_header({"error": "go away"}) + b"junk behind")
+    await until(lambda: said.refused)
+    await until(lambda: said.link.ended)
+    assert (said.refused, said.lost, said.messages) == (["go away"], [], [])
+    assert said.link.refused == "go away"
+    await said.close()
+    link.close()
+
+
+async def test_a_publisher_with_another_md5_sum_is_not_believed(publisher: RawPublisher) -> None:
+    publisher.description = Description("std_msgs/Int32", "0" * 32, "int32 data")
+    said = Said(publisher.uri, type_name="std_msgs/String", md5sum=MD5)
+    link, _ = await publisher.serve()
+    await link.send(frame_message(b"poison"))
+    await until(lambda: said.refused)
+    assert f"not [std_msgs/String/{MD5}]" in said.refused[0]
+    assert said.messages == []
+    await said.close()
+    link.close()
+
+
+@pytest.mark.parametrize("junk", [b"GET / HTTP/1.1\r\n", struct.pack("<II", 9, 5) + b"topic"])
+async def test_a_malformed_reply_is_a_loss(publisher: RawPublisher, junk: bytes) -> None:
+    said = Said(publisher.uri)
+    link = await publisher.accept()
+    await link.send(junk)
+    await until(lambda: said.lost)
+    assert "connection header" in said.lost[0]
+    assert not said.headers
+    await said.close()
+    link.close()
+
+
+async def test_a_message_beyond_the_limit_ends_the_connection(publisher: RawPublisher) -> None:
+    said = Said(publisher.uri)
+    link, _ = await publisher.serve()
+    await link.send(b"\xff\xff\xff\xff")
+    await until(lambda: said.lost)
+    assert "message of 4294967295 bytes exceeds the limit" in said.lost[0]
+    await said.close()
+    link.close()
+
+
+async def test_one_that_never_answers_is_given_up(publisher: RawPublisher, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "TCPROS_HANDSHAKE_TIMEOUT", 0.05)
+    said = Said(publisher.uri)
+    link = await publisher.accept()
+    await until(lambda: said.lost)
+    assert "no header from the publisher" in said.lost[0]
+    await said.close()
+    link.close()
+
+
+async def test_closed_from_within_a_message_no_other_comes(publisher: RawPublisher) -> None:
+    got: list[bytes] = []
+
+    def take(framed: memoryview) -> None:
+        got.append(bytes(framed))
+        connection.close()
+
+    connection = PublisherConnection("/t", publisher.uri, "/s", on_message=take)
+    connection.start()
+    link, _ = await publisher.serve()
+    await link.send(frame_message(b"one") + frame_message(b"two"))
+    await until(lambda: connection.ended)
+    assert got == [b"\x03\x00\x00\x00one"]
+    link.close()
+
+
+class Followed:
+    def __init__(self, own_uri: str = "") -> None:
+        self.messages: list[tuple[str, bytes]] = []
+        self.refused: list[str] = []
+        self.subscription = Subscription(
+            "/t",
+            "/s",
+            on_message=lambda link, framed: self.messages.append((link.uri, bytes(framed[4:]))),
+            on_refused=lambda _, text: self.refused.append(text),
+            own_uri=own_uri,
+        )
+
+    async def close(self) -> None:
+        self.subscription.close()
+        await self.subscription.closed()
+
+
+async def test_a_subscription_follows_the_list_of_publishers() -> None:
+    followed = Followed(own_uri="http://127.0.0.1:1/")
+    async with RawPublisher() as one, RawPublisher() as two:
+        followed.subscription.update([one.uri, two.uri, two.uri, "http://127.0.0.1:1/"])
+        first, second = (await one.serve())[0], (await two.serve())[0]
+        await first.send(frame_message(b"1"))
+        await second.send(frame_message(b"2"))
+        await until(lambda: len(followed.messages) == 2)
+        assert set(followed.messages) == {(one.uri, b"1"), (two.uri, b"2")}
+        assert followed.subscription.publishers == 2
+        followed.subscription.update([two.uri])
+        assert await first.ended()
+        followed.subscription.update([one.uri], keep=True)
+        third, _ = await one.serve()
+        await second.send(frame_message(b"still"))
+        await until(lambda: len(followed.messages) == 3)
+        assert len(one.asked) == 2
+        assert len(two.asked) == 1
+        for link in (first, second, third):
+            link.close()
+        await followed.close()
+
+
+async def test_a_publisher_that_refused_is_asked_again_when_it_is_named_again() -> None:
+    followed = Followed()
+    async with RawPublisher() as one:
+        followed.subscription.update([one.uri])
+        link = await one.accept()
+        await link.header()
+        await link.send(encode_header({"error": "not yet"}))
+        await until(lambda: followed.refused == ["not yet"])
+        followed.subscription.update([one.uri])
+        again, _ = await one.serve()
+        await again.send(frame_message(b"now"))
+        await until(lambda: followed.messages == [(one.uri, b"now")])
+        link.close()
+        again.close()
+        await followed.close()

@@ -1,0 +1,164 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from rmpa.ros.definitions import SEPARATOR, DefinitionError, known_types
+from rmpa.ros.messages import MessageError, MessageType, Plain
+
+JOY: Plain = {
+    "header": {"seq": 3, "stamp": {"secs": 1, "nsecs": 500_000_000}, "frame_id": "pad"},
+    "axes": [0.5, -1.0],
+    "buttons": [1, 0, 1],
+}
+JOY_BYTES = bytes.fromhex(
+    "03000000 01000000 0065cd1d 03000000 706164 02000000 0000003f 000080bf 03000000 010000000000000001000000"
+)
+
+
+def test_these_bytes() -> None:
+    kind = MessageType("sensor_msgs/Joy")
+    assert kind.serialize(kind.make(JOY)) == JOY_BYTES
+    assert kind.to_plain(kind.deserialize(JOY_BYTES)) == JOY
+
+
+def test_a_learnt_type_reads_the_same() -> None:
+    known = MessageType("sensor_msgs/Joy")
+    learnt = MessageType.learn(known.name, known.definition, known.md5sum)
+    assert learnt.to_plain(learnt.deserialize(JOY_BYTES)) == JOY
+    assert learnt.serialize(learnt.make(JOY)) == JOY_BYTES
+    assert MessageType.learn(known.name, known.definition) is learnt
+
+
+def test_a_learnt_type_with_all_there_is() -> None:
+    definition = (
+        "int32 lower=1\nstring TEXT=a'\"\\ # no comment\ntime[] times\nduration d\nbyte b\nchar c\nbool[2] flags\n"
+        f"string[] texts\nInner[] inner\nuint8[] data\nint64 class\nint8 self\n{SEPARATOR}\nMSG: my_msgs/Inner\n"
+        "float32 x # note\n"
+    )
+    kind = MessageType.learn("my_msgs/All", definition)
+    values: Plain = {
+        "times": [{"secs": 1, "nsecs": 2}],
+        "d": {"secs": -1, "nsecs": 5},
+        "b": 7,
+        "c": 8,
+        "flags": [True, False],
+        "texts": ["a", "ü"],
+        "inner": [{"x": 1.5}, {"x": 2.5}],
+        "data": [1, 2, 255],
+        "class": -5,
+        "self": -1,
+    }
+    raw = kind.serialize(kind.make(values))
+    assert kind.to_plain(kind.deserialize(raw)) == values
+    assert kind.to_plain(kind.make())["flags"] == [False, False]
+
+
+@pytest.mark.parametrize("name", known_types())
+def test_every_type_that_comes_with_us_can_be_made_and_read(name: str) -> None:
+    kind = MessageType(name)
+    message = kind.make()
+    assert kind.to_plain(kind.deserialize(kind.serialize(message))) == kind.to_plain(message)
+
+
+@pytest.mark.parametrize(
+    ("values", "plain"),
+    [
+        ("hello", {"data": "hello"}),
+        (["hello"], {"data": "hello"}),
+        ({"data": 7}, {"data": "7"}),
+        (None, {"data": ""}),
+    ],
+)
+def test_short_ways_to_write_a_message(values: Plain, plain: dict[str, Plain]) -> None:
+    kind = MessageType("std_msgs/String")
+    assert kind.to_plain(kind.make(values)) == plain
+
+
+def test_times_may_be_seconds_and_byte_arrays_text() -> None:
+    kind = MessageType("std_msgs/Header")
+    assert kind.to_plain(kind.make({"stamp": 1.25}))["stamp"] == {"secs": 1, "nsecs": 250_000_000}
+    array = MessageType("std_msgs/UInt8MultiArray")
+    assert array.to_plain(array.make({"data": "ab"}))["data"] == [97, 98]
+
+
+@pytest.mark.parametrize(
+    ("values", "error"),
+    [
+        ({"axs": []}, "sensor_msgs/Joy has no field 'axs'; it has header, axes, buttons"),
+        ({"header": {"stmp": 1}}, "header has no field 'stmp'"),
+        ({"axes": 1}, "axes is a list of float32, not 1"),
+        ({"axes": ["x"]}, "axes is a float32, not 'x'"),
+        ({"buttons": [1.5]}, "buttons is a int32, not 1.5"),
+        ({"buttons": [1 << 31]}, "buttons: 2147483648 does not fit int32"),
+        ({"header": {"stamp": "now"}}, "header.stamp is a time"),
+        ({"header": {"frame_id": [1]}}, "header.frame_id is a string, not [1]"),
+        ([1, 2], "sensor_msgs/Joy has 3 fields, not 2"),
+        (7, "sensor_msgs/Joy is made of the fields header, axes, buttons, not of 7"),
+    ],
+)
+def test_values_that_do_not_fit_are_named(values: Plain, error: str) -> None:
+    with pytest.raises(MessageError) as caught:
+        MessageType("sensor_msgs/Joy").make(values)
+    assert error in str(caught.value)
+
+
+def test_fixed_arrays_have_their_size() -> None:
+    kind = MessageType("geometry_msgs/PoseWithCovariance")
+    assert kind.to_plain(kind.make())["covariance"] == [0.0] * 36
+    with pytest.raises(MessageError, match="covariance has 36 elements, not 1"):
+        kind.make({"covariance": [1.0]})
+
+
+@pytest.mark.parametrize("raw", [b"", JOY_BYTES[:-1], JOY_BYTES + b"x", b"\xff" * 40])
+def test_bytes_that_are_no_message(raw: bytes) -> None:
+    with pytest.raises(MessageError, match="bytes are not a sensor_msgs/Joy"):
+        MessageType("sensor_msgs/Joy").deserialize(raw)
+
+
+def test_an_object_that_is_no_message() -> None:
+    with pytest.raises(MessageError, match="cannot serialize a sensor_msgs/Joy"):
+        MessageType("sensor_msgs/Joy").serialize("joy")
+
+
+def test_types_from_headers() -> None:
+    known = MessageType("std_msgs/Empty")
+    fields = {"type": known.name, "md5sum": known.md5sum, "message_definition": ""}
+    assert MessageType.from_header(fields).serialize(MessageType.from_header(fields).make()) == b""
+    string = MessageType("std_msgs/String")
+    assert MessageType.from_header({"type": string.name, "md5sum": string.md5sum}).md5sum == string.md5sum
+    with pytest.raises(DefinitionError, match="another version of it"):
+        MessageType.from_header({"type": string.name, "md5sum": "0" * 32})
+    with pytest.raises(DefinitionError, match="its publisher says 0000"):
+        MessageType.from_header({"type": "a/B", "md5sum": "0" * 32, "message_definition": "int32 x"})
+    with pytest.raises(DefinitionError, match="is not one that comes with rmpa"):
+        MessageType("my_msgs/Nothing")
+
+
+def test_sums_are_those_of_rosbags() -> None:
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    compared = 0
+    for name in known_types():
+        inner = name.replace("/", "/msg/")
+        if inner in store.fielddefs:
+            assert store.generate_msgdef(inner)[1] == MessageType(name).md5sum, name
+            compared += 1
+    assert compared > 150
+
+
+def test_the_agents_part_of_ros_starts_without_numpy() -> None:
+    program = (
+        "import pkgutil, sys, importlib, rmpa.ros, rmpa.ros.aio\n"
+        "for room in (rmpa.ros, rmpa.ros.aio):\n"
+        "    for module in pkgutil.iter_modules(room.__path__, room.__name__ + '.'):\n"
+        "        importlib.import_module(module.name)\n"
+        "from rmpa.ros.messages import MessageType\n"
+        "MessageType('sensor_msgs/Joy').describe()\n"
+        "print(sorted({'numpy', 'rosbags', 'rich'} & sys.modules.keys()))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout == "[]\n"
