@@ -98,14 +98,14 @@ class RosCore:
                 raise
 
     async def close(self) -> None:
-        """End: /rosout first, then what looks after the nodes, then the server."""
+        """End: /rosout first, then what calls the nodes, then the server."""
         rosout, self._rosout = self._rosout, None
         if rosout is not None:
             await rosout.close()
-        if self._liveness is not None:
-            await self._liveness.close()
         if self._notifier is not None:
             await self._notifier.close()
+        if self._liveness is not None:
+            await self._liveness.close()
         await self._server.close()
 
     @property

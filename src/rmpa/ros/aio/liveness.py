@@ -61,13 +61,15 @@ class Liveness:
         self._interval = interval
         self._rounds: asyncio.Task[None] | None = None
         self._checks: dict[str, asyncio.Task[None]] = {}
+        self._closed = False
 
     def start(self) -> None:
         """Look from now on."""
         self._rounds = asyncio.get_running_loop().create_task(self._go_round(), name="node liveness")
 
     async def close(self) -> None:
-        """Look no longer."""
+        """Look no longer; later suspicions are not heard."""
+        self._closed = True
         tasks = [*self._checks.values()]
         if self._rounds is not None:
             tasks.append(self._rounds)
@@ -78,7 +80,7 @@ class Liveness:
     def suspect(self, node: str) -> None:
         """Check one node now."""
         api = self._nodes().get(node)
-        if api is None or node in self._checks:
+        if api is None or node in self._checks or self._closed:
             return
         task = asyncio.get_running_loop().create_task(self._check(node, api), name=f"check {node}")
         self._checks[node] = task

@@ -1,0 +1,222 @@
+"""The stock tools against a core: what they print beside our core is what they print beside the real one."""
+
+from __future__ import annotations
+
+import re
+import sys
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from tests.interop.processes import Process, eventually
+from tests.interop.ros import Ros, free_port
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from tests.interop.conftest import ShellFactory
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(240)]
+
+RUN: Final = "from rmpa.cli.core import core; core()"
+DEADLINE: Final = 40.0
+LAUNCH: Final = """<launch>
+  <param name="speed" value="1.5"/>
+  <rosparam>{gains: {p: 1, i: 0.5}, names: [a, b], enabled: true}</rosparam>
+  <group ns="left">
+    <node pkg="topic_tools" type="relay" name="relay" args="/in out">
+      <param name="lazy" value="true"/>
+    </node>
+  </group>
+  <group ns="right">
+    <node pkg="topic_tools" type="relay" name="relay" args="/in out"/>
+  </group>
+</launch>
+"""
+
+
+def start_ours(ros: Ros) -> Process:
+    process = ros.start(sys.executable, "-c", RUN, "-p", str(ros.port), name="rmpa core")
+    process.wait_for("started core service", DEADLINE)
+    return process
+
+
+def start_real(ros: Ros) -> Process:
+    process = ros.roscore()
+    eventually(lambda: "/rosout_agg" in ros.tool("rostopic", "list"), what="/rosout")
+    return process
+
+
+def normal(text: str) -> list[str]:
+    """A tool's lines, without what differs from run to run."""
+    text = re.sub(r"127\.0\.0\.1:\d+|localhost:\d+", "HOST:PORT", text)
+    text = re.sub(r"(?i)pid: \d+|\bport \d+|\[[^ ]*:\d+\]|time=[\d.]+ms|average: [\d.]+ms", "#", text)
+    text = re.sub(r"[0-9a-f]{8}-[0-9a-f-]{27}|_\d+_\d+\b|\d{10}\.\d+|(n?secs): \d+", "#", text)
+    return [line.rstrip() for line in text.splitlines() if line.strip()]
+
+
+def both(shell: ShellFactory, scenario: Callable[[Ros], dict[str, str]]) -> None:
+    """Play a scenario beside the real core and beside ours; every output must be the same."""
+    outputs = []
+    for start in (start_real, start_ours):
+        with shell(port=free_port()) as ros:
+            start(ros)
+            outputs.append(scenario(ros))
+    theirs, ours = outputs
+    assert ours.keys() == theirs.keys()
+    for what, text in theirs.items():
+        assert normal(ours[what]) == normal(text), what
+
+
+def test_topics_nodes_and_services(shell: ShellFactory) -> None:
+    def scenario(ros: Ros) -> dict[str, str]:
+        listener = ros.roscpp("listener", "__name:=listener", topic="/chatter", count=5)
+        listener.wait_event("up", DEADLINE)
+        talker = ros.rospy("talker", "__name:=talker", topic="/chatter", rate=100, count=5, wait=1)
+        listener.wait_event("done", DEADLINE)
+        found = {
+            " ".join(words): ros.tool(*words, timeout=DEADLINE)
+            for words in (
+                ("rosnode", "list"),
+                ("rosnode", "ping", "-c", "1", "/talker"),
+                ("rosnode", "ping", "-c", "1", "/listener"),
+                ("rosnode", "machine", "127.0.0.1"),
+                ("rostopic", "list"),
+                ("rostopic", "list", "-v"),
+                ("rostopic", "info", "/chatter"),
+                ("rostopic", "type", "/chatter"),
+                ("rostopic", "find", "std_msgs/Header"),
+                ("rosservice", "list"),
+                ("rosservice", "info", "/talker/get_loggers"),
+                ("rosservice", "type", "/talker/get_loggers"),
+                ("rosservice", "call", "/talker/set_logger_level", "rosout", "debug"),
+            )
+        }
+        # Ours has no logger services of its own /rosout: they would be of no use.
+        for listing in ("rosservice list",):
+            found[listing] = "\n".join(
+                line for line in found[listing].splitlines() if not line.startswith("/rosout/")
+            )
+        for node in ("/talker", "/listener"):
+            info = ros.tool("rosnode", "info", node)
+            found[f"info {node}"] = "\n".join(sorted(info.splitlines()))
+        listener.kill()
+        talker.terminate()
+        eventually(lambda: "/talker" not in ros.tool("rosnode", "list"), what="/talker to unregister")
+        return found
+
+    both(shell, scenario)
+
+
+def test_parameters(shell: ShellFactory, tmp_path: Path) -> None:
+    source = tmp_path / "in.yaml"
+    source.write_text("a: {b: 1, c: [1, two, 3.5], d: {}}\nt: 'text <&> ü'\n", encoding="utf-8")
+
+    def scenario(ros: Ros) -> dict[str, str]:
+        def param(*words: str) -> str:
+            return ros.tool("rosparam", *words)
+
+        found = {
+            "set": param("set", "/x/y", "{z: 1.5, w: true}"),
+            "get": param("get", "/x"),
+            "load": param("load", str(source), "/loaded"),
+            "get loaded": param("get", "/loaded"),
+            "list": param("list", "/loaded"),
+            "delete": param("delete", "/x/y/z"),
+            "dump": param("dump", str(ros.home / "dump.yaml"), "/"),
+        }
+        found["dumped"] = (ros.home / "dump.yaml").read_text("utf-8")
+        found["dumped"] = re.sub(
+            r"(?s)^roslaunch:.*?(?=^\w)|^run_id:.*?\n|^rosdistro: .*?'\n", "", found["dumped"], flags=re.MULTILINE
+        )
+        return found
+
+    both(shell, scenario)
+
+
+def test_launch(shell: ShellFactory, tmp_path: Path) -> None:
+    launch = tmp_path / "two.launch"
+    launch.write_text(LAUNCH)
+
+    def scenario(ros: Ros) -> dict[str, str]:
+        process = ros.start("roslaunch", str(launch), name="roslaunch")
+        eventually(
+            lambda: {"/left/relay", "/right/relay"} <= set(ros.tool("rosnode", "list").split()),
+            DEADLINE,
+            what="relays",
+        )
+        found = {
+            "nodes": ros.tool("rosnode", "list"),
+            "gains": ros.tool("rosparam", "get", "/gains"),
+            "private": ros.tool("rosparam", "get", "/left/relay/lazy"),
+        }
+        process.interrupt(DEADLINE)
+        found["after"] = "\n".join(line for line in ros.tool("rosnode", "list").splitlines() if "relay" not in line)
+        assert "started core service" not in process.output
+        return found
+
+    both(shell, scenario)
+
+
+def test_pub_echo_and_bag(shell: ShellFactory) -> None:
+    def scenario(ros: Ros) -> dict[str, str]:
+        record = ros.start("rosbag", "record", "-O", str(ros.home / "b.bag"), "/t", "__name:=record", name="rosbag")
+        eventually(lambda: "/record" in ros.tool("rosnode", "list"), DEADLINE, what="rosbag")
+        echo = ros.start("rostopic", "echo", "-n", "1", "/t", name="echo")
+        pub = ros.start("rostopic", "pub", "-r", "20", "/t", "std_msgs/String", "data: hello", name="pub")
+        assert echo.wait(DEADLINE) == 0
+        eventually((ros.home / "b.bag.active").exists, DEADLINE, what="the bag")
+        pub.interrupt(DEADLINE)
+        record.interrupt(DEADLINE)
+        info = ros.tool("rosbag", "info", "-y", "-k", "topics", str(ros.home / "b.bag"))
+        heard = "\n".join(line for line in echo.output.splitlines() if not line.startswith("WARNING"))
+        return {"echo": heard, "bag": re.sub(r"(messages|frequency): [\d.]+", "", info)}
+
+    both(shell, scenario)
+
+
+def test_wtf_finds_nothing_about_the_core(shell: ShellFactory) -> None:
+    with shell(port=free_port()) as ros:
+        start_ours(ros)
+        talker = ros.roscpp("talker", topic="/chatter", rate=10, count=0)
+        eventually(lambda: "/chatter" in ros.tool("rostopic", "list"), DEADLINE, what="the talker")
+        output = ros.tool("roswtf", timeout=DEADLINE)
+        talker.terminate()
+    assert "No errors or warnings" in output.partition("Online checks summary")[2], output
+
+
+def test_cleanup_finds_nothing_left_to_do(shell: ShellFactory) -> None:
+    """A killed node is gone by itself; until then `rosnode cleanup` finds it as it does beside rosmaster."""
+    with shell(port=free_port()) as ros:
+        start_ours(ros)
+        talker = ros.rospy("talker", "__name:=victim", topic="/chatter", rate=10, count=0)
+        eventually(lambda: "/victim" in ros.tool("rosnode", "list"), DEADLINE, what="the victim")
+        talker.kill()
+        eventually(lambda: "/victim" not in ros.tool("rosnode", "list"), DEADLINE, what="the victim's purge")
+        assert "/chatter" not in ros.tool("rostopic", "list")
+
+
+def test_what_nodes_log_arrives_at_rosout_agg(shell: ShellFactory) -> None:
+    with shell(port=free_port()) as ros:
+        start_ours(ros)
+        echo = ros.start("rostopic", "echo", "/rosout_agg", name="echo")
+        eventually(lambda: "Subscribers:" in ros.tool("rostopic", "info", "/rosout_agg"), what="echo")
+        bump = ros.tool("rosservice", "list")
+        assert "/rosout" in ros.tool("rosnode", "list"), bump
+        script = (
+            "import rospy\nrospy.init_node('speaker')\nr = rospy.Rate(20)\n"
+            "while not rospy.is_shutdown():\n    rospy.logwarn('heard me')\n    r.sleep()\n"
+        )
+        speaker = ros.start("/usr/bin/python3", "-c", script, name="speaker")
+        echo.wait_for("heard me", DEADLINE)
+        speaker.terminate(DEADLINE)
+
+
+def test_a_second_core_says_so(shell: ShellFactory) -> None:
+    with shell(port=free_port()) as ros:
+        first = start_ours(ros)
+        second = ros.start(sys.executable, "-c", RUN, "-p", str(ros.port))
+        assert second.wait(DEADLINE) == 1
+        assert f"port {ros.port} is already in use" in second.output
+        assert first.terminate(DEADLINE) == 0
