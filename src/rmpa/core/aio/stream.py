@@ -7,16 +7,15 @@ keeps to ``core.outbox`` and costs one system call a message each way.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
+import socket
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from rmpa.core import limits
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import URGENT, Outbox
-
-if TYPE_CHECKING:
-    import socket
 
 _log = logging.getLogger(__name__)
 
@@ -54,6 +53,7 @@ class Stream:
         self._filled = 0
         self._wanted = 0
         self._writing = False
+        self._finishing = False
         self._closed = False
         self._drained: asyncio.Future[None] | None = None
         self._report: asyncio.Handle | None = None
@@ -99,7 +99,7 @@ class Stream:
         Returns:
             How many older messages, of any key, were dropped to make room.
         """
-        if self._closed:
+        if self._closed or self._finishing:
             return 0
         if self._writing:
             return self._queue(b"".join(parts), key)
@@ -130,6 +130,16 @@ class Stream:
             self._report = None
         self._shut()
 
+    def finish(self) -> None:
+        """Send no more: when all that waits has left, the other side reads an end; ours goes on reading.
+
+        Not for ROS connections: rospy and roscpp take a half-closed socket for dead.
+        """
+        if not self._finishing:
+            self._finishing = True
+            if not self._writing:
+                self._shut_write()
+
     async def drained(self, within: float = limits.DRAIN_TIMEOUT) -> None:
         """Wait until all that was sent has left, the stream is closed, or ``within`` seconds are over."""
         if self._closed or not self._writing:
@@ -156,6 +166,11 @@ class Stream:
         self._buffer = bytearray()
         self._outbox.clear()
         self._done_draining()
+
+    def _shut_write(self) -> None:
+        if not self._closed:
+            with contextlib.suppress(OSError):  # the other side may be gone; the reader will notice
+                self._sock.shutdown(socket.SHUT_WR)
 
     def _done_draining(self) -> None:
         if self._drained is not None and not self._drained.done():
@@ -231,6 +246,8 @@ class Stream:
         if not self._outbox:
             self._writing = False
             self._loop.remove_writer(self._fd)
+            if self._finishing:
+                self._shut_write()
             self._done_draining()
 
 

@@ -310,6 +310,7 @@ class MeshLink:
         if self._machine.state is State.CLOSING and not self._leaving:
             # Closing at once would turn what the other side still sends into a reset that overtakes our bye.
             self._leaving = True
+            self._stream.finish()
             self._arm()
 
     def _check_urgent(self) -> None:
