@@ -51,11 +51,7 @@ class MeshScenario(Scenario):
                 assert remote is not None
                 remotes.append(remote.instance)
                 other = living[remote.instance]
-                twins = [
-                    twin
-                    for twin in other.links.values()
-                    if twin.end is link.end.other and twin.machine.remote.instance == peer.identity.instance
-                ]
+                twins = [twin for twin in other.links.values() if twin.up and twin.end is link.end.other]
                 assert len(twins) == 1, f"{peer.name} and {other.name} mean different links"
                 if self.calm and peer.identity.guid < other.identity.guid:
                     assert link.expected is not None, f"{peer.name} did not dial {other.name}"

@@ -10,7 +10,9 @@ import os
 
 import pytest
 
+from rmpa.core import limits
 from tests.simulation.mesh_scenario import MeshScenario
+from tests.simulation.network import Weather
 
 FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
 BLOCK = 25
@@ -37,6 +39,24 @@ def test_a_network_of_fifty_is_linked_after_healing(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(10))
 def test_where_both_can_dial_the_lower_guid_did(seed: int, count: int) -> None:
     MeshScenario(seed, count, calm=True).play()
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_calls_that_cross_leave_the_lower_guids_link_and_no_flapping(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "DIAL_FALLBACK", 0.0)  # the higher GUID does not wait: calls cross
+    scenario = MeshScenario(seed, 3, keep=True, calm=True)
+    scenario.network.weather = Weather(delay=(0.1, 0.4))
+    for peer in scenario.peers:
+        scenario.world.after(0, peer.start)
+    scenario.world.run(scenario.world.now + 25)
+    crossed = [line for line in scenario.world.lines if "> dials" in line]
+    assert len(crossed) > 3, "no calls crossed"
+    scenario.check()
+    # The bye on one stream may overtake the welcome on the other; nothing else makes a link fall here.
+    fell = [line for line in scenario.world.lines if " down " in line]
+    assert all("replaced" in line or "linked already" in line for line in fell), fell
 
 
 @pytest.mark.parametrize("seed", range(5))
