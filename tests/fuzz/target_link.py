@@ -51,16 +51,20 @@ def _feed(role: Role, pieces: list[bytes]) -> tuple[str, int, int]:
         data += len(payload)
 
     link = Link(role, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event, on_data=on_data)
+
+    def closed() -> bool:
+        return link.state is State.CLOSED
+
     kept = b""
     for piece in pieces:
-        if link.state is State.CLOSED:
+        if closed():
             break
         kept += piece
         try:
             consumed, wanted = link.receive(memoryview(kept), 0.0)
         except RemoteProtocolError as error:
             str(error)
-            if link.state is not State.CLOSED:
+            if not closed():
                 raise AssertionError("a broken protocol left the link open") from None
             break
         if not 0 <= consumed <= len(kept) or wanted < 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given
@@ -10,9 +11,11 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.guid import Guid
-from rmpa.core.identity import Identity
 from rmpa.mesh.handshake import HandshakeError, Hello, KnownLink, Refusal, Refuse, judge, judge_welcome
 from tests.mesh.worlds import HIGH, LOW
+
+if TYPE_CHECKING:
+    from rmpa.core.identity import Identity
 
 HELLO = Hello(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base", 5, 1000, Guid.of("10.0.0.2", 2), features=9)
 WIRE = bytes.fromhex(

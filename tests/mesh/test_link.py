@@ -47,14 +47,14 @@ def test_handshake_control_data_and_bye_in_pieces(chunk: int) -> None:
     control = dialler.link.control(b'{"op":"x"}')
     data = [pack_data_header(n, 7, i, 99) + bytes(n) for i, n in enumerate([0, 1, 300])]
     deliver(control + b"".join(data), acceptor.link, time.now, chunk)
-    assert acceptor.events[-1] == ControlReceived(b'{"op":"x"}')
+    assert acceptor.last() == ControlReceived(b'{"op":"x"}')
     assert acceptor.data == [(7, 0, 99, b""), (7, 1, 99, bytes(1)), (7, 2, 99, bytes(300))]
     dialler.link.close("shutting down", time.now)
     assert dialler.link.state is State.CLOSING
     deliver(dialler.link.take_output(), acceptor.link, time.now, chunk)
-    assert acceptor.events[-1] == Closed("low left: shutting down", orderly=True)
+    assert acceptor.last() == Closed("low left: shutting down", orderly=True)
     dialler.link.drained()
-    assert dialler.events[-1] == Closed("shutting down", orderly=True)
+    assert dialler.last() == Closed("shutting down", orderly=True)
 
 
 def test_every_split_of_the_handshake_in_two_is_the_same() -> None:
@@ -87,12 +87,12 @@ def test_a_refusal_reaches_the_dialler_and_both_end() -> None:
     deliver(dialler.link.take_output(), acceptor.link, time.now)
     refuse = Refuse(Refusal.BUSY, "come later")
     acceptor.link.refuse(refuse, time.now)
-    assert acceptor.events[-1] == Refused(refuse, by_us=True)
+    assert acceptor.last() == Refused(refuse, by_us=True)
     assert acceptor.link.state is State.CLOSING
     deliver(acceptor.link.take_output(), dialler.link, time.now)
     assert dialler.events == [Refused(refuse, by_us=False), Closed("? refused: busy: come later", orderly=True)]
     acceptor.link.drained()
-    assert acceptor.events[-1] == Closed("refused: busy: come later", orderly=True)
+    assert acceptor.last() == Closed("refused: busy: come later", orderly=True)
 
 
 def with_byte(data: bytes, offset: int, value: int) -> bytes:
@@ -226,7 +226,7 @@ def test_silence_for_the_others_lease_ends_the_link() -> None:
     assert dialler.link.state is State.UP
     time.now += 0.001
     dialler.link.handle_timer(time.now)
-    assert dialler.events[-1] == Closed("high was silent for its lease of 2 s", orderly=False)
+    assert dialler.last() == Closed("high was silent for its lease of 2 s", orderly=False)
     assert dialler.link.next_timer() is None
 
 
@@ -268,7 +268,7 @@ def test_what_comes_while_leaving_is_ignored_and_the_drain_ends_in_time() -> Non
     assert not any(isinstance(e, ControlReceived) for e in dialler.events)
     time.now += limits.DRAIN_TIMEOUT
     dialler.link.handle_timer(time.now)
-    assert dialler.events[-1] == Closed("done", orderly=True)
+    assert dialler.last() == Closed("done", orderly=True)
 
 
 def test_the_driver_loses_the_connection() -> None:
@@ -276,7 +276,7 @@ def test_the_driver_loses_the_connection() -> None:
     dialler, _ = pair(time)
     dialler.link.lost("reset by peer")
     dialler.link.lost("twice")
-    assert dialler.events[-1] == Closed("reset by peer", orderly=False)
+    assert dialler.last() == Closed("reset by peer", orderly=False)
     assert sum(isinstance(e, Closed) for e in dialler.events) == 1
 
 

@@ -22,6 +22,9 @@ class Side:
     events: list[Event] = field(default_factory=list)
     data: list[tuple[int, int, int, bytes]] = field(default_factory=list)
 
+    def last(self) -> Event:
+        return self.events[-1]
+
 
 class Time:
     """A clock that tests move."""

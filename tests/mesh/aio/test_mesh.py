@@ -6,18 +6,22 @@ import asyncio
 import errno
 import hashlib
 import socket
-from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING
 
 import pytest
 
 from rmpa.core import limits
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
-from rmpa.mesh.aio.link import MeshLink
 from rmpa.mesh.aio.mesh import Mesh
 from rmpa.mesh.frames import Frame, Kind
 from rmpa.mesh.handshake import Hello, Refusal, Refuse
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from rmpa.mesh.aio.link import MeshLink
 
 DEADLINE = 20.0
 
@@ -111,9 +115,9 @@ async def test_a_full_mesh_with_one_link_a_pair(count: int) -> None:
         await until(lambda: all(p.linked(*(o for o in made if o is not p)) for p in made), "a full mesh")
         for peer in made:
             assert len(peer.mesh.links()) == count - 1
-            for link in peer.mesh.links():
-                assert link.guid is not None
-                assert link.dialled == (peer.identity.guid < link.guid)
+            for status in peer.mesh.links():
+                assert status.guid is not None
+                assert status.dialled == (peer.identity.guid < status.guid)
             assert {s.state for s in peer.mesh.peers()} == {"linked"}
         link = made[0].link(made[1])
         await until(lambda: link.rtt is not None, "a round trip")

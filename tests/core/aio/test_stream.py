@@ -1,0 +1,234 @@
+"""The stream on a socket pair."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+import socket
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rmpa.core import limits
+from rmpa.core.aio.stream import Stream
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.outbox import URGENT, Outbox
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(20):
+        while not condition():
+            await asyncio.sleep(0.001)
+
+
+class End:
+    """A stream of messages with a length of 4 bytes in front."""
+
+    def __init__(self, sock: socket.socket, outbox: Outbox | None = None) -> None:
+        sock.setblocking(False)
+        self.got: list[bytes] = []
+        self.ends: list[Exception | None] = []
+        self.offered: list[int] = []
+        self.on_message: Callable[[bytes], None] = self.got.append
+        box = Outbox(1 << 20, 1 << 30) if outbox is None else outbox
+        self.stream = Stream(sock, on_bytes=self.take, on_close=self.ends.append, outbox=box)
+
+    def take(self, view: memoryview) -> tuple[int, int]:
+        self.offered.append(len(view))
+        at = 0
+        while len(view) - at >= 4:
+            size = int.from_bytes(view[at : at + 4], "big")
+            if size == 0xFFFFFFFF:
+                raise RemoteProtocolError("no such length")
+            if len(view) - at - 4 < size:
+                return at, 4 + size
+            self.on_message(bytes(view[at + 4 : at + 4 + size]))
+            at += 4 + size
+        return at, 0
+
+    def send(self, data: bytes, key: int = 1) -> int:
+        return self.stream.send([len(data).to_bytes(4, "big"), memoryview(data)], key)
+
+
+@pytest.fixture
+def sockets() -> Iterator[tuple[socket.socket, socket.socket]]:
+    listener = socket.create_server(("127.0.0.1", 0))
+    one = socket.create_connection(listener.getsockname())
+    other, _ = listener.accept()
+    listener.close()
+    yield one, other
+    one.close()
+    other.close()
+
+
+Sockets = tuple[socket.socket, socket.socket]
+
+
+async def test_all_sizes_in_order_both_ways_through_full_buffers(sockets: Sockets) -> None:
+    one, other = End(sockets[0]), End(sockets[1])
+    sizes = [0, 1, 3, 100, 65532, 65533, 200_000, 3 * limits.MIB, 5, 9 * limits.MIB, 7] * 2
+    messages = [bytes([i]) * size for i, size in enumerate(sizes)]
+    for message in messages:
+        one.send(message)
+        other.send(message[::-1])
+    await until(lambda: len(one.got) == len(other.got) == len(messages))
+    assert other.got == one.got == messages
+    assert one.stream.bytes_out == other.stream.bytes_in == sum(sizes) + 4 * len(sizes)
+    assert not one.stream.pending_bytes
+    assert len(one.stream._buffer) <= 4 * limits.MIB, "a large buffer is given back"
+    one.stream.close()
+    other.stream.close()
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    sizes=st.lists(st.one_of(st.integers(0, 300), st.integers(60_000, 300_000)), max_size=12),
+    cut=st.integers(1, 9999),
+)
+def test_any_messages_in_any_pieces(sizes: list[int], cut: int) -> None:
+    messages = [bytes([i]) * size for i, size in enumerate(sizes)]
+    wire = b"".join(len(m).to_bytes(4, "big") + m for m in messages)
+
+    async def run() -> list[bytes]:
+        left, right = socket.socketpair()
+        end = End(right)
+        for start in range(0, len(wire), cut):
+            end.stream.feed(wire[start : start + cut])
+        end.stream.close()
+        left.close()
+        return end.got
+
+    assert asyncio.run(run()) == messages
+
+
+async def test_a_claim_is_not_allocated(sockets: Sockets) -> None:
+    end = End(sockets[1])
+    sockets[0].sendall((200 * limits.MIB).to_bytes(4, "big") + bytes(1000))
+    await until(lambda: end.stream.bytes_in == 1004)
+    assert len(end.stream._buffer) <= 64 * limits.KIB
+    before = end.stream.last_in
+    offered = len(end.offered)
+    sockets[0].sendall(bytes(10))
+    await until(lambda: end.stream.bytes_in == 1014)
+    assert end.stream.last_in > before
+    assert len(end.offered) == offered, "half a message is not offered again and again"
+    end.stream.close()
+
+
+async def test_a_slow_reader_costs_bounded_memory_and_gets_whole_messages(sockets: Sockets) -> None:
+    sockets[0].setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
+    sockets[1].setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
+    one = End(sockets[0], Outbox(10, 4 * limits.MIB))
+    dropped = sum(one.send(b"%06d" % i + bytes(100_000)) for i in range(300))
+    one.send(b"urgent", URGENT)
+    assert dropped > 100
+    assert one.stream.pending_bytes <= 4 * limits.MIB
+    other = End(sockets[1])
+    await until(lambda: not one.stream.pending_bytes and one.stream.bytes_out == other.stream.bytes_in)
+    numbers = [int(m[:6]) for m in other.got if m != b"urgent"]
+    assert numbers == sorted(numbers)
+    assert len(numbers) == 300 - dropped
+    assert numbers[-1] == 299
+    assert b"urgent" in other.got[:-5]
+    one.stream.close()
+    other.stream.close()
+
+
+async def test_ends_are_told_once_and_not_after_close(sockets: Sockets) -> None:
+    one, other = End(sockets[0]), End(sockets[1])
+    one.stream.close()
+    one.stream.close()
+    await until(lambda: other.ends == [None])
+    assert other.stream.closed
+    assert other.send(b"x") == 0
+    other.stream.feed(b"x")
+    assert one.ends == []
+
+
+async def test_finish_lets_what_waits_leave_and_reads_on(sockets: Sockets) -> None:
+    one = End(sockets[0])
+    one.send(bytes(8 * limits.MIB))
+    one.stream.finish()
+    assert one.send(b"late") == 0
+    other = End(sockets[1])
+    await until(lambda: other.ends == [None])
+    assert len(other.got) == 1
+    await until(lambda: one.ends == [None])
+
+
+async def test_a_failed_send_is_told_from_the_loop(sockets: Sockets) -> None:
+    one = End(sockets[0])
+
+    class Broken:
+        def sendmsg(self, _parts: object) -> int:
+            raise OSError(errno.EPIPE, "Broken pipe")
+
+        def close(self) -> None:
+            sockets[0].close()
+
+    one.stream._sock = Broken()  # type: ignore[assignment]
+    assert one.send(b"x") == 0
+    assert one.ends == []
+    assert one.stream.closed
+    await until(lambda: len(one.ends) == 1)
+    assert isinstance(one.ends[0], OSError)
+
+
+async def test_close_after_a_failed_send_is_silent(sockets: Sockets) -> None:
+    one = End(sockets[0])
+    one.stream._lost(OSError())
+    one.stream.close()
+    await asyncio.sleep(0)
+    assert one.ends == []
+
+
+async def test_a_protocol_error_and_a_bug_close_the_connection(
+    sockets: Sockets, caplog: pytest.LogCaptureFixture
+) -> None:
+    one, other = End(sockets[0]), End(sockets[1])
+
+    def bug(_message: bytes) -> None:
+        raise ZeroDivisionError
+
+    one.on_message = bug
+    sockets[0].setblocking(False)
+    with caplog.at_level(logging.ERROR):
+        other.send(b"x")
+        await until(lambda: len(one.ends) == 1)
+    assert isinstance(one.ends[0], ZeroDivisionError)
+    assert "a reader of bytes failed" in caplog.text
+    await until(lambda: len(other.ends) == 1)
+
+
+async def test_garbage_ends_with_its_error(sockets: Sockets) -> None:
+    one = End(sockets[0])
+    sockets[1].sendall(b"\xff" * 4)
+    await until(lambda: len(one.ends) == 1)
+    assert isinstance(one.ends[0], RemoteProtocolError)
+
+
+async def test_closing_from_within_a_callback(sockets: Sockets) -> None:
+    one = End(sockets[0])
+    one.on_message = lambda _m: one.stream.close()
+    sockets[1].sendall(b"\0\0\0\1x" * 3)
+    await until(lambda: one.stream.closed)
+    assert one.ends == []
+
+
+async def test_drained_waits_for_the_last_byte_and_not_for_ever(sockets: Sockets) -> None:
+    one = End(sockets[0])
+    await one.stream.drained()
+    one.send(bytes(16 * limits.MIB))
+    await one.stream.drained(0.01)
+    assert one.stream.pending_bytes
+    other = End(sockets[1])
+    await asyncio.gather(one.stream.drained(20), one.stream.drained(20))
+    assert not one.stream.pending_bytes
+    one.stream.close()
+    other.stream.close()

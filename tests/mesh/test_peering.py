@@ -1,0 +1,290 @@
+"""Who dials whom, when, and which of two links stays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from ipaddress import IPv4Address
+
+import pytest
+
+from rmpa.core import limits
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+from rmpa.mesh.handshake import Hello, Refusal, Refuse
+from rmpa.mesh.peering import CloseLink, Dial, LinkDown, LinkRefused, LinkUp, Output, Peering
+from tests.mesh.worlds import HIGH, LOW
+
+DUAL = replace(HIGH, addresses=(IPv4Address("192.168.0.2"),))
+AGAIN = Identity(Guid.of("10.0.0.2", 40002, 2), b"A" * 16, "high")
+
+
+def of(ours: Identity, *, alive: bool = True) -> Peering:
+    return Peering(ours, rng=lambda: 0.999999, alive=lambda _: alive)
+
+
+def dials(outputs: list[Output]) -> list[tuple[str, int]]:
+    return [o.endpoint for o in outputs if isinstance(o, Dial)]
+
+
+def until_dial(peering: Peering, now: float) -> tuple[float, tuple[str, int]]:
+    while not (made := dials(peering.take())):
+        due = peering.next_timer()
+        assert due is not None
+        now = max(now, due)
+        peering.handle_timer(now)
+    return now, made[0]
+
+
+def test_the_lower_dials_at_once_and_the_higher_after_a_while() -> None:
+    low, high = of(LOW), of(HIGH)
+    low.peer_found(HIGH, 0.0)
+    high.peer_found(LOW, 0.0)
+    assert dials(low.take()) == [HIGH.guid.endpoint]
+    assert dials(high.take()) == []
+    assert until_dial(high, 0.0) == (limits.DIAL_FALLBACK, LOW.guid.endpoint)
+
+
+def test_the_beacons_source_then_each_address_then_a_growing_pause() -> None:
+    low = of(LOW)
+    low.peer_found(DUAL, 0.0, source="172.16.0.2")
+    now, seen = 0.0, []
+    for _ in range(9):
+        now, endpoint = until_dial(low, now)
+        seen.append((round(now, 3), endpoint[0]))
+        low.dial_failed(DUAL.guid, "refused", now)
+    a, b, c = "172.16.0.2", "10.0.0.2", "192.168.0.2"
+    assert seen == [(0.0, a), (0.0, b), (0.0, c), (0.1, a), (0.1, b), (0.1, c), (0.3, a), (0.3, b), (0.3, c)]
+    (status,) = low.peers()
+    assert status.state == "waiting"
+    assert status.last_error == "refused"
+    assert status.attempts == 9
+
+
+def test_retries_for_ever_with_a_cap() -> None:
+    low = of(LOW)
+    low.peer_found(HIGH, 0.0)
+    now, pauses = 0.0, []
+    for _ in range(200):
+        before = now
+        now, _ = until_dial(low, now)
+        pauses.append(now - before)
+        low.dial_failed(HIGH.guid, "refused", now)
+    assert max(pauses) <= limits.BACKOFF_MAX
+    assert pauses[-1] > 0.9 * limits.BACKOFF_MAX
+
+
+def test_a_flapping_link_is_dialled_slower_and_a_stable_one_at_once() -> None:
+    low = of(LOW)
+    low.peer_found(HIGH, 0.0)
+    now, before, pauses = 0.0, 0.0, []
+    for link in range(1, 9):
+        before = now
+        now, _ = until_dial(low, now)
+        pauses.append(now - before)
+        low.link_up(link, HIGH, now, dialled=True, endpoint=HIGH.guid.endpoint)
+        now += 0.01 if link < 7 else limits.LINK_STABLE
+        low.link_down(link, "lost", now)
+    assert pauses[5] > 1.0
+    now, _ = until_dial(low, now)
+    assert now - (before + pauses[-1]) <= limits.LINK_STABLE + limits.BACKOFF_FIRST
+
+
+def test_where_it_worked_is_dialled_first() -> None:
+    low = of(LOW)
+    low.peer_found(DUAL, 0.0)
+    assert until_dial(low, 0.0)[1] == HIGH.guid.endpoint
+    good = ("192.168.0.2", 40002)
+    low.link_up(1, DUAL, 0.0, dialled=True, endpoint=good)
+    low.link_down(1, "lost", 9.0)
+    assert until_dial(low, 9.0)[1] == good
+
+
+def test_a_link_from_an_unknown_peer_is_up_and_is_forgotten_a_while_after_it_fell() -> None:
+    low = of(LOW)
+    low.link_up(7, HIGH, 0.0, dialled=False)
+    assert low.take() == [LinkUp(7, HIGH)]
+    low.link_down(7, "lost", 10.0)
+    assert low.take() == [LinkDown(7, HIGH, "lost")]
+    now = 10.0
+    while (due := low.next_timer()) is not None:
+        now = due
+        low.handle_timer(now)
+        for output in low.take():
+            assert isinstance(output, Dial)
+            low.dial_failed(output.guid, "refused", now)
+    assert now <= 10.0 + limits.FORGET_UNANNOUNCED
+    assert low.peers() == []
+
+
+def test_gone_stops_dialling_but_not_a_live_link() -> None:
+    low = of(LOW)
+    low.peer_found(HIGH, 0.0)
+    low.take()
+    low.peer_gone(HIGH.guid, 0.0)
+    assert low.next_timer() is None
+    low.dial_failed(HIGH.guid, "refused", 1.0)
+    assert low.peers() == []
+    low.link_up(1, HIGH, 2.0, dialled=False)
+    low.peer_gone(HIGH.guid, 3.0)
+    assert low.take() == [LinkUp(1, HIGH)]
+    low.link_down(1, "lost", 4.0)
+    assert low.next_timer() is None
+    assert low.peers() == []
+
+
+@pytest.mark.parametrize("code", [Refusal.VERSION, Refusal.DOMAIN, Refusal.DUPLICATE])
+def test_a_no_that_lasts_is_said_once_and_retried_slowly(code: Refusal) -> None:
+    low = of(LOW)
+    low.peer_found(HIGH, 0.0)
+    now, said = 0.0, 0
+    for _ in range(5):
+        before = now
+        while not dials(outputs := low.take()):
+            said += sum(isinstance(o, LinkRefused) for o in outputs)
+            due = low.next_timer()
+            assert due is not None
+            now = due
+            low.handle_timer(now)
+        assert now == 0 or now - before >= limits.REFUSED_RETRY
+        low.dial_refused(HIGH.guid, Refuse(code, "do this"), now)
+        assert low.peers()[0].state == "refused"
+    assert said + sum(isinstance(o, LinkRefused) for o in low.take()) == 1
+    low.peer_found(AGAIN, now)
+    assert until_dial(low, now)[0] == now, "a restart deserves a new try at once"
+
+
+def test_a_new_instance_replaces_its_ghost() -> None:
+    low = of(LOW)
+    low.peer_found(HIGH, 0.0)
+    low.link_up(1, HIGH, 0.0, dialled=True, endpoint=HIGH.guid.endpoint)
+    low.take()
+    low.peer_found(AGAIN, 1.0)
+    assert low.take() == [
+        CloseLink(1, "the peer restarted"),
+        LinkDown(1, HIGH, "the peer restarted"),
+        Dial(AGAIN.guid, AGAIN.guid.endpoint),
+    ]
+    low.link_up(2, AGAIN, 1.1, dialled=True, endpoint=AGAIN.guid.endpoint)
+    assert low.take() == [LinkUp(2, AGAIN)]
+    low.peer_found(HIGH, 1.2)
+    low.peer_gone(HIGH.guid, 1.3)
+    low.link_down(1, "late", 1.4)
+    assert low.take() == []
+    assert low.peers()[0].state == "linked"
+
+
+def test_a_new_instance_that_links_before_its_beacon_comes() -> None:
+    low = of(LOW, alive=False)
+    low.link_up(1, HIGH, 0.0, dialled=False)
+    assert low.judge(Hello.of(AGAIN, lease=1.0, expected=None)) is None
+    low.link_up(2, AGAIN, 1.0, dialled=False)
+    assert low.take()[1:] == [
+        CloseLink(1, "the peer restarted"),
+        LinkDown(1, HIGH, "the peer restarted"),
+        LinkUp(2, AGAIN),
+    ]
+
+
+def test_two_live_instances_with_one_address_are_refused() -> None:
+    low = of(LOW, alive=True)
+    low.link_up(1, HIGH, 0.0, dialled=False)
+    verdict = low.judge(Hello.of(AGAIN, lease=1.0, expected=None))
+    assert verdict is not None
+    assert verdict.code == Refusal.DUPLICATE
+
+
+def test_of_one_direction_the_newer_stays() -> None:
+    low = of(LOW)
+    low.link_up(1, HIGH, 0.0, dialled=False)
+    assert low.judge(Hello.of(HIGH, lease=1.0, expected=None)) is None
+    low.link_up(2, HIGH, 1.0, dialled=False)
+    reason = "replaced by a newer link"
+    assert low.take() == [LinkUp(1, HIGH), CloseLink(1, reason), LinkDown(1, HIGH, reason), LinkUp(2, HIGH)]
+
+
+def test_invented_identities_do_not_fill_the_memory() -> None:
+    low = of(LOW)
+    for i in range(2 * limits.ROSTER_PEERS_MAX):
+        stranger = Identity(Guid.of("10.1.0.0", i + 1), i.to_bytes(16, "big"), "x")
+        low.link_up(i + 1, stranger, 0.0, dialled=False)
+        low.link_down(i + 1, "lost", 0.0)
+    assert len(low.peers()) <= limits.ROSTER_PEERS_MAX
+
+
+def test_ourselves_is_nobody() -> None:
+    low = of(LOW)
+    low.peer_found(LOW, 0.0)
+    low.peer_found(replace(LOW, instance=b"x" * 16), 0.0)
+    assert low.peers() == []
+
+
+class Crossing:
+    """Both dial at once; what is under way is delivered in an order that the test chooses.
+
+    Link ids are 1 for the lower's call and 2 for the higher's, on both sides. What one side sends on one
+    connection stays in order, as TCP keeps it.
+    """
+
+    def __init__(self) -> None:
+        self.sides = {"low": of(LOW), "high": of(HIGH)}
+        self.who = {"low": LOW, "high": HIGH}
+        self.wires: dict[tuple[int, str], list[Refuse | str]] = {(1, "high"): ["hello"], (2, "low"): ["hello"]}
+        self.used: dict[str, int | None] = {"low": None, "high": None}
+        self.sides["low"].peer_found(HIGH, 0.0)
+        self.sides["high"].peer_found(LOW, -limits.DIAL_FALLBACK)
+        self.sides["high"].handle_timer(0.0)
+        for side in self.sides.values():
+            assert len(dials(side.take())) == 1
+
+    def choices(self) -> list[tuple[int, str]]:
+        return sorted(k for k, queue in self.wires.items() if queue)
+
+    def deliver(self, wire: tuple[int, str]) -> None:
+        link, me = wire
+        what = self.wires[wire].pop(0)
+        peering, other = self.sides[me], "low" if me == "high" else "high"
+        theirs = self.who[other]
+        if isinstance(what, Refuse):
+            peering.dial_refused(theirs.guid, what, 0.0)
+        elif what == "hello":
+            verdict = peering.judge(Hello.of(theirs, lease=1.0, expected=self.who[me].guid))
+            self.send(link, other, verdict if verdict is not None else "welcome")
+            if verdict is None:
+                peering.link_up(link, theirs, 0.0, dialled=False)
+        elif what == "welcome":
+            peering.link_up(link, theirs, 0.0, dialled=True, endpoint=theirs.guid.endpoint)
+        else:
+            peering.link_down(link, "bye", 0.0)
+        self.act(me, other)
+
+    def act(self, me: str, other: str) -> None:
+        for output in self.sides[me].take():
+            if isinstance(output, CloseLink):
+                self.send(output.link_id, other, "bye")
+            elif isinstance(output, LinkUp):
+                assert self.used[me] is None, "one link at a time"
+                self.used[me] = output.link_id
+            elif isinstance(output, LinkDown):
+                assert self.used[me] == output.link_id
+                self.used[me] = None
+            else:
+                assert not isinstance(output, Dial), "nothing more to dial"
+
+    def send(self, link: int, to: str, what: Refuse | str) -> None:
+        self.wires.setdefault((link, to), []).append(what)
+
+
+def test_in_every_order_of_two_calls_the_lower_ones_link_stays() -> None:
+    todo: list[list[tuple[int, str]]] = [[]]
+    ends = 0
+    while todo:
+        path = todo.pop()
+        world = Crossing()
+        for wire in path:
+            world.deliver(wire)
+        choices = world.choices()
+        todo.extend([*path, choice] for choice in choices)
+        if not choices:
+            ends += 1
+            assert world.used == {"low": 1, "high": 1}, path
+    assert ends >= 6
