@@ -1,0 +1,108 @@
+"""One child process: in a group of its own, gone when we are gone, its words heard."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ctypes
+import os
+import signal
+from collections import deque
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+PR_SET_PDEATHSIG = 1
+TAIL = 30
+"""Lines that are kept of what a child says."""
+_libc = ctypes.CDLL(None)
+
+
+class Child:
+    """A running process; made by ``Child.start``."""
+
+    def __init__(self, name: str, process: asyncio.subprocess.Process) -> None:
+        self.name = name
+        self.process = process
+        self.tail: deque[str] = deque(maxlen=TAIL)
+        """The last lines that it wrote to its standard error."""
+        self.ours = False
+        """Whether we ended it; else its end is news."""
+
+    @classmethod
+    async def start(
+        cls, name: str, argv: Sequence[str], env: Mapping[str, str], heard: Callable[[str], None], *, piped: bool
+    ) -> Child:
+        """Start it; ``heard`` is called with each line of its standard error.
+
+        Args:
+            name: For messages.
+            argv: What to execute.
+            env: All of its variables.
+            heard: Told its standard error, line by line.
+            piped: Whether it reads from us, and writes to our standard output.
+        """
+        us = os.getpid()
+        process = await asyncio.create_subprocess_exec(
+            *argv,
+            env=env,
+            stdin=asyncio.subprocess.PIPE if piped else asyncio.subprocess.DEVNULL,
+            stdout=None if piped else asyncio.subprocess.DEVNULL,
+            stderr=asyncio.subprocess.PIPE,
+            process_group=0,
+            preexec_fn=lambda: _die_with(us),
+        )
+        child = cls(name, process)
+        child._listening = asyncio.create_task(child._listen(heard), name=f"listen to {name}")
+        return child
+
+    _listening: asyncio.Task[None]
+
+    @property
+    def pid(self) -> int:
+        """Its process id, which is its group's too."""
+        return self.process.pid
+
+    @property
+    def runs(self) -> bool:
+        """Whether it has not ended."""
+        return self.process.returncode is None
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal to it and its children; whatever comes of that is our doing."""
+        self.ours = True
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.pid, number)
+
+    def tell(self, line: bytes) -> None:
+        """Write to its standard input; a child that has ended does not hear it."""
+        if self.runs and self.process.stdin is not None and not self.process.stdin.is_closing():
+            self.process.stdin.write(line)
+
+    async def ended(self, within: float | None = None) -> int | None:
+        """Wait for its end, at most so many seconds; its exit status, or ``None`` while it runs."""
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self.process.wait(), within)
+            await self._listening
+        return self.process.returncode
+
+    async def _listen(self, heard: Callable[[str], None]) -> None:
+        assert self.process.stderr is not None
+        while True:
+            try:
+                line = await self.process.stderr.readline()
+            except ValueError:
+                continue  # a line beyond asyncio's limit: dropped
+            if not line:
+                return
+            text = line.decode(errors="replace").rstrip()
+            self.tail.append(text)
+            heard(text)
+
+
+def _die_with(parent: int) -> None:
+    """Between fork and exec: have the kernel kill us when the parent dies, however it dies."""
+    _libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)

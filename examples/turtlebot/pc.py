@@ -1,0 +1,186 @@
+"""The module *pc*: watches every topic and shows who is there, how regularly and how late messages come.
+
+rmpa up --name pc &
+python pc.py
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import locale
+import math
+import os
+import signal
+import sys
+import time
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.live import Live
+
+import table
+from module import arguments, joined, run
+from rate import Rate
+from rmpa.core.errors import RmpaError
+from rmpa.monitor.aio.control_client import ControlClient, choose_agent
+from watch import HERE, TOPICS, PoseView, View, Watch
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.ros.aio.node import Node, Received
+
+LOOKS = 4
+"""Looks a second at our agent, and drawings of the table."""
+SWITCH = 2e-4
+"""Seconds after which the thread that draws gives way to one that receives; Python's 5 ms would spoil the figures."""
+
+
+async def pc(master_uri: str, screen: Screen, *, events: bool) -> None:
+    """Subscribe to everything, look at our agent, and show it all until we are cancelled; then the summary."""
+    watch = Watch(time.monotonic())
+    if events:
+        _follow(sys.stdin.fileno(), watch, screen, asyncio.current_task())
+    looking = asyncio.create_task(_look(watch))
+    try:
+        with screen:
+            async with joined("pc", master_uri) as node:
+                await _subscribe(node, watch)
+                async for _ in Rate(screen.rate):
+                    view = watch.view(time.monotonic())
+                    await asyncio.to_thread(screen.show, view, watch.trail())
+    finally:
+        looking.cancel()
+        screen.summarise(watch.view(time.monotonic(), whole=True))
+
+
+async def _subscribe(node: Node, watch: Watch) -> None:
+    def counting(topic: str) -> Callable[[Received], None]:
+        def came(received: Received) -> None:
+            now = time.monotonic()
+            header = getattr(received.message, "header", None)
+            latency = None
+            if header is not None:
+                latency = (received.stamp_ns - header.stamp.sec * 10**9 - header.stamp.nanosec) * 1e-9
+            watch.message(topic, now, latency)
+            if topic == "/odom":
+                watch.pose(_pose(received), now)
+
+        return came
+
+    for topic, about in TOPICS.items():
+        await node.subscribe(topic, about.type, counting(topic))
+
+
+def _pose(received: Received) -> PoseView:
+    pose, twist = received.message.pose.pose, received.message.twist.twist
+    heading = 2 * math.atan2(pose.orientation.z, pose.orientation.w)
+    return PoseView(
+        float(pose.position.x),
+        float(pose.position.y),
+        math.remainder(heading, math.tau),
+        float(twist.linear.x),
+        float(twist.angular.z),
+    )
+
+
+async def _look(watch: Watch) -> None:
+    """Ask our agent who is there, as `rmpa peer list` does."""
+    async for _ in Rate(LOOKS):
+        with contextlib.suppress(RmpaError):
+            states = await asyncio.to_thread(_peers)
+            watch.peers(states, time.monotonic())
+
+
+def _peers() -> dict[str, str]:
+    with ControlClient(choose_agent(os.environ, HERE).path) as agent:
+        return {peer.name: peer.state for peer in agent.snapshot().peers}
+
+
+def _follow(descriptor: int, watch: Watch, screen: Screen, task: asyncio.Task[None] | None) -> None:
+    """Take the supervisor's news from a pipe, one JSON object a line; end when it is closed."""
+    rest = b""
+    loop = asyncio.get_running_loop()
+
+    def readable() -> None:
+        nonlocal rest
+        data = os.read(descriptor, 65536)
+        if not data:
+            loop.remove_reader(descriptor)
+            if task is not None:
+                task.cancel()
+            return
+        *lines, rest = (rest + data).split(b"\n")
+        for text in lines:
+            _tell(watch, screen, json.loads(text))
+
+    loop.add_reader(descriptor, readable)
+
+
+def _tell(watch: Watch, screen: Screen, news: dict[str, object]) -> None:
+    module, at = str(news.get("module")), news.get("at")
+    if news["event"] == "note":
+        note = f"{module}: {news['text']}"
+        watch.note(note)
+        screen.note(note)
+    elif isinstance(at, float):
+        (watch.started if news["event"] == "started" else watch.killed)(module, at)
+
+
+class Screen:
+    """Where it is shown: a live table on a terminal, else a line each second; JSON if asked for.
+
+    Args:
+        as_json: One object a line.
+    """
+
+    def __init__(self, *, as_json: bool) -> None:
+        self._json = as_json
+        self._console = Console()
+        self._live: Live | None = None
+        if self._console.is_terminal and not as_json:
+            self._live = Live(console=self._console, auto_refresh=False)
+        self._unicode = "utf" in (sys.stdout.encoding or locale.getpreferredencoding()).lower()
+        self.rate = LOOKS if self._live else 1
+
+    def __enter__(self) -> None:
+        if self._live:
+            self._live.start()
+
+    def __exit__(self, *_: object) -> None:
+        if self._live:
+            self._live.stop()
+
+    def show(self, view: View, trail: list[tuple[float, float]]) -> None:
+        """Show the present; called in a thread, so that drawing does not delay receiving."""
+        if self._live:
+            self._live.update(table.live(view, trail, unicode=self._unicode), refresh=True)
+        elif self._json:
+            print(table.json_line(view), flush=True)
+        else:
+            print(table.line(view), flush=True)
+
+    def note(self, text: str) -> None:
+        """Show a note at once where lines are printed; the table and JSON show it with the rest."""
+        if not self._live and not self._json:
+            print(f"        {text}", flush=True)
+
+    def summarise(self, view: View) -> None:
+        """Show the whole run."""
+        if self._json:
+            print(table.json_summary(view), flush=True)
+        else:
+            self._console.print(*table.summary(view), sep="\n")
+
+
+if __name__ == "__main__":
+    parser = arguments(__doc__)
+    parser.add_argument("--json", action="store_true", help="one JSON object a second, and the summary as the last")
+    parser.add_argument("--events", action="store_true", help="read the supervisor's news on standard input")
+    options = parser.parse_args()
+    sys.setswitchinterval(SWITCH)
+    signal.signal(signal.SIGTTOU, signal.SIG_IGN)  # we are not the terminal's foreground job: the supervisor is
+    with contextlib.suppress(BrokenPipeError):
+        run(pc(options.master, Screen(as_json=options.json), events=options.events))

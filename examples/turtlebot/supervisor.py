@@ -1,0 +1,253 @@
+"""Runs the four modules: each an agent (``rmpa up``) with a core of its own, and a node, as children of ours."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from child import Child
+from ports import free_port
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from home import Home
+
+MODULES = ("joystick", "velocity", "base", "pc")
+GROUP = "239.255.82.77"
+HERE = Path(__file__).parent
+FAREWELL = 3.0
+"""Seconds for a child to end in order before it is killed."""
+STARTING = 3.0
+"""An agent that ends within so many seconds of its start because of a port gets another port …"""
+STARTS_MAX = 3
+"""… so often at the most."""
+LINE_MAX = 4096
+
+
+class Refused(Exception):  # noqa: N818 - it is an answer
+    """A command that cannot be done, and why."""
+
+
+@dataclass(slots=True)
+class Module:
+    """One module: its core's port and its processes."""
+
+    name: str
+    core_port: int
+    started: float = 0.0
+    starts: int = 0
+    children: list[Child] = field(default_factory=list)
+
+    @property
+    def runs(self) -> bool:
+        """Whether any of its processes does."""
+        return any(child.runs for child in self.children)
+
+
+class Supervisor:
+    """Starts, watches, kills and ends the modules.
+
+    Args:
+        home: Where sockets live.
+        joystick: A joystick device for the module joystick, or empty.
+        as_json: Whether the pc prints JSON.
+    """
+
+    def __init__(self, home: Home, *, joystick: str = "", as_json: bool = False) -> None:
+        self._home = home
+        self._joystick = joystick
+        self._as_json = as_json
+        self._taken: set[int] = set()
+        self._multicast = f"{GROUP}:{free_port(socket.SOCK_DGRAM, self._taken)}"
+        self._modules = {name: Module(name, free_port(socket.SOCK_STREAM, self._taken)) for name in MODULES}
+        self._untold: list[bytes] | None = []
+        self._watching: set[asyncio.Task[None]] = set()
+        self._server: asyncio.Server | None = None
+        self._over = asyncio.Event()
+        self.failures: list[str] = []
+        """What ended by itself, with its last words."""
+
+    async def run(self, seconds: float | None) -> None:
+        """Run everything until ``seconds`` are over, ``stop`` is called or the pc's node is gone; end it all."""
+        try:
+            self._server = await asyncio.start_unix_server(self._serve, self._home.socket, limit=LINE_MAX)
+            # All agents before the nodes: theirs is the longer way to the first message.
+            await asyncio.gather(*(self._start(module) for module in self._modules.values()))
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._over.wait(), seconds)
+        finally:
+            await self._end()
+
+    def stop(self) -> None:
+        """End in order; at the second call, at once."""
+        if self._over.is_set():
+            for child in self._children():
+                child.send(signal.SIGKILL)
+        self._over.set()
+
+    # --- modules ------------------------------------------------------------------------------------------------
+
+    async def _start(self, module: Module) -> None:
+        module.children = []
+        module.started = time.monotonic()
+        module.starts += 1
+        started: dict[str, object] = {"event": "started", "module": module.name, "at": module.started}
+        if module.name != "pc":
+            self._news(started)
+        env = self._environment(module)
+        for name, argv in (("agent", self._agent(module)), ("node", self._node(module))):
+            watched = module.name == "pc" and name == "node"
+            full_name = f"{name} of {module.name}"
+            child = await Child.start(full_name, argv, env, self._hearing(module, name), piped=watched)
+            module.children.append(child)
+            if watched:
+                self._tell_early_news(child)
+                self._news(started)
+            task = asyncio.create_task(self._watch(module, child), name=f"watch {full_name}")
+            self._watching.add(task)
+            task.add_done_callback(self._watching.discard)
+
+    def _agent(self, module: Module) -> list[str]:
+        return [
+            *(rmpa_program(), "up", "--name", module.name, "--core-port", str(module.core_port)),
+            *("--interface", "lo", "--multicast", self._multicast),
+            *("--config", str(self._home.settings), "--log-level", "warning"),
+        ]
+
+    def _node(self, module: Module) -> list[str]:
+        argv = [sys.executable, str(HERE / f"{module.name}.py"), "--master", f"http://127.0.0.1:{module.core_port}/"]
+        if module.name == "joystick" and self._joystick:
+            argv += ["--device", self._joystick]
+        if module.name == "pc":
+            argv += ["--events", *(["--json"] if self._as_json else [])]
+        return argv
+
+    def _environment(self, module: Module) -> Mapping[str, str]:
+        foreign = ("ROS_", "RMPA_", "NOTIFY_SOCKET")
+        kept = {name: value for name, value in os.environ.items() if not name.startswith(foreign)}
+        return {**kept, "RMPA_RUNTIME_DIR": str(self._home.agents), "RMPA_AGENT": module.name}
+
+    def _hearing(self, module: Module, name: str) -> Callable[[str], None]:
+        # Agents report lost peers to their log; the table shows those. What a node says is for the user.
+        if name == "agent" or module.name == "pc":
+            return lambda _: None
+        return lambda text: self._news({"event": "note", "module": module.name, "text": text})
+
+    async def _watch(self, module: Module, child: Child) -> None:
+        status = await child.ended()
+        if child.ours or self._over.is_set():
+            return
+        tail = "\n".join(f"    {line}" for line in child.tail)
+        young = time.monotonic() - module.started < STARTING
+        if young and "in use" in tail and module.starts < STARTS_MAX:
+            await self._kill(module)
+            module.core_port = free_port(socket.SOCK_STREAM, self._taken)
+            await self._start(module)
+            return
+        self.failures.append(f"the {child.name} ended with status {status}\n{tail}")
+        self._news({"event": "note", "module": module.name, "text": f"the {child.name} ended with status {status}"})
+        if child.process.stdin is not None:
+            self._over.set()  # without the pc's node nobody sees anything
+
+    async def _kill(self, module: Module) -> None:
+        for child in module.children:
+            child.send(signal.SIGKILL)
+        for child in module.children:
+            await child.ended()
+
+    def _news(self, news: dict[str, object]) -> None:
+        """Tell the pc's node; what happens before its first start waits for it."""
+        line = json.dumps(news).encode() + b"\n"
+        if self._untold is not None:
+            self._untold.append(line)
+        for child in self._modules["pc"].children:
+            child.tell(line)
+
+    def _tell_early_news(self, child: Child) -> None:
+        early, self._untold = self._untold, None
+        for line in early or ():
+            child.tell(line)
+
+    # --- commands from a second terminal ------------------------------------------------------------------------
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            request = json.loads(await reader.readline())
+            text, ok = await self._do(str(request["do"]), str(request["module"])), True
+        except Refused as refusal:
+            text, ok = str(refusal), False
+        except (ValueError, TypeError, KeyError):
+            text, ok = "not a command", False
+        with contextlib.suppress(OSError):
+            writer.write(json.dumps({"ok": ok, "text": text}).encode() + b"\n")
+            await writer.drain()
+        writer.close()
+
+    async def _do(self, verb: str, name: str) -> str:
+        module = self._modules.get(name)
+        if module is None:
+            raise Refused(f"no module named {name!r}: there are {', '.join(MODULES)}")
+        if verb == "kill":
+            if not module.runs:
+                raise Refused(f"{name} does not run; `demo.py start {name}` starts it")
+            at = time.monotonic()
+            pids = ", ".join(str(child.pid) for child in module.children if child.runs)
+            await self._kill(module)
+            self._news({"event": "killed", "module": name, "at": at})
+            if name == "pc":
+                print("the pc is killed, the others go on; start it: make demo-start MODULE=pc", file=sys.stderr)
+            return f"{name} is killed (kill -9 of its agent and its node, processes {pids})"
+        if verb == "start":
+            if module.runs:
+                raise Refused(f"{name} runs already")
+            module.starts = 0
+            await self._start(module)
+            return f"{name} is started"
+        raise Refused(f"no command {verb!r}: there are kill and start")
+
+    # --- the end ------------------------------------------------------------------------------------------------
+
+    def _children(self) -> list[Child]:
+        return [child for module in self._modules.values() for child in module.children if child.runs]
+
+    async def _end(self) -> None:
+        self._over.set()
+        if self._server is not None:
+            self._server.close()
+        # The pc's node first: it prints the summary, of all four.
+        for child in self._modules["pc"].children[1:]:
+            child.send(signal.SIGTERM)
+            await child.ended(FAREWELL)
+        children = self._children()
+        for child in children:
+            child.send(signal.SIGTERM)
+        await asyncio.gather(*(child.ended(FAREWELL) for child in children))
+        for child in self._children():
+            self.failures.append(f"the {child.name} did not end within {FAREWELL} s, and was killed")
+            child.send(signal.SIGKILL)
+            await child.ended()
+        await asyncio.gather(*self._watching, return_exceptions=True)
+
+
+def rmpa_program() -> str:
+    """The path of ``rmpa``.
+
+    Raises:
+        Refused: It is not installed.
+    """
+    beside = Path(sys.executable).with_name("rmpa")
+    found = str(beside) if beside.exists() else shutil.which("rmpa")
+    if not found:
+        raise Refused("the program rmpa is not installed for this Python; `make` builds .venv with it")
+    return found
