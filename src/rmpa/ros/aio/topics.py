@@ -15,7 +15,7 @@ from rmpa.core.errors import LocalProtocolError
 from rmpa.ros.aio.publication import Publication
 from rmpa.ros.aio.subscription import Subscription
 from rmpa.ros.messages import MessageType
-from rmpa.ros.tcpros import ANY, LENGTH, frame_message
+from rmpa.ros.tcpros import ANY, LENGTH, frame_message, printable
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
@@ -90,12 +90,16 @@ class Publisher:
         self.kind = kind
         self._on_close = on_close
         self._change = asyncio.Event()
+        self._log = RefusalLog(_log, Counters())
+        self.refusals: dict[str, str] = {}
+        """Why subscribers (by caller id) were refused."""
         self.publication = Publication(
             topic,
             caller_id,
             description,
             on_first_subscriber=self._change.set,
             on_last_subscriber=self._change.clear,
+            on_mismatch=self._refused,
             queue_messages=queue_messages,
         )
 
@@ -136,6 +140,11 @@ class Publisher:
         """Let what was published leave, unregister, and close the connections."""
         await self.drained()
         await self._on_close(self.topic)
+
+    def _refused(self, fields: Mapping[str, str], text: str) -> None:
+        who = printable(fields.get("callerid", ""))
+        _remember(self.refusals, who, text)
+        self._log.refuse(asyncio.get_running_loop().time(), "publication.refused", who, f"{self.topic}: {text}")
 
     def _known(self) -> MessageType:
         if self.kind is None:
@@ -226,8 +235,12 @@ class Subscriber:
         self._wake.set()
 
     def _refused(self, link: PublisherConnection, text: str) -> None:
-        self.refusals[link.uri] = text
-        if len(self.refusals) > limits.LOG_KINDS_MAX:
-            self.refusals.pop(next(iter(self.refusals)))
+        _remember(self.refusals, link.uri, text)
         now = asyncio.get_running_loop().time()
         self._refusals.refuse(now, "subscription.refused", link.uri, f"{self.topic}: publisher {link.uri}: {text}")
+
+
+def _remember(refusals: dict[str, str], who: str, text: str) -> None:
+    refusals[who] = text
+    if len(refusals) > limits.LOG_KINDS_MAX:
+        refusals.pop(next(iter(refusals)))

@@ -1,0 +1,368 @@
+"""Real rospy and roscpp nodes against our publications and subscriptions, at the embedded core."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import socket
+import struct
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from rmpa.ros.aio.core import RosCore
+from rmpa.ros.aio.http_client import call_api
+from rmpa.ros.aio.node import Node
+from rmpa.ros.aio.publication import Publication
+from rmpa.ros.aio.slave_server import SlaveNode
+from rmpa.ros.definitions import known_types
+from rmpa.ros.environment import RosEnvironment
+from rmpa.ros.messages import MessageType
+from rmpa.ros.tcpros import frame_message
+from tests.interop.nodes.payload import Pattern, Tally
+from tests.interop.ros import PYTHON
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from rmpa.ros.aio.node import Publisher, Received
+    from tests.interop.conftest import ShellFactory
+    from tests.interop.processes import Process
+    from tests.interop.ros import Ros
+
+pytestmark = pytest.mark.ros
+libraries = pytest.mark.parametrize("library", ["rospy", "roscpp"])
+BYTES = "std_msgs/UInt8MultiArray"
+DEADLINE = 40.0
+EMPTY_LAYOUT = bytes(8)  # no dimensions, offset 0
+
+
+def framed(payload: bytes) -> bytes:
+    """A std_msgs/UInt8MultiArray as raw bytes."""
+    return EMPTY_LAYOUT + struct.pack("<I", len(payload)) + payload
+
+
+def content(received: Received) -> bytes:
+    """The bytes in a std_msgs/UInt8MultiArray of ours or of the real nodes."""
+    message = received.message
+    return bytes(message.data)
+
+
+@pytest.fixture
+async def core() -> AsyncIterator[RosCore]:
+    made = RosCore("127.0.0.1", 0)
+    await made.start()
+    yield made
+    await made.close()
+
+
+@pytest.fixture
+async def node(core: RosCore) -> AsyncIterator[Node]:
+    async with Node("ours", master_uri=core.uri, environment=RosEnvironment()) as made:
+        yield made
+
+
+@pytest.fixture
+def ros(core: RosCore, shell: ShellFactory) -> Ros:
+    return shell(port=core.port)
+
+
+async def until(condition: Any) -> None:
+    async with asyncio.timeout(DEADLINE):
+        while not condition():
+            await asyncio.sleep(0.005)
+
+
+async def event(process: Process, name: str) -> dict[str, Any]:
+    report: dict[str, Any] = await asyncio.to_thread(process.wait_event, name, timeout=DEADLINE)
+    return report
+
+
+async def tool(ros: Ros, *argv: str) -> str:
+    return await asyncio.to_thread(ros.tool, *argv)
+
+
+async def send(publisher: Publisher, count: int, size: int, rate: float) -> None:
+    """Publish numbered payloads, as the talkers do."""
+    pattern = Pattern(size)
+    loop = asyncio.get_running_loop()
+    due = loop.time()
+    for sequence in range(1, count + 1):
+        publisher.publish_raw(framed(pattern.payload(1, sequence)))
+        due += 1 / rate
+        await asyncio.sleep(max(0.0, due - loop.time()))
+
+
+@libraries
+@pytest.mark.parametrize(("count", "size", "rate"), [(1000, 64, 1000), (30, 1_000_000, 30)])
+async def test_a_real_listener_gets_every_byte(
+    node: Node, ros: Ros, library: str, count: int, size: int, rate: float
+) -> None:
+    publisher = await node.advertise("/chatter", BYTES)
+    listener = ros.node(library, "listener", count=count)
+    await asyncio.wait_for(publisher.wait_for_subscriber(), DEADLINE)
+    await send(publisher, count, size, rate)
+    report = await event(listener, "done")
+    assert (report["count"], report["bad"], report["gaps"], report["doubled"]) == (count, 0, 0, 0)
+    assert report["bytes"] == count * size
+    assert publisher.publication.dropped == 0
+
+
+@libraries
+@pytest.mark.parametrize(("count", "size", "rate"), [(1000, 64, 1000), (30, 1_000_000, 30)])
+async def test_a_real_talker_is_heard_to_the_byte(
+    node: Node, ros: Ros, library: str, count: int, size: int, rate: int
+) -> None:
+    tally = Tally()
+    await node.subscribe("/chatter", BYTES, lambda received: tally.take(content(received)))
+    ros.node(library, "talker", count=count, size=size, rate=rate, wait=1)
+    await until(lambda: tally.count >= count)
+    report = tally.report()
+    assert (report["count"], report["bad"], report["gaps"], report["doubled"]) == (count, 0, 0, 0)
+
+
+@libraries
+async def test_the_real_talkers_own_definition_is_handed_on(node: Node, ros: Ros, library: str) -> None:
+    got: list[Received] = []
+    await node.subscribe("/chatter", None, got.append)
+    ros.node(library, "talker", rate=50)
+    await until(lambda: got)
+    header = got[0].header
+    kind = MessageType(BYTES)
+    assert (header["type"], header["md5sum"]) == (BYTES, kind.md5sum)
+    # genmsg for C++ ends the text with one more newline than genpy; the bytes of the publisher are what counts.
+    assert header["message_definition"].rstrip("\n") == kind.definition.rstrip("\n")
+    assert got[0].kind.md5sum == kind.md5sum
+
+
+@libraries
+async def test_trap_10_a_real_latched_message_reaches_us_late(node: Node, ros: Ros, library: str) -> None:
+    talker = ros.node(library, "talker", count=1, latch=True)
+    await event(talker, "done")
+    got: list[Received] = []
+    await node.subscribe("/chatter", BYTES, got.append)
+    await until(lambda: got)
+    assert got[0].header["latching"] == "1"
+
+
+@libraries
+async def test_trap_10_our_latched_message_reaches_each_listener_once(node: Node, ros: Ros, library: str) -> None:
+    publisher = await node.advertise("/chatter", BYTES, latch=True)
+    await send(publisher, 3, 64, 1000)
+    first = ros.node(library, "listener")
+    assert (await event(first, "first"))["last"] == 3
+    second = ros.node(library, "listener", count=2)
+    assert (await event(second, "first"))["last"] == 3
+    publisher.publish_raw(framed(Pattern(64).payload(1, 4)))
+    report = await event(second, "done")
+    assert (report["count"], report["last"], report["doubled"], report["gaps"]) == (2, 4, 0, 0)
+
+
+@libraries
+@pytest.mark.parametrize("nodelay", [True, False])
+async def test_trap_9_tcp_nodelay_is_what_the_listener_asks_for(
+    node: Node, ros: Ros, library: str, nodelay: bool
+) -> None:
+    publisher = await node.advertise("/chatter", BYTES)
+    ros.node(library, "listener", nodelay=nodelay)
+    await asyncio.wait_for(publisher.wait_for_subscriber(), DEADLINE)
+    (link,) = publisher.publication._open
+    assert link._sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == nodelay
+
+
+async def test_trap_1_rostopic_echo_takes_any_type_and_prints_ours(node: Node, ros: Ros) -> None:
+    publisher = await node.advertise("/joy", "sensor_msgs/Joy", latch=True)
+    publisher.publish(publisher.make({"header": {"frame_id": "pad"}, "axes": [0.5], "buttons": [1, 0]}))
+    output = await tool(ros, "rostopic", "echo", "-n", "1", "/joy")
+    assert 'frame_id: "pad"' in output
+    assert "axes: [0.5]" in output
+
+
+async def test_trap_2_rosbag_records_our_definition_byte_for_byte(node: Node, ros: Ros) -> None:
+    publisher = await node.advertise("/joy", "sensor_msgs/Joy", latch=True)
+    publisher.publish(publisher.make({"axes": [0.5]}))
+    bag = ros.home / "joy.bag"
+    await tool(ros, "rosbag", "record", "-q", "-O", str(bag), "-l", "1", "/joy")
+    program = (
+        "import json, sys, rosbag, sensor_msgs.msg as m\n"
+        "bag = rosbag.Bag(sys.argv[1])\n"
+        "(c,) = bag._get_connections()\n"
+        "(message,) = [m for _, m, _ in bag.read_messages()]\n"
+        "print(json.dumps([c.msg_def, m.Joy._full_text, c.md5sum, list(message.axes)]))\n"
+    )
+    recorded, real, md5, axes = json.loads(await tool(ros, PYTHON, "-c", program, str(bag)))
+    assert recorded == real == MessageType("sensor_msgs/Joy").definition
+    assert (md5, axes) == (MessageType("sensor_msgs/Joy").md5sum, [0.5])
+
+
+@libraries
+async def test_trap_5_a_listener_of_another_type_is_refused_and_gets_nothing(
+    node: Node, ros: Ros, library: str
+) -> None:
+    publisher = await node.advertise("/chatter", "std_msgs/Int32", latch=True)
+    publisher.publish(publisher.make(7))
+    listener = ros.node(library, "listener", name="wrong")
+    await until(lambda: publisher.refusals)
+    assert "client [/wrong] wants topic /chatter to have type/md5sum" in publisher.refusals["/wrong"]
+    assert publisher.subscribers == 0
+    assert listener.returncode is None
+    assert not listener.events("first")
+
+
+@libraries
+async def test_a_real_listener_waits_while_the_type_is_not_known(core: RosCore, ros: Ros, library: str) -> None:
+    proxy = SlaveNode("/proxy", "127.0.0.1", core.uri)
+    await proxy.start()
+    demand = asyncio.Event()
+    publication = Publication("/chatter", "/proxy", on_first_subscriber=demand.set)
+    proxy.add_publication(publication)
+    core.call("registerPublisher", "/proxy", "/chatter", BYTES, proxy.uri)
+    listener = ros.node(library, "listener", count=3)
+    await asyncio.wait_for(demand.wait(), DEADLINE)
+    await asyncio.sleep(1.0)  # as long as a route may take; nothing can be waited for
+    assert publication.connections()[0].connected is False
+    publication.describe(MessageType(BYTES).describe())
+    pattern = Pattern(64)
+    for sequence in range(1, 4):
+        publication.publish_framed(frame_message(framed(pattern.payload(1, sequence))))
+    report = await event(listener, "done")
+    assert (report["bad"], report["gaps"], report["last"]) == (0, 0, 3)
+    core.call("unregisterPublisher", "/proxy", "/chatter", proxy.uri)
+    await proxy.close()
+
+
+@libraries
+async def test_trap_16_a_withdrawn_topic_is_left_by_real_listeners_and_found_again(
+    node: Node, ros: Ros, library: str
+) -> None:
+    publisher = await node.advertise("/chatter", BYTES)
+    listener = ros.node(library, "listener", count=20)
+    await asyncio.wait_for(publisher.wait_for_subscriber(), DEADLINE)
+    await send(publisher, 10, 64, 1000)
+    await publisher.close()
+    again = await node.advertise("/chatter", BYTES)
+    await asyncio.wait_for(again.wait_for_subscriber(), DEADLINE)
+    pattern = Pattern(64)
+    for sequence in range(11, 21):
+        again.publish_raw(framed(pattern.payload(1, sequence)))
+    report = await event(listener, "done")
+    assert (report["gaps"], report["doubled"], report["last"]) == (0, 0, 20)
+
+
+@libraries
+async def test_a_killed_talker_is_heard_again_when_it_is_back(node: Node, ros: Ros, library: str) -> None:
+    got: list[Received] = []
+    subscriber = await node.subscribe("/chatter", BYTES, got.append)
+    talker = ros.node(library, "talker", name="talker", rate=100)
+    await until(lambda: len(got) > 10)
+    talker.kill()
+    await until(lambda: subscriber.publishers == 0)
+    before = len(got)
+    ros.node(library, "talker", name="talker", rate=100)
+    await until(lambda: len(got) > before + 10)
+    assert subscriber.publishers == 1
+
+
+@libraries
+async def test_trap_19_a_stopped_listener_delays_nobody(node: Node, ros: Ros, library: str) -> None:
+    publisher = await node.advertise("/chatter", BYTES, queue_messages=5)
+    slow = ros.node(library, "listener", name="slow")
+    fast = ros.node(library, "listener", name="fast", count=60)
+    await until(lambda: publisher.subscribers == 2)
+    os.kill(slow.pid, signal.SIGSTOP)
+    try:
+        await send(publisher, 60, 1_000_000, 60)
+        report = await event(fast, "done")
+    finally:
+        os.kill(slow.pid, signal.SIGCONT)
+    assert (report["count"], report["bad"], report["gaps"]) == (60, 0, 0)
+    drops = {c.other: c.dropped for c in publisher.publication.connections()}
+    assert drops["/slow"] > 0
+    assert drops["/fast"] == 0
+
+
+@libraries
+async def test_trap_11_a_silent_connection_hurts_no_real_listener(node: Node, ros: Ros, library: str) -> None:
+    publisher = await node.advertise("/chatter", BYTES)
+    with socket.create_connection(node.slave._tcpros.address):
+        ros.node(library, "listener")
+        await asyncio.wait_for(publisher.wait_for_subscriber(), DEADLINE)
+
+
+@libraries
+async def test_trap_21_requestTopic_answers_as_rospy_does(node: Node, ros: Ros, core: RosCore, library: str) -> None:  # noqa: N802
+    ros.node(library, "talker", name="talker")
+    await until(lambda: core.state().publishers.get("/chatter"))
+    await node.advertise("/ours", BYTES)
+    theirs = await call_api(
+        core.state().publishers["/chatter"]["/talker"], "requestTopic", "/x", "/chatter", [["TCPROS"]]
+    )
+    own = await call_api(node.uri, "requestTopic", "/x", "/ours", [["UDPROS", b"", "h", 1, 1500], ["TCPROS"]])
+    assert (theirs.code, own.code) == (1, 1)
+    assert isinstance(theirs.value, list)
+    assert isinstance(own.value, list)
+    assert [type(part) for part in theirs.value] == [type(part) for part in own.value]
+    assert theirs.value[:2] == own.value[:2]
+    assert (await call_api(node.uri, "requestTopic", "/x", "/other", [["TCPROS"]])).code == -1
+
+
+async def test_the_stock_tools_show_our_node(node: Node, ros: Ros) -> None:
+    publisher = await node.advertise("/chatter", BYTES)
+    ros.roscpp("listener", name="listener")
+    await asyncio.wait_for(publisher.wait_for_subscriber(), DEADLINE)
+    output = await tool(ros, "rosnode", "info", "/ours")
+    assert "* topic: /chatter" in output
+    assert "* to: /listener" in output
+    assert f"Pid: {os.getpid()}" in output
+    assert "/ours" in await tool(ros, "rosnode", "list")
+
+
+async def test_rosnode_kill_ends_our_node(core: RosCore, ros: Ros) -> None:
+    async with Node("victim", master_uri=core.uri, environment=RosEnvironment()) as victim:
+        await victim.advertise("/t", BYTES)
+        await tool(ros, "rosnode", "kill", "/victim")
+        await asyncio.wait_for(victim.stopped.wait(), DEADLINE)
+        await victim.close()
+        assert "/t" not in core.state().publishers
+
+
+async def test_definitions_and_sums_are_those_of_the_installed_packages(ros: Ros) -> None:
+    program = (
+        "import glob, importlib, json\n"
+        "found = {}\n"
+        "for path in glob.glob('/usr/lib/python3/dist-packages/*/msg/__init__.py'):\n"
+        "    for value in vars(importlib.import_module(path.split('/')[-3] + '.msg')).values():\n"
+        "        if hasattr(value, '_full_text'):\n"
+        "            found[value._type] = [value._md5sum, value._full_text]\n"
+        "print(json.dumps(found))\n"
+    )
+    real = json.loads(await tool(ros, PYTHON, "-c", program))
+    compared = 0
+    for name in real.keys() & set(known_types()):
+        kind = MessageType(name)
+        assert [kind.md5sum, kind.definition] == real[name], name
+        compared += 1
+    assert compared > 80
+    for name, (md5, text) in real.items():
+        assert MessageType.learn(name, text, md5).md5sum == md5
+
+
+async def test_our_bytes_are_what_rospy_writes_and_reads(ros: Ros) -> None:
+    kind = MessageType("sensor_msgs/Joy")
+    values: Any = {
+        "header": {"seq": 1, "stamp": {"secs": 2, "nsecs": 3}, "frame_id": "ü"},
+        "axes": [1.5],
+        "buttons": [7],
+    }
+    ours = kind.serialize(kind.make(values))
+    program = (
+        "import io, sys, sensor_msgs.msg as m\n"
+        "joy = m.Joy().deserialize(bytes.fromhex(sys.argv[1]))\n"
+        "buffer = io.BytesIO(); joy.serialize(buffer)\n"
+        "print(buffer.getvalue().hex())\n"
+    )
+    theirs = bytes.fromhex((await tool(ros, PYTHON, "-c", program, ours.hex())).strip())
+    assert theirs == ours
+    assert kind.to_plain(kind.deserialize(theirs)) == values
