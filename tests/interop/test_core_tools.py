@@ -25,14 +25,21 @@ LAUNCH: Final = """<launch>
   <param name="speed" value="1.5"/>
   <rosparam>{gains: {p: 1, i: 0.5}, names: [a, b], enabled: true}</rosparam>
   <group ns="left">
-    <node pkg="topic_tools" type="relay" name="relay" args="/in out">
-      <param name="lazy" value="true"/>
-    </node>
+    <node pkg="two_nodes" type="node.py" name="node"><param name="side" value="left"/></node>
   </group>
   <group ns="right">
-    <node pkg="topic_tools" type="relay" name="relay" args="/in out"/>
+    <node pkg="two_nodes" type="node.py" name="node"/>
   </group>
 </launch>
+"""
+PACKAGE: Final = """<package><name>two_nodes</name><version>1.0.0</version><description>x</description>
+<maintainer email="x@example.org">x</maintainer><license>x</license></package>
+"""
+NODE: Final = """#!/usr/bin/python3
+import rospy
+rospy.init_node("node")
+rospy.get_param("~side", "")
+rospy.spin()
 """
 
 
@@ -136,24 +143,28 @@ def test_parameters(shell: ShellFactory, tmp_path: Path) -> None:
 
 
 def test_launch(shell: ShellFactory, tmp_path: Path) -> None:
-    launch = tmp_path / "two.launch"
-    launch.write_text(LAUNCH)
+    package = tmp_path / "two_nodes"
+    package.mkdir()
+    (package / "package.xml").write_text(PACKAGE)
+    (package / "node.py").write_text(NODE)
+    (package / "node.py").chmod(0o755)
+    (package / "two.launch").write_text(LAUNCH)
+    env = {"ROS_PACKAGE_PATH": f"{tmp_path}:/usr/share"}
 
     def scenario(ros: Ros) -> dict[str, str]:
-        process = ros.start("roslaunch", str(launch), name="roslaunch")
+        process = ros.start("roslaunch", "two_nodes", "two.launch", name="roslaunch", env=env)
+        process.wait_for(r"process\[right/node", DEADLINE)
         eventually(
-            lambda: {"/left/relay", "/right/relay"} <= set(ros.tool("rosnode", "list").split()),
-            DEADLINE,
-            what="relays",
+            lambda: {"/left/node", "/right/node"} <= set(ros.tool("rosnode", "list").split()), DEADLINE, what="nodes"
         )
         found = {
             "nodes": ros.tool("rosnode", "list"),
             "gains": ros.tool("rosparam", "get", "/gains"),
-            "private": ros.tool("rosparam", "get", "/left/relay/lazy"),
+            "private": ros.tool("rosparam", "get", "/left/node/side"),
         }
         process.interrupt(DEADLINE)
-        found["after"] = "\n".join(line for line in ros.tool("rosnode", "list").splitlines() if "relay" not in line)
-        assert "started core service" not in process.output
+        eventually(lambda: "/node" not in ros.tool("rosnode", "list"), DEADLINE, what="the nodes' end")
+        assert "started core service" not in process.output, "it must take our /rosout for the real one"
         return found
 
     both(shell, scenario)
