@@ -1,0 +1,181 @@
+"""``rmpa topic list|info|type|find``: what the graph holds."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from typing import TYPE_CHECKING
+
+import click
+
+from rmpa.cli.master import Graph, Master, choose_master, read_graph, read_topic, split_proxy
+from rmpa.cli.options import agent_option, json_option, master_option
+from rmpa.cli.output import coloured, duration, print_json, printable, warn
+from rmpa.core.errors import RmpaError
+
+if TYPE_CHECKING:
+    from rmpa.monitor.snapshot import TopicInfo
+
+
+def _graph(master: str | None, agent: str | None) -> tuple[Master, Graph]:
+    chosen = choose_master(master, agent, os.environ)
+    return chosen, asyncio.run(read_graph(chosen))
+
+
+def _ends(nodes: list[str]) -> list[dict[str, str]]:
+    """Publishers or subscribers for JSON: a proxy's with the peer and the node behind it."""
+    found = []
+    for node in nodes:
+        proxy = split_proxy(node)
+        found.append({"node": node} if proxy is None else {"node": node, "peer": proxy[0], "remote_node": proxy[1]})
+    return found
+
+
+def _topic_json(graph: Graph, name: str) -> dict[str, object]:
+    return {
+        "name": name,
+        "type": graph.types.get(name),
+        "peers": graph.peers(name),
+        "publishers": _ends(graph.publishers.get(name, [])),
+        "subscribers": _ends(graph.subscribers.get(name, [])),
+    }
+
+
+@click.command(
+    "list", epilog="\b\nExamples:\n  rmpa topic list\n  rmpa topic list -v /camera\n  rmpa topic list joystick:/\n"
+)
+@click.argument("namespace", default="")
+@click.option("-v", "--verbose", is_flag=True, help="Types and counts, publishers and subscribers apart.")
+@click.option("-p", "--publishers", is_flag=True, help="Only topics that have a publisher.")
+@click.option("-s", "--subscribers", is_flag=True, help="Only topics that have a subscriber.")
+@json_option
+@agent_option
+@master_option
+def list_(
+    namespace: str,
+    verbose: bool,
+    publishers: bool,
+    subscribers: bool,
+    as_json: bool,
+    agent: str | None,
+    master: str | None,
+) -> None:
+    """List topics, all or those of a NAMESPACE.
+
+    A topic that peers publish has their names behind it: /cmd  [joystick].
+    """
+    _, graph = _graph(master, agent)
+    wanted = read_topic(namespace) if namespace else None
+    names = [
+        name
+        for name in graph.topics
+        if (wanted is None or wanted.topic == "/" or f"{name}/".startswith(f"{wanted.topic}/"))
+        and (wanted is None or wanted.peer is None or wanted.peer in graph.peers(name))
+        and (not publishers or graph.publishers.get(name))
+        and (not subscribers or graph.subscribers.get(name))
+    ]
+    if as_json:
+        print_json([_topic_json(graph, name) for name in names])
+    elif verbose:
+        if not subscribers:
+            _verbose("Published topics", "publisher", graph, [n for n in names if n in graph.publishers])
+        if not publishers:
+            _verbose("Subscribed topics", "subscriber", graph, [n for n in names if n in graph.subscribers])
+    else:
+        for name in names:
+            click.echo(printable(name) + _mark(graph, name))
+
+
+def _mark(graph: Graph, name: str) -> str:
+    peers = graph.peers(name)
+    text = f"  [{', '.join(peers)}]" if peers else ""
+    return click.style(printable(text), fg="cyan") if text and coloured() else printable(text)
+
+
+def _verbose(title: str, what: str, graph: Graph, names: list[str]) -> None:
+    ends = graph.publishers if what == "publisher" else graph.subscribers
+    click.echo(f"{title}:")
+    for name in names:
+        count = len(ends[name])
+        kind = printable(graph.types.get(name, "unknown type"))
+        mark = _mark(graph, name) if what == "publisher" else ""
+        click.echo(f" * {printable(name)} [{kind}] {count} {what}{'s' if count != 1 else ''}{mark}")
+
+
+@click.command(epilog="\b\nExamples:\n  rmpa topic info /cmd\n")
+@click.argument("topic")
+@json_option
+@agent_option
+@master_option
+def info(topic: str, as_json: bool, agent: str | None, master: str | None) -> None:
+    """Show a topic's type, publishers and subscribers, and what of it crosses."""
+    wanted = read_topic(topic)
+    chosen, graph = _graph(master, agent)
+    graph.require(wanted.topic)
+    snapshot = chosen.snapshot()
+    crossing = next((t for t in snapshot.topics if t.name == wanted.topic), None) if snapshot else None
+    if as_json:
+        print_json(_topic_json(graph, wanted.topic) | {"mesh": crossing})
+        return
+    click.echo(f"Type: {printable(graph.types.get(wanted.topic, 'unknown'))}")
+    if crossing is not None and crossing.md5:
+        click.echo(f"MD5: {printable(crossing.md5)}")
+    for title, nodes in (("Publishers", graph.publishers), ("Subscribers", graph.subscribers)):
+        meant = [node for node in nodes.get(wanted.topic, []) if wanted.takes(node) or title == "Subscribers"]
+        click.echo(f"\n{title}:" + ("" if meant else " none"))
+        for node in meant:
+            proxy = split_proxy(node)
+            whence = "" if proxy is None else f"{proxy[1]} of peer {proxy[0]}, by its proxy "
+            click.echo(f" * {printable(whence + node)}")
+    if crossing is not None:
+        _print_crossing(crossing)
+
+
+def _print_crossing(crossing: TopicInfo) -> None:
+    click.echo("\nMesh:" + ("" if crossing.routes else " nothing of it crosses"))
+    if crossing.policy:
+        click.echo(f" * {'may cross' if crossing.crosses else 'stays home'}: {printable(crossing.policy)}")
+    for route in crossing.routes:
+        way = f"from {route.peer}" if route.direction == "in" else f"to {route.peer}"
+        last = "" if route.last_ago is None else f", last {duration(route.last_ago)} ago"
+        text = f"{way}: {route.node} {route.state}, {route.messages} messages, {route.dropped} dropped{last}"
+        click.echo(f" * {printable(text)}")
+        if route.problem:
+            warn(printable(f"{route.peer} {route.node}: {route.problem}"))
+    for mismatch in crossing.mismatches:
+        warn(printable(mismatch))
+
+
+@click.command("type", epilog="\b\nExamples:\n  rmpa topic type /cmd\n")
+@click.argument("topic")
+@json_option
+@agent_option
+@master_option
+def type_(topic: str, as_json: bool, agent: str | None, master: str | None) -> None:
+    """Print a topic's type."""
+    wanted = read_topic(topic)
+    _, graph = _graph(master, agent)
+    graph.require(wanted.topic)
+    kind = graph.types.get(wanted.topic)
+    if kind is None:
+        raise RmpaError(f"nobody has told the type of {wanted.topic} yet: its publisher does")
+    if as_json:
+        print_json({"name": wanted.topic, "type": kind})
+    else:
+        click.echo(printable(kind))
+
+
+@click.command(epilog="\b\nExamples:\n  rmpa topic find sensor_msgs/Joy\n")
+@click.argument("kind", metavar="TYPE")
+@json_option
+@agent_option
+@master_option
+def find(kind: str, as_json: bool, agent: str | None, master: str | None) -> None:
+    """Print the topics of a TYPE."""
+    _, graph = _graph(master, agent)
+    found = [name for name in graph.topics if graph.types.get(name) == kind]
+    if as_json:
+        print_json(found)
+    else:
+        for name in found:
+            click.echo(printable(name) + _mark(graph, name))

@@ -1,0 +1,169 @@
+"""``rmpa topic pub``: messages from values in YAML or JSON."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from typing import TYPE_CHECKING, Final
+
+import click
+
+from rmpa.cli.master import Master, choose_master, read_topic
+from rmpa.cli.options import agent_option, json_option, master_option
+from rmpa.cli.output import print_json, print_line
+from rmpa.cli.stream import run_stream, with_node
+from rmpa.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from rmpa.ros.aio.node import Node, Publisher
+    from rmpa.ros.messages import MessageType, Plain
+
+_ONCE_SECONDS: Final = 3.0
+"""How long a single message stays latched for subscribers to find us, as ``rostopic pub -1`` has it."""
+
+
+def read_values(texts: tuple[str, ...]) -> Plain:
+    """What the command line says of a message: nothing, one YAML value, or one for each field in order.
+
+    Raises:
+        ConfigError: It is not YAML.
+    """
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    values: list[Plain] = []
+    for text in texts:
+        try:
+            values.append(YAML(typ="safe", pure=True).load(text))
+        except (YAMLError, ValueError) as error:
+            problem = getattr(error, "problem", None) or str(error)
+            raise ConfigError("VALUES", f"not YAML: {problem}", f"in {text!r}") from None
+    if len(values) == 1 and values[0] is not None:
+        return values[0]
+    return values or None
+
+
+def fill_stamps(values: Plain, now_ns: int) -> Plain:
+    """Put the time where ``auto`` (a header) and ``now`` (a stamp) stand, as rostopic does."""
+    secs, nsecs = divmod(now_ns, 1_000_000_000)
+    stamp: dict[str, Plain] = {"secs": secs, "nsecs": nsecs}
+    if isinstance(values, list):
+        return [fill_stamps(value, now_ns) for value in values]
+    if not isinstance(values, dict):
+        return {"stamp": stamp} if values == "auto" else values
+    filled: dict[str, Plain] = {}
+    for name, value in values.items():
+        if name == "header" and value == "auto":
+            filled[name] = {"stamp": dict(stamp)}
+        elif value == "now" and name == "stamp":
+            filled[name] = dict(stamp)
+        else:
+            filled[name] = fill_stamps(value, now_ns) if isinstance(value, dict | list) else value
+    return filled
+
+
+@click.command(
+    context_settings={"ignore_unknown_options": True},
+    epilog="""\
+\b
+Without -r one message is published and kept for late subscribers until Ctrl-C; -1 ends after 3 seconds.
+A header may be written auto, and a stamp now.
+
+\b
+Examples:
+  rmpa topic pub -1 /chatter std_msgs/String hello
+  rmpa topic pub -r 10 /cmd_vel geometry_msgs/Twist '{linear: {x: 0.2}, angular: {z: 0.1}}'
+  rmpa topic pub /cmd sensor_msgs/Joy '{header: auto, axes: [0.5, 0.0]}'
+""",
+)
+@click.argument("topic")
+@click.argument("kind", metavar="TYPE")
+@click.argument("values", nargs=-1)
+@click.option("-r", "--rate", type=click.FloatRange(0.001, 10_000), help="Messages a second, until Ctrl-C.")
+@click.option("-1", "--once", is_flag=True, help="Publish one message and end.")
+@click.option("-l", "--latch", is_flag=True, help="Latch, with -r too: a new subscriber gets the last message.")
+@json_option
+@agent_option
+@master_option
+def pub(
+    topic: str,
+    kind: str,
+    values: tuple[str, ...],
+    rate: float | None,
+    once: bool,
+    latch: bool,
+    as_json: bool,
+    agent: str | None,
+    master: str | None,
+) -> None:
+    """Publish VALUES, in YAML or JSON, as messages of a TYPE on a TOPIC."""
+    from rmpa.ros.messages import MessageType
+
+    wanted = read_topic(topic)
+    if wanted.peer is not None:
+        raise ConfigError("TOPIC", f"{topic!r} names a peer", f"publish on {wanted.topic}: it crosses to every peer")
+    if once and rate is not None:
+        raise ConfigError("--once", "does not go with --rate", "choose one of them")
+    message_type = MessageType(kind)
+    plain = read_values(values)
+    message_type.make(fill_stamps(plain, 0))  # a mistake is told before anything is registered
+    chosen = choose_master(master, agent, os.environ)
+    latch = latch or rate is None
+    run_stream(lambda: _pub(chosen, wanted.topic, message_type, plain, rate, once=once, latch=latch, as_json=as_json))
+
+
+async def _pub(
+    master: Master,
+    topic: str,
+    kind: MessageType,
+    plain: Plain,
+    rate: float | None,
+    *,
+    once: bool,
+    latch: bool,
+    as_json: bool,
+) -> None:
+    async def publish(node: Node) -> None:
+        publisher = await node.advertise(topic, kind, latch=latch)
+        if rate is not None:
+            if not as_json:
+                print_line(f"publishing on {topic} at {rate:g} Hz; Ctrl-C to end")
+            await _repeat(node, publisher, kind, plain, rate, as_json=as_json)
+            return
+        _one(publisher, kind, plain, 1, as_json=as_json)
+        if not as_json:
+            how_long = f"{_ONCE_SECONDS:g} s" if once else "Ctrl-C"
+            print_line(f"published on {topic}, kept for late subscribers until {how_long}")
+        await _wait(node, _ONCE_SECONDS if once else None)
+
+    await with_node(master, "rmpa_pub", publish)
+
+
+def _one(publisher: Publisher, kind: MessageType, plain: Plain, number: int, *, as_json: bool) -> None:
+    now_ns = time.time_ns()
+    publisher.publish(kind.make(fill_stamps(plain, now_ns)))
+    if as_json:
+        line = {"topic": publisher.topic, "seq": number, "time": now_ns / 1e9, "subscribers": publisher.subscribers}
+        print_json(line, flush=True)
+
+
+async def _repeat(
+    node: Node, publisher: Publisher, kind: MessageType, plain: Plain, rate: float, *, as_json: bool
+) -> None:
+    loop = asyncio.get_running_loop()
+    begin = loop.time()
+    number = 0
+    while not node.stopped.is_set():
+        number += 1
+        _one(publisher, kind, plain, number, as_json=as_json)
+        # Each from the beginning: what one comes late is not added to the next.
+        await _wait(node, max(0.0, begin + number / rate - loop.time()))
+
+
+async def _wait(node: Node, seconds: float | None) -> None:
+    try:
+        async with asyncio.timeout(seconds):
+            await node.stopped.wait()
+    except TimeoutError:
+        pass
