@@ -251,7 +251,9 @@ def script(a: str, b: str, n: str) -> list[Call]:
         c("unregisterService", "/twin", "/s", RPC),
         c("getSystemState", "/x"),
         c("setParam", "/x", "/p", 11),
-        c("subscribeParam", "/twin", a, "/p"),
+        # Not here: subscribeParam from the old URI, which takes the name back at rosmaster and not at ours; see
+        # Registrations.subscribe_param.
+        c("registerSubscriber", "/twin", "/t3", s, a),
         c("getSystemState", "/x"),
         c("lookupNode", "/x", "/twin"),
         # many at once

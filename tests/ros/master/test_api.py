@@ -148,6 +148,24 @@ def test_late_unregisters_do_not_hit_the_new_node(master: Master) -> None:
     assert master.effects == [ParamUpdate(C, "/p/", 1)]
 
 
+def test_an_evicted_node_does_not_take_its_name_back_by_a_parameter(master: Master) -> None:
+    """Trap 33: roscpp subscribes a parameter while it obeys our shutdown; the newer node must not die of that."""
+    master("setParam", "/x", "/p", 5)
+    master("registerPublisher", "/twin", "/t", STRING, A)
+    master("registerPublisher", "/twin", "/t", STRING, C)
+    assert master.value("subscribeParam", "/twin", A, "/p") == 5
+    assert master.effects == []
+    assert master.value("lookupNode", "/x", "/twin") == C
+    master("setParam", "/x", "/p", 6)
+    assert master.effects == []
+    # A real registration does take it, and a name that is free is anybody's.
+    master("registerPublisher", "/twin", "/t", STRING, A)
+    assert Shutdown(C, "/twin", ("/t",)) in master.effects
+    master("unregisterPublisher", "/twin", "/t", A)
+    master("subscribeParam", "/twin", C, "/p")
+    assert master.value("lookupNode", "/x", "/twin") == C
+
+
 def test_a_dead_node_is_purged_and_its_subscribers_told(master: Master) -> None:
     master("registerSubscriber", "/s", "/t", "*", B)
     master("registerPublisher", "/dead", "/t", STRING, A)

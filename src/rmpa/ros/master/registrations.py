@@ -38,6 +38,8 @@ class Registrations:
         self._tables: dict[Kind, dict[str, dict[str, str]]] = {kind: {} for kind in Kind}
         self._service_uris: dict[str, str] = {}
         self._types: dict[str, str] = {}
+        # The URI that each node's name was last taken from, while the name is in use.
+        self._evicted: dict[str, str] = {}
         self._state: GraphState | None = None
         self.effects: list[Effect] = []
         self.changes: list[GraphChange] = []
@@ -130,8 +132,13 @@ class Registrations:
         self._register(Kind.SERVICE, service, node, api, retyped=retyped)
 
     def subscribe_param(self, key: str, node: str, api: str) -> None:
-        """Tell this node of changes below ``key``, which ends in ``/``."""
-        self._register(Kind.PARAM, key, node, api)
+        """Tell this node of changes below ``key``, which ends in ``/``.
+
+        A node that was pushed out does not take its name back by this. roscpp logs that it was asked to end, and
+        its log asks for a parameter with ``getCached``: at rosmaster, that kills the new node too.
+        """
+        if self._evicted.get(node) != api:
+            self._register(Kind.PARAM, key, node, api)
 
     def unregister(self, kind: Kind, key: str, node: str, api: str) -> bool:
         """Take a publisher, subscriber or parameter's subscriber away, if ``api`` is still that node's.
@@ -172,6 +179,7 @@ class Registrations:
         topics = list(found.keys[Kind.PUBLISHER])
         self._empty(node)
         self._nodes.pop(node, None)
+        self._evicted.pop(node, None)
         for topic in topics:
             self._tell_subscribers(topic)
         return True
@@ -184,6 +192,7 @@ class Registrations:
         if found is not None and found.api != api:
             self.effects.append(Shutdown(found.api, node, tuple(found.keys[Kind.PUBLISHER])))
             self._empty(node)
+            self._evicted[node] = found.api
             found = None
             # Its place in the order of nodes stays, as rosmaster has it.
         if found is None:
@@ -220,6 +229,7 @@ class Registrations:
         found = self._nodes.get(node)
         if found is not None and found.empty:
             del self._nodes[node]
+            self._evicted.pop(node, None)
             self._state = None
 
     def _changed(self, kind: Kind, key: str, node: str, api: str, *, added: bool) -> None:
