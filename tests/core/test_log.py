@@ -1,0 +1,55 @@
+"""How log lines look."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import re
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.core.log import configure_logging, room_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@pytest.fixture
+def stream() -> Iterator[io.StringIO]:
+    root = logging.getLogger()
+    before, level, raising = root.handlers[:], root.level, logging.raiseExceptions
+    yield io.StringIO()
+    root.handlers[:] = before
+    root.setLevel(level)
+    logging.raiseExceptions = raising
+
+
+def test_rooms() -> None:
+    assert [room_of(n) for n in ("rmpa.mesh.aio.mesh", "rmpa", "asyncio")] == ["mesh", "rmpa", "asyncio"]
+
+
+def test_text(stream: io.StringIO) -> None:
+    configure_logging("info", stream, as_json=False)
+    logging.getLogger("rmpa.mesh.aio.mesh").warning("! %s", "it\nis \x1b[31m")
+    logging.getLogger("rmpa.mesh").debug("hidden")
+    assert re.fullmatch(r"\d\d:\d\d:\d\d\.\d{3} warning mesh      ! it\\nis \\x1b\[31m\n", stream.getvalue())
+
+
+def test_json_with_a_traceback(stream: io.StringIO) -> None:
+    configure_logging("debug", stream, as_json=True)
+    try:
+        int("x")
+    except ValueError:
+        logging.getLogger("rmpa.bridge").exception("! failed\nat it")
+    (line,) = stream.getvalue().splitlines()
+    record = json.loads(line)
+    assert {k: record[k] for k in ("level", "room", "logger", "text")} == {
+        "level": "error",
+        "room": "bridge",
+        "logger": "rmpa.bridge",
+        "text": "! failed\nat it",
+    }
+    assert "ValueError: invalid literal" in record["traceback"]
+    assert record["time"].endswith("+00:00")
