@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 
+class PipeClosed(Exception):  # noqa: N818 - not an error: whoever reads our output has enough
+    """Standard output was closed; click would turn the BrokenPipeError into an exit of its own."""
+
+
 class LazyGroup(click.Group):
     """A click group whose commands live in modules of their own, under their own names.
 
@@ -37,6 +41,17 @@ class LazyGroup(click.Group):
         command = getattr(module, cmd_name.replace("-", "_"), None) or getattr(module, f"{cmd_name}_")
         assert isinstance(command, click.Command)  # noqa: S101 - a mistake in our own table
         return command
+
+    def invoke(self, ctx: click.Context) -> object:
+        """Run the command.
+
+        Raises:
+            PipeClosed: Whoever reads its output has closed it.
+        """
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError as error:
+            raise PipeClosed from error
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

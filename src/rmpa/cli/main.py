@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rmpa import __version__
-from rmpa.cli.lazy import LazyGroup
+from rmpa.cli.lazy import LazyGroup, PipeClosed
 from rmpa.core.errors import ConfigError, RmpaError
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         code = _run(arguments)
         sys.stdout.flush()
-    except BrokenPipeError:
+    except (BrokenPipeError, PipeClosed):
         # The reader has enough (`| head`). What is left in the buffer must not fail again at the interpreter's end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141

@@ -158,7 +158,7 @@ def split_proxy(node: str) -> tuple[str, str] | None:
     if not node.startswith(_PROXY):
         return None
     peer, slash, name = node.removeprefix(_PROXY).partition("/")
-    return (peer, f"/{name}") if slash and name else None
+    return (peer, f"/{name}") if peer and slash and name else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,123 @@
+"""The program run as a user runs it, beside a fake agent and our own core."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+import pytest
+
+from rmpa.monitor.aio.control_server import ControlServer, Handler
+from rmpa.monitor.snapshot import PingReply, Snapshot
+from rmpa.ros.aio.core import RosCore
+from tests.monitor.samples import SNAPSHOT
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Iterator
+
+DEADLINE = 30.0
+
+
+@dataclass
+class Place:
+    """One machine's runtime directory, and the environment that commands see."""
+
+    path: Path
+    environ: dict[str, str] = field(default_factory=dict)
+
+    def start(self, *arguments: str) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [sys.executable, "-m", "rmpa.cli.main", *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=self.environ,
+            cwd=self.path,
+        )
+
+    def run(self, *arguments: str) -> tuple[int, str, str]:
+        with self.start(*arguments) as process:
+            out, err = process.communicate(timeout=DEADLINE)
+        return process.returncode, out, err
+
+    def json(self, *arguments: str) -> list[dict[str, object]]:
+        code, out, err = self.run(*arguments)
+        assert code == 0, err
+        return [json.loads(line) for line in out.splitlines()]
+
+
+@pytest.fixture
+def place() -> Iterator[Place]:
+    with tempfile.TemporaryDirectory(prefix="rmpa-test-") as name:
+        kept = {k: v for k, v in os.environ.items() if not k.startswith(("ROS_", "RMPA_", "XDG_"))}
+        yield Place(Path(name), kept | {"RMPA_RUNTIME_DIR": name, "HOME": name, "NO_COLOR": "1"})
+
+
+class Background:
+    """An event loop in a thread of its own, for what commands talk to."""
+
+    def __init__(self) -> None:
+        self.loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self.loop.run_forever)
+        self._thread.start()
+
+    def do(self, work: Coroutine[object, object, None]) -> None:
+        asyncio.run_coroutine_threadsafe(work, self.loop).result(DEADLINE)
+
+    def close(self) -> None:
+        self.loop.call_soon_threadsafe(self.loop.stop)
+        self._thread.join(DEADLINE)
+        self.loop.close()
+
+
+@pytest.fixture
+def background() -> Iterator[Background]:
+    background = Background()
+    yield background
+    background.close()
+
+
+@pytest.fixture
+def agent(place: Place, background: Background) -> Iterator[Callable[..., None]]:
+    """Starts fake agents: by name, what they show, and how they answer a ping."""
+    servers: list[ControlServer] = []
+
+    def start(name: str = "base", snapshot: Snapshot = SNAPSHOT, ping: Handler | None = None) -> None:
+        times = iter([0.0004, None, 0.0006] * 100)
+        answer = ping or (lambda _: PingReply(times=(next(times),), remote="10.0.0.2:40002"))
+        server = ControlServer(place.path, name, {"snapshot": lambda _: snapshot, "ping": answer})
+        background.do(server.start())
+        servers.append(server)
+
+    yield start
+    for server in servers:
+        background.do(server.close())
+
+
+@pytest.fixture
+def core(background: Background) -> Iterator[RosCore]:
+    core: RosCore | None = None
+
+    async def start() -> None:
+        nonlocal core
+        core = RosCore("127.0.0.1", 0)
+        await core.start()
+
+    background.do(start())
+    assert core is not None
+    yield core
+    background.do(core.close())
+
+
+def with_core(uri: str) -> Snapshot:
+    """The sample of an agent whose core is at ``uri``."""
+    return msgspec.structs.replace(SNAPSHOT, agent=msgspec.structs.replace(SNAPSHOT.agent, core_uri=uri))

@@ -1,0 +1,90 @@
+"""The program as a whole: help, exit codes, quiet ends."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from rmpa import __version__
+from rmpa.cli.lazy import LazyGroup
+from rmpa.cli.main import cli, main
+
+if TYPE_CHECKING:
+    from tests.cli.conftest import Place
+
+
+def commands(group: LazyGroup, path: str = "rmpa") -> list[tuple[str, str, click.Command]]:
+    found: list[tuple[str, str, click.Command]] = []
+    for name, (_, text) in group.commands_at.items():
+        command = group.get_command(click.Context(group), name)
+        assert command is not None, name
+        found.append((f"{path} {name}", text, command))
+        if isinstance(command, LazyGroup):
+            found += commands(command, f"{path} {name}")
+    return found
+
+
+assert isinstance(cli, LazyGroup)
+ALL = commands(cli)
+
+
+@pytest.mark.parametrize(("path", "command"), [(path, command) for path, _, command in ALL])
+def test_each_command_has_help(path: str, command: click.Command) -> None:
+    result = CliRunner().invoke(cli, [*path.split()[1:], "--help"])
+    assert result.exit_code == 0
+    if not isinstance(command, LazyGroup) and path != "rmpa core":
+        assert "Examples:" in result.output, path
+
+
+@pytest.mark.parametrize(("path", "command"), [(path, command) for path, _, command in ALL])
+def test_each_command_but_those_without_an_answer_has_json(path: str, command: click.Command) -> None:
+    if path.split()[1] in ("peer", "topic") and not isinstance(command, LazyGroup):
+        assert any("--json" in parameter.opts for parameter in command.params), path
+
+
+def test_version() -> None:
+    assert CliRunner().invoke(cli, ["--version"]).output == f"rmpa {__version__}\n"
+
+
+def test_a_misspelt_command_is_told_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["topci", "list"]) == 2
+    assert "Did you mean topic?" in capsys.readouterr().err
+
+
+def test_a_setting_that_cannot_be_exits_2(place: Place) -> None:
+    code, out, err = place.run("up", "--name", "robot-1")
+    assert (code, out) == (2, "")
+    assert err.startswith("rmpa: --name: 'robot-1' is not a ROS base name")
+    assert "did you mean --name robot_1?" in err
+
+
+def test_a_mistake_in_the_file_names_file_line_and_key(place: Place) -> None:
+    (place.path / "rmpa.toml").write_text("[core]\nprot = 1\n")
+    assert place.run("up") == (2, "", "rmpa: rmpa.toml:2: core.prot: an unknown key; did you mean core.port?\n")
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_scripts(shell: str) -> None:
+    assert "_RMPA_COMPLETE" in CliRunner().invoke(cli, ["completion", shell]).output
+
+
+@pytest.mark.parametrize("module", ["rmpa.cli.main", "rmpa.cli.up", "rmpa.cli.peer", "rmpa.cli.topic_graph"])
+def test_heavy_packages_wait_until_they_are_needed(module: str) -> None:
+    importlib.import_module(module)
+    heavy = "{'rich', 'numpy', 'rosbags', 'ruamel', 'matplotlib'}"
+    code = f"import sys, {module}; sys.exit(' '.join({heavy} & set(sys.modules)) or 0)"
+    assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).stderr == b""
+
+
+def test_help_imports_no_command() -> None:
+    code = (
+        "import sys; from rmpa.cli.main import main; main(['--help']);"
+        "sys.exit(' '.join({'asyncio', 'msgspec', 'rmpa.cli.up', 'rmpa.cli.peer'} & set(sys.modules)) or 0)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).stderr == b""

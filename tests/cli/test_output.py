@@ -1,0 +1,102 @@
+"""Figures and messages as text."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.cli.master import read_topic, split_proxy
+from rmpa.cli.message_text import flatten, pick, shorten, to_text
+from rmpa.cli.output import duration, printable, size
+from rmpa.cli.topic_pub import fill_stamps, read_values
+from rmpa.core.errors import ConfigError, RmpaError
+
+if TYPE_CHECKING:
+    from rmpa.ros.messages import Plain
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (None, "-"),
+        (float("nan"), "-"),
+        (0.0, "0 µs"),
+        (0.000432, "432 µs"),
+        (0.0123, "12.30 ms"),
+        (-0.00125, "-1.25 ms"),
+        (0.5, "500 ms"),
+        (4.2, "4.2 s"),
+        (59.9, "59.9 s"),
+        (59.96, "1 min 0 s"),
+        (200, "3 min 20 s"),
+        (3599.9, "1 h 0 min"),
+        (7500, "2 h 5 min"),
+        (86400 * 3 + 3600 * 4, "3 d 4 h"),
+    ],
+)
+def test_durations(seconds: float | None, text: str) -> None:
+    assert duration(seconds) == text
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [(None, "-"), (0, "0 B"), (999, "999 B"), (1234, "1.23 kB"), (12_345_678, "12.3 MB"), (5e15, "5000 TB")],
+)
+def test_sizes(count: float | None, text: str) -> None:
+    assert size(count) == text
+
+
+def test_nothing_from_outside_moves_the_cursor() -> None:
+    assert printable("a\x1b[2J\nb") == "a\\x1b[2J\\nb"
+    assert to_text({"data": "\x1b[31m"}) == 'data: "\\x1b[31m"'
+
+
+def test_messages_as_text() -> None:
+    message: Plain = {"h": {"t": {"secs": 1, "nsecs": 2}}, "s": 'a"b', "l": [1, 2], "m": [{"x": 1.5}], "e": []}
+    assert to_text(message) == (
+        'h:\n  t:\n    secs: 1\n    nsecs: 2\ns: "a\\"b"\nl: [1, 2]\nm:\n  -\n    x: 1.5\ne: []'
+    )
+    short = (
+        "h:\n  t:\n    secs: 1\n    nsecs: 2\ns: <string length: 3>\nl: <array length: 2>\nm: <array length: 1>\ne: "
+    )
+    assert to_text(shorten(message, arrays=True, strings=True)).startswith(short)
+    assert list(flatten(message)) == [
+        ("field.h.t", "1000000002"),
+        ("field.s", 'a"b'),
+        ("field.l0", "1"),
+        ("field.l1", "2"),
+        ("field.m0.x", "1.5"),
+    ]
+
+
+def test_picking_a_field() -> None:
+    message: Plain = {"a": [{"b": [1, 2]}]}
+    assert pick(message, ["a[0]", "b[1]"]) == 2
+    for path in (["c"], ["a[1]"], ["a", "b"], ["a[x]"]):
+        with pytest.raises(RmpaError):
+            pick(message, path)
+
+
+def test_values_of_the_command_line() -> None:
+    assert read_values(()) is None
+    assert read_values(("hello",)) == "hello"
+    assert read_values(("{x: 1}",)) == {"x": 1}
+    assert read_values(("1", "[2, 3]")) == [1, [2, 3]]
+    with pytest.raises(ConfigError, match="not YAML"):
+        read_values(("{",))
+
+
+def test_stamps_are_filled() -> None:
+    filled = fill_stamps({"header": "auto", "poses": [{"stamp": "now", "text": "now"}]}, 1_000_000_002)
+    stamp = {"secs": 1, "nsecs": 2}
+    assert filled == {"header": {"stamp": stamp}, "poses": [{"stamp": stamp, "text": "now"}]}
+
+
+def test_proxies_and_topics() -> None:
+    assert split_proxy("/rmpa/base/ns/driver") == ("base", "/ns/driver")
+    assert [split_proxy(n) for n in ("/driver", "/rmpa/base", "/rmpa//x")][:2] == [None, None]
+    assert str(read_topic("joystick:cmd/")) == "joystick:/cmd"
+    for text in ("", ":", ":/x", "a b", "~x", "base:"):
+        with pytest.raises(ConfigError):
+            read_topic(text)
