@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := venv
-.PHONY: venv demo test tests style format types imports fuzz bench ros clean
+.PHONY: venv demo demo-kill demo-start test tests style format types imports fuzz bench ros clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -14,7 +14,10 @@ $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 venv: $(STAMP)  ## build .venv with everything that the commands below need
 
 demo: $(STAMP)  ## the paper's set-up (Fig. 7) on this machine: make demo [SECONDS=30] [JOYSTICK=/dev/input/js0]
-	$(BIN)/python examples/turtlebot/demo.py $(if $(SECONDS),--seconds $(SECONDS)) $(if $(JOYSTICK),--joystick $(JOYSTICK))
+	@$(BIN)/python examples/turtlebot/demo.py $(if $(SECONDS),--seconds $(SECONDS)) $(if $(JOYSTICK),--joystick $(JOYSTICK))
+
+demo-kill demo-start: $(STAMP)  ## kill -9 a module of the running demo, start it again: make demo-kill MODULE=base
+	@$(BIN)/python examples/turtlebot/demo.py $(@:demo-%=%) $(or $(MODULE),$(error name one: make $@ MODULE=base))
 
 test: $(STAMP) ros style types imports tests  ## everything, with Debian's ROS 1 where it can be installed
 

@@ -96,7 +96,9 @@ async def _look(watch: Watch) -> None:
 
 def _peers() -> dict[str, str]:
     with ControlClient(choose_agent(os.environ, HERE).path) as agent:
-        return {peer.name: peer.state for peer in agent.snapshot().peers}
+        peers = agent.snapshot().peers
+    # A module that came back has a new GUID; its ghost may still be listed beside it.
+    return {peer.name: peer.state for peer in sorted(peers, key=lambda peer: peer.state == "linked")}
 
 
 def _follow(descriptor: int, watch: Watch, screen: Screen, task: asyncio.Task[None] | None) -> None:

@@ -203,8 +203,9 @@ class Supervisor:
                 raise Refused(f"{name} does not run; `demo.py start {name}` starts it")
             at = time.monotonic()
             pids = ", ".join(str(child.pid) for child in module.children if child.runs)
-            await self._kill(module)
+            # Told first: on a busy machine the pc's agent may see it gone before we have buried it.
             self._news({"event": "killed", "module": name, "at": at})
+            await self._kill(module)
             if name == "pc":
                 print("the pc is killed, the others go on; start it: make demo-start MODULE=pc", file=sys.stderr)
             return f"{name} is killed (kill -9 of its agent and its node, processes {pids})"

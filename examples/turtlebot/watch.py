@@ -209,9 +209,10 @@ class Watch:
         for name, module in self._modules.items():
             if name == HERE:
                 state = "here"
-            elif name in states:
+            elif states.get(name) == "linked" or (name in states and module.state in {"waiting", states[name]}):
                 state = states[name]
             else:
+                # A killed peer stays in the roster for a while: its agent is called again. To the user it is gone.
                 state = "waiting" if module.state == "waiting" else "gone"
             if state == module.state:
                 continue

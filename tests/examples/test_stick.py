@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapping import velocity_order
+from stick import AXIS, BUTTON, EVENT, INIT, LinuxJoystick, Recording, StickState
+from unicycle import Pose
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+GOLDEN = bytes.fromhex(
+    "10270000 0000 81 00"  # button 0 is up, told at opening
+    "10270000 0000 82 01"  # axis 1 is in the middle, told at opening
+    "20270000 0180 02 01"  # axis 1 goes to -32767: stick full forward
+    "30270000 ff3f 02 00"  # axis 0 goes to 16383: half to the right
+    "40270000 0100 01 00"  # button 0 is held
+)
+
+
+def test_golden_bytes() -> None:
+    state = StickState()
+    state.feed(GOLDEN)
+    axes, buttons = state.deflections
+    assert axes == pytest.approx((-0.5, 1.0), abs=1e-4)
+    assert buttons == (1,)
+
+
+def test_byte_by_byte() -> None:
+    whole, pieces = StickState(), StickState()
+    whole.feed(GOLDEN)
+    for index in range(len(GOLDEN)):
+        pieces.feed(GOLDEN[index : index + 1])
+    assert pieces.deflections == whole.deflections
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_a_bounded_state(data: bytes) -> None:
+    state = StickState()
+    state.feed(data)
+    axes, buttons = state.deflections
+    assert all(-1 <= axis <= 1 for axis in axes)
+    assert set(buttons) <= {0, 1}
+    assert len(axes) <= 64
+    assert len(buttons) <= 64
+
+
+def test_the_most_negative_value_is_a_full_deflection() -> None:
+    state = StickState()
+    state.feed(EVENT.pack(0, -32768, AXIS | INIT, 0))
+    assert state.deflections[0] == (1.0,)
+
+
+def test_a_joystick_is_unplugged_and_comes_back(tmp_path: Path) -> None:
+    device = str(tmp_path / "js0")
+    said: list[str] = []
+    joystick = LinuxJoystick(device, said.append)
+    assert joystick.read() == ((), ())
+    assert "is gone (No such file or directory)" in said.pop()
+    assert joystick.read() == ((), ())
+    assert not said, "said once"
+
+    os.mkfifo(device)
+    keeper = os.open(device, os.O_RDWR)
+    os.write(keeper, EVENT.pack(0, 1, BUTTON, 0) + EVENT.pack(0, -32767, AXIS, 1))
+    assert joystick.read() == ((0.0, 1.0), (1,))
+    assert "is there" in said.pop()
+    assert joystick.read() == ((0.0, 1.0), (1,)), "what is held stays held"
+
+    os.close(keeper)
+    assert joystick.read() == ((), ()), "unplugged: everything is released"
+    assert "the robot stops" in said.pop()
+    joystick.close()
+
+
+def test_the_recorded_drive_is_a_minute_with_curves_and_ends_where_it_began() -> None:
+    recording = Recording()
+    assert len(recording.rows) == 600
+    pose, furthest = Pose(), 0.0
+    for _ in range(600):
+        pose = pose.moved(*velocity_order(*recording.read()), 0.1)
+        furthest = max(furthest, abs(pose.x), abs(pose.y))
+    assert (pose.x, pose.y, pose.heading) == pytest.approx((0, 0, 0), abs=0.01)
+    assert 1.0 < furthest < 5.0
+    assert recording.read() == recording.rows[0], "it loops"
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong"),
+    [
+        ("", "no recorded drive"),
+        ("forward,left,dead_man\n", "no recorded drive"),
+        ("forward,left\n0,0\n", "line 2: not forward,left,dead_man"),
+        ("forward,left,dead_man\n0,0,1\n0,up,1\n", "line 3: not forward,left,dead_man"),
+        ("forward,left,dead_man\n0,1.5,1\n", "line 2: a deflection beyond"),
+        ("forward,left,dead_man\n0,nan,1\n", "line 2: a deflection beyond"),
+        ("forward,left,dead_man\n0,0,7\n", "line 2: a deflection beyond"),
+    ],
+)
+def test_a_bad_recording_is_refused_with_its_line(tmp_path: Path, text: str, wrong: str) -> None:
+    path = tmp_path / "drive.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match=wrong):
+        Recording(path)
