@@ -110,7 +110,8 @@ class Station:
                 _log.error("! %s", event)
 
     def _link_up(self, link: MeshLink) -> None:
-        self.discovery.link_up(link.identity, link.remote_endpoint)
+        # Its beacons' port is its mesh port, whichever port an accepted connection came from.
+        self.discovery.link_up(link.identity, (link.remote_endpoint[0], link.identity.guid.port))
         self._bridge.link_up(link)
 
     def _link_down(self, link: MeshLink, _reason: str) -> None:

@@ -10,8 +10,7 @@ import psutil
 
 import rmpa
 from rmpa.bridge.imports import RouteState
-from rmpa.bridge.policy import OWN_NODE, Policy
-from rmpa.bridge.proxy_names import proxied_node
+from rmpa.bridge.policy import Policy, is_own
 from rmpa.core.aio.clock import SystemClock
 from rmpa.monitor.snapshot import AgentInfo, LinkInfo, PeerInfo, RouteInfo, Snapshot, TopicInfo
 
@@ -151,15 +150,15 @@ class View:
         state = self._core.state()
         routes: dict[str, list[RouteInfo]] = {}
         mismatches: dict[str, list[str]] = {}
-        for route in (*self._inbound(mismatches), *self._outbound()):
+        for route in (*self._inbound(mismatches), *self._outbound(mismatches)):
             routes.setdefault(route[0], []).append(route[1])
         names = sorted({*state.publishers, *state.subscribers, *routes})
         return tuple(
             self._topic(
                 name,
                 state.types.get(name, ""),
-                tuple(node for node in state.publishers.get(name, {}) if _is_local(node)),
-                tuple(node for node in state.subscribers.get(name, {}) if _is_local(node)),
+                tuple(node for node in state.publishers.get(name, {}) if not is_own(node)),
+                tuple(node for node in state.subscribers.get(name, {}) if not is_own(node)),
                 tuple(routes.get(name, ())),
                 tuple(mismatches.get(name, ())),
             )
@@ -216,10 +215,11 @@ class View:
             found.append((source.topic, info))
         return found
 
-    def _outbound(self) -> list[tuple[str, RouteInfo]]:
+    def _outbound(self, mismatches: dict[str, list[str]]) -> list[tuple[str, RouteInfo]]:
         found = []
         names = {attached.peer: attached.link.name for attached in self._bridge.attached()}
         for source, local in self._bridge.exports.offered.items():
+            mismatches.setdefault(source.topic, []).extend(self._bridge.mismatches(source))
             about = self._bridge.exports.description(source)
             flow = self._bridge.outbound.flows.get(source)
             for peer in self._bridge.exports.flowing(source):
@@ -237,7 +237,3 @@ class View:
                 )
                 found.append((source.topic, info))
         return found
-
-
-def _is_local(node: str) -> bool:
-    return node != OWN_NODE and proxied_node(node) is None

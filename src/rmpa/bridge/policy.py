@@ -30,6 +30,11 @@ class Decision:
     rule: str
 
 
+def is_own(node: str) -> bool:
+    """Whether a local node is the agent itself or stands for a node of another module."""
+    return node == OWN_NODE or node.startswith(OWN_NODE + "/")
+
+
 class Policy:
     """Judges sources by their topic, type and node.
 
@@ -42,7 +47,7 @@ class Policy:
 
     def judge(self, topic: str, type_name: str, node: str) -> Decision:
         """Decide about one source; the first "no" wins, in the order of the table below."""
-        if node == OWN_NODE or node.startswith(OWN_NODE + "/"):
+        if is_own(node):
             return Decision(False, f"{node} stands for a node of another module, or is the agent itself")
         for pattern, why in BUILT_IN_DENY.items():
             if matches(pattern, topic):

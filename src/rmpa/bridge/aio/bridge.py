@@ -26,12 +26,14 @@ from rmpa.bridge.messages import (
     decode,
     encode,
 )
-from rmpa.bridge.policy import OWN_NODE
+from rmpa.bridge.policy import OWN_NODE, is_own
 from rmpa.bridge.proxy_names import LOOPBACK, proxy_prefix
 from rmpa.core import limits
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.names import is_type_name
 from rmpa.ros.aio.slave_server import SlaveNode
+from rmpa.ros.master.effects import GraphChange, Kind
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -75,6 +77,7 @@ class Bridge:
         self._reconciler: asyncio.TimerHandle | None = None
         self._rescan: asyncio.Handle | None = None
         self._closed = False
+        self._types: dict[Source, str] = {}
         self._mismatches: dict[Source, dict[str, str]] = {}
         self.counters = Counters()
         self._refusals = RefusalLog(_log, self.counters)
@@ -106,7 +109,7 @@ class Bridge:
         """Follow the local graph."""
         self._loop = asyncio.get_running_loop()
         await self._node.start()
-        self._core.on_change(lambda _change: self._graph_changed())
+        self._core.on_change(self._graph_changed)
         self._scan()
         self._reconciler = self._loop.call_later(limits.RECONCILE_INTERVAL, self._reconcile)
 
@@ -211,7 +214,14 @@ class Bridge:
 
     # --- the local graph's side --------------------------------------------------------------------------------
 
-    def _graph_changed(self) -> None:
+    def _graph_changed(self, change: GraphChange) -> None:
+        if change.kind is Kind.PUBLISHER:
+            # The master keeps one type a topic, the last that anybody said; we need each publisher's own.
+            source = Source(change.name, change.node)
+            if not change.added:
+                self._types.pop(source, None)
+            elif is_type_name(change.type):
+                self._types[source] = change.type
         if self._rescan is None and not self._closed:
             self._rescan = self._loop.call_soon(self._scan)
 
@@ -219,10 +229,10 @@ class Bridge:
         self._rescan = None
         state = self._core.state()
         sources = {
-            Source(topic, node): LocalSource(state.types.get(topic, "*"), uri)
+            source: LocalSource(self._types.get(source) or state.types.get(source.topic, "*"), uri)
             for topic, nodes in state.publishers.items()
             for node, uri in nodes.items()
-            if node != OWN_NODE and not node.startswith(OWN_NODE + "/")
+            if not is_own((source := Source(topic, node)).node)
         }
         self._act(self._exports.graph(sources))
         self._act(self._imports.local_types({source.topic: local.type for source, local in sources.items()}))

@@ -64,6 +64,7 @@ class Inbound:
         self._on_demand = on_demand
         self._on_mismatch = on_mismatch
         self._proxies: dict[str, Proxy] = {}
+        self._wanted: dict[Source, str] = {}
         self._jobs: asyncio.Queue[Publish | Retract | None] = asyncio.Queue()
         self._task = asyncio.create_task(self._work(), name=f"proxies {prefix}")
         self.flows: dict[int, ImportFlow] = {}
@@ -80,10 +81,12 @@ class Inbound:
 
     def publish(self, action: Publish) -> None:
         """Let a source appear; takes a moment."""
+        self._wanted[action.source] = action.type
         self._jobs.put_nowait(action)
 
     def retract(self, action: Retract) -> None:
         """Let a source disappear: its data stops at once, its registration a moment later."""
+        self._wanted.pop(action.source, None)
         self._jobs.put_nowait(action)
 
     def describe(self, action: Describe) -> None:
@@ -140,6 +143,11 @@ class Inbound:
             node = SlaveNode(name, LOOPBACK, self._core.uri, on_shutdown=lambda reason: _not_here(name, reason))
             await node.start()
             proxy = self._proxies[source.node] = Proxy(node)
+        if self._wanted.get(source) != type_name:
+            # Retracted while the proxy's sockets were being made: to register it would change the topic's type.
+            if not proxy.publications:
+                await self._close_proxy(source.node)
+            return
         publication = Publication(
             source.topic,
             proxy.node.name,
