@@ -11,10 +11,11 @@ import msgspec
 import pytest
 
 from rmpa.core.errors import RmpaError
+from rmpa.monitor.snapshot import PeerInfo
 from tests.monitor.samples import SNAPSHOT
 
 if TYPE_CHECKING:
-    from rmpa.monitor.snapshot import PeerInfo, PingReply
+    from rmpa.monitor.snapshot import PingReply
     from tests.cli.conftest import Place
 
 Agent = Callable[..., None]
