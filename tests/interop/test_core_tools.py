@@ -57,6 +57,7 @@ def start_real(ros: Ros) -> Process:
 
 def normal(text: str) -> list[str]:
     """A tool's lines, without what differs from run to run."""
+    text = re.sub(r"\(\d+ - [^)]*\) \[\d+\]", "#", text)
     text = re.sub(r"127\.0\.0\.1:\d+|localhost:\d+", "HOST:PORT", text)
     text = re.sub(r"(?i)pid: \d+|\bport \d+|\[[^ ]*:\d+\]|time=[\d.]+ms|average: [\d.]+ms", "#", text)
     text = re.sub(r"[0-9a-f]{8}-[0-9a-f-]{27}|_\d+_\d+\b|\d{10}\.\d+|(n?secs): \d+", "#", text)
