@@ -1,0 +1,262 @@
+"""The demo as users run it, end to end: figures, a killed module, every way it may end, nothing left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import psutil
+import pytest
+
+from tests.interop.processes import Process, eventually
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+ROOT: Final = Path(__file__).parents[2]
+DEMO: Final = ROOT / "examples" / "turtlebot" / "demo.py"
+MODULES: Final = ("joystick", "velocity", "base", "pc")
+pytestmark = pytest.mark.timeout(120)
+
+
+@pytest.fixture
+def tidy(tmp_path: Path) -> Iterator[dict[str, str]]:
+    """The demo's environment, its temporary files in a directory that must be empty in the end."""
+    place = tmp_path / "t" if len(str(tmp_path)) < 50 else Path(f"/tmp/rmpa-demo-test-{os.getpid()}")
+    place.mkdir()
+    env = {key: value for key, value in os.environ.items() if not key.startswith(("ROS_", "RMPA_"))}
+    try:
+        yield {**env, "TMPDIR": str(place)}
+        assert not list(place.iterdir()), "files are left"
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+
+
+def family(demo: Process) -> list[psutil.Process]:
+    """All processes of a demo: the supervisor, its children, and theirs."""
+    supervisor = psutil.Process(demo.pid)
+    return [supervisor, *supervisor.children(recursive=True)]
+
+
+def open_ports(processes: list[psutil.Process]) -> set[int]:
+    return {
+        connection.laddr.port
+        for process in processes
+        for connection in process.net_connections()
+        if connection.status == psutil.CONN_LISTEN
+    }
+
+
+def assert_gone(processes: list[psutil.Process], ports: set[int]) -> None:
+    _, alive = psutil.wait_procs(processes, timeout=10)
+    assert not alive, "processes are left"
+    assert ports, "there was something to close"
+    for port in ports:
+        with socket.socket() as probe:
+            assert probe.connect_ex(("127.0.0.1", port)) != 0, f"port {port} is left open"
+
+
+def views(demo: Process) -> list[dict[str, Any]]:
+    """What the pc showed so far, one object a second."""
+    return [json.loads(line) for line in demo.output.splitlines() if line.startswith('{"seconds"')]
+
+
+def summary_of(demo: Process) -> dict[str, Any]:
+    (line,) = [line for line in demo.output.splitlines() if line.startswith('{"summary"')]
+    found: dict[str, Any] = json.loads(line)["summary"]
+    return found
+
+
+def states(view: dict[str, Any]) -> dict[str, str]:
+    return {name: module["state"] for name, module in view["modules"].items()}
+
+
+def wait_for_view(demo: Process, holds: Callable[[dict[str, Any]], bool], what: str) -> dict[str, Any]:
+    """Wait until one of the last views is as wanted."""
+
+    def look() -> list[dict[str, Any]]:
+        assert demo.returncode is None, f"the demo ended with {demo.returncode}\n{demo.output}"
+        return [view for view in views(demo)[-2:] if holds(view)]
+
+    return eventually(look, 30, what=what)[0]
+
+
+def flows(view: dict[str, Any]) -> bool:
+    return all(topic["rate"] > 0 for topic in view["topics"].values())
+
+
+def all_linked(view: dict[str, Any]) -> bool:
+    return states(view) == {"joystick": "linked", "velocity": "linked", "base": "linked", "pc": "here"}
+
+
+def test_the_paper_s_set_up_runs_and_leaves_nothing(tidy: dict[str, str]) -> None:
+    with Process([sys.executable, DEMO, "--seconds", "8", "--json"], env=tidy, name="demo") as demo:
+        wait_for_view(demo, lambda view: all_linked(view) and flows(view), "messages of all four modules")
+        processes = family(demo)
+        ports = open_ports(processes)
+        assert len(processes) == 9, "the supervisor; an agent and a node for each module"
+        assert demo.wait(30) == 0, demo.output
+    assert_gone(processes, ports)
+    summary = summary_of(demo)
+    assert states(summary) == {"joystick": "linked", "velocity": "linked", "base": "linked", "pc": "here"}
+    rates = {name: topic["rate"] for name, topic in summary["topics"].items()}
+    assert rates == {
+        "/command_information": pytest.approx(10, rel=0.2),
+        "/velocity_order": pytest.approx(10, rel=0.2),
+        "/odom": pytest.approx(50, rel=0.2),
+    }
+    for name in ("/command_information", "/odom"):
+        assert 0 < summary["topics"][name]["latency"]["p50"] < 1
+    assert 0 < summary["command_to_velocity"]["mean"] < 0.1
+    assert summary["pose"]["x"] != 0 or summary["pose"]["y"] != 0
+    poses = {(view["pose"]["x"], view["pose"]["y"]) for view in views(demo) if view["pose"]}
+    assert len(poses) > 2, "the robot drives"
+    assert all(module["first_message"] > 0 for module in summary["modules"].values())
+
+
+def test_a_killed_module_is_seen_gone_the_others_go_on_and_it_comes_back(tidy: dict[str, str]) -> None:
+    def command(*words: str) -> Process:
+        return Process([sys.executable, DEMO, *words], env=tidy, name=" ".join(words))
+
+    with Process([sys.executable, DEMO, "--json"], env=tidy, name="demo") as demo:
+        before = wait_for_view(demo, lambda view: all_linked(view) and flows(view), "messages of all modules")
+        with command("kill", "base") as kill:
+            assert kill.wait() == 0, kill.output
+            pids = [int(pid) for pid in re.findall(r"\d+", kill.output.partition("processes")[2])]
+        assert len(pids) == 2
+        assert not any(map(psutil.pid_exists, pids))
+        gone = wait_for_view(
+            demo,
+            lambda view: (
+                states(view)["base"] == "gone"
+                and view["topics"]["/odom"]["rate"] == 0
+                and view["topics"]["/velocity_order"]["rate"] > 0
+            ),
+            "base gone",
+        )
+        assert states(gone)["joystick"] == states(gone)["velocity"] == "linked"
+        assert (
+            gone["topics"]["/command_information"]["messages"] > before["topics"]["/command_information"]["messages"]
+        )
+
+        for words, answer in (
+            (("kill", "base"), "base does not run"),
+            (("start", "pc"), "pc runs already"),
+            (("kill", "bas"), "no module named 'bas': there are joystick, velocity, base, pc"),
+            (("kill", "base", "--demo", "1"), "no demo has the pid 1"),
+        ):
+            with command(*words) as refused:
+                assert refused.wait() == 1
+                assert answer in refused.output
+
+        with command("start", "base") as start:
+            assert start.wait() == 0, start.output
+        wait_for_view(demo, lambda view: all_linked(view) and flows(view), "base back")
+        assert demo.interrupt() == 0, demo.output
+    (restart,) = summary_of(demo)["restarts"]
+    assert restart["module"] == "base"
+    assert restart["seen_gone_after"] > 0
+    assert restart["back_after"] > 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_it_ends_in_order_when_it_is_told_to(tidy: dict[str, str], number: signal.Signals) -> None:
+    with Process([sys.executable, DEMO], env=tidy, name="demo") as demo:
+        demo.wait_for(r"base:linked.* ODOM [1-9]", 30)
+        processes = family(demo)
+        ports = open_ports(processes)
+        os.kill(demo.pid, number)
+        assert demo.wait(15) == 0, demo.output
+    assert_gone(processes, ports)
+    assert "Summary of" in demo.output
+    assert "Traceback" not in demo.output
+
+
+def test_it_can_be_interrupted_while_it_starts(tidy: dict[str, str]) -> None:
+    with Process([sys.executable, DEMO], env=tidy, name="demo") as demo:
+        eventually(lambda: len(family(demo)) > 3, 20, what="some children")
+        processes = family(demo)
+        os.kill(demo.pid, signal.SIGINT)
+        assert demo.wait(20) == 0, demo.output
+    _, alive = psutil.wait_procs(processes, timeout=10)
+    assert not alive
+    assert "Traceback" not in demo.output
+
+
+def test_children_die_with_a_killed_supervisor_and_the_next_demo_clears_its_files(tidy: dict[str, str]) -> None:
+    with Process([sys.executable, DEMO], env=tidy, name="demo") as demo:
+        demo.wait_for(r"base:linked", 30)
+        processes = family(demo)
+        ports = open_ports(processes)
+        os.kill(demo.pid, signal.SIGKILL)
+        assert demo.wait() == -signal.SIGKILL
+    assert_gone(processes, ports)
+    assert len(list(Path(tidy["TMPDIR"]).iterdir())) == 1, "nobody was left to remove it"
+    with Process([sys.executable, DEMO, "kill", "base"], env=tidy) as kill:
+        assert kill.wait() == 1
+        assert "no demo runs here" in kill.output
+    with Process([sys.executable, DEMO, "--seconds", "0.1"], env=tidy) as following:
+        assert following.wait(30) == 0, following.output
+
+
+def test_two_demos_on_one_machine_do_not_meet(tidy: dict[str, str]) -> None:
+    with (
+        Process([sys.executable, DEMO, "--json"], env=tidy, name="first") as first,
+        Process([sys.executable, DEMO, "--json"], env=tidy, name="second") as second,
+    ):
+        for demo in (first, second):
+            wait_for_view(demo, lambda view: all_linked(view) and flows(view), "messages of all modules")
+        with Process([sys.executable, DEMO, "kill", "base"], env=tidy) as kill:
+            assert kill.wait() == 1
+            assert "several demos run here; name one with --demo PID" in kill.output
+        with Process([sys.executable, DEMO, "kill", "base", "--demo", str(first.pid)], env=tidy) as kill:
+            assert kill.wait() == 0, kill.output
+        wait_for_view(first, lambda view: states(view)["base"] == "gone", "base of the first gone")
+        assert all_linked(views(second)[-1])
+        assert first.interrupt() == second.interrupt() == 0
+
+
+@pytest.mark.parametrize(
+    ("flags", "status", "text"),
+    [
+        (["--joystick", "/nowhere/js0"], 1, "--joystick /nowhere/js0: No such file or directory; there is "),
+        (["--joystick", "/etc/passwd"], 1, "--joystick /etc/passwd: is not a device"),
+        (["--seconds", "0"], 2, "0 is not a number of seconds"),
+        (["--seconds", "nan"], 2, "nan is not a number of seconds"),
+        (["--seconds", "soon"], 2, "soon is not a number of seconds"),
+    ],
+)
+def test_wrong_flags_are_refused_plainly(tidy: dict[str, str], flags: list[str], status: int, text: str) -> None:
+    with Process([sys.executable, DEMO, *flags], env=tidy) as demo:
+        assert demo.wait() == status
+        assert text in demo.output
+        assert "Traceback" not in demo.output
+
+
+def test_the_readme_s_commands(tidy: dict[str, str]) -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    commands = re.findall(r"^\$ make (demo\b[^#\n]*?) *(?:#.*)?$", readme, re.MULTILINE)
+    assert commands == ["demo", "demo-kill MODULE=base", "demo-start MODULE=base"]
+    # The environment that `make` would build first is the one that these tests run in.
+    make = ["make", "-C", str(ROOT), "-o", ".venv/.installed", f"BIN={Path(sys.executable).parent}"]
+    with Process([*make, *commands[0].split()], env=tidy, name="make demo") as demo:
+        demo.wait_for(r"base:linked.* ODOM [1-9]", 30)
+        processes = family(demo)
+        ports = open_ports(processes)
+        for command, wanted in ((commands[1], r"base:gone.* ODOM 0.0"), (commands[2], r"base:linked.* ODOM [1-9]")):
+            mark = demo.mark()
+            with Process([*make, *command.split()], env=tidy, name=command) as second_terminal:
+                assert second_terminal.wait() == 0, second_terminal.output
+            demo.wait_for(wanted, 30, since=mark)
+        demo.send(signal.SIGINT)  # to make as well, as a terminal does
+        demo.wait(20)
+    assert_gone(processes, ports)
+    assert "Summary of" in demo.output
+    assert re.search(r"base killed, seen gone after [\d.]+ s, back [\d.]+ s after its start", demo.output)
