@@ -130,27 +130,28 @@ class Delay(Figures):
         return f"average delay: {v['delay']:.4f}\n\t{spread}"
 
 
+def _show(figures: Figures, topic: str, *, as_json: bool) -> None:
+    if figures.fresh():
+        if as_json:
+            print_json({"topic": topic, **figures.values()}, flush=True)
+        else:
+            print_line(figures.text())
+    elif not as_json:
+        print_line("no new messages")
+
+
 def _watch(
     topic: str, figures: Figures, count: int | None, agent: str | None, master: str | None, *, as_json: bool
 ) -> None:
     wanted = read_topic(topic)
     chosen = choose_master(master, agent, os.environ)
 
-    def show() -> None:
-        if figures.fresh():
-            if as_json:
-                print_json({"topic": str(wanted), **figures.values()}, flush=True)
-            else:
-                print_line(figures.text())
-        elif not as_json:
-            print_line("no new messages")
-
     async def body(watch: Watch) -> None:
         if not as_json:
             print_line(f"subscribed to [{wanted}]")
         while not await watch.finished(_EVERY):
-            show()
-        show()
+            _show(figures, str(wanted), as_json=as_json)
+        _show(figures, str(wanted), as_json=as_json)
 
     def take(received: Received) -> None:
         if figures.flow.messages == count:
@@ -163,7 +164,7 @@ def _watch(
         try:
             await watch_topic(chosen, wanted, take, body)
         except _Enough:
-            show()
+            _show(figures, str(wanted), as_json=as_json)
 
     run_stream(run)
 
