@@ -60,6 +60,10 @@ Scores = dict[tuple[str, int], _Score]
 
 def measure(plan: Plan, console: Console, json: Path | None = None) -> dict[str, object]:
     """Run the plan, print the tables, write the files; return the result."""
+    if not machine.facts()["python_optimised"]:
+        console.print(
+            "this Python was built without optimisations: agents are slower than with the system's", style="yellow"
+        )
     late = machine.lateness(2.0)
     scores: Scores = {}
     with Bed() as bed:
