@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import itertools
 import json
 import os
+import shutil
 import signal
 import socket
 import sys
@@ -218,6 +220,10 @@ def is_linked(row: dict[str, object]) -> bool:
 
 def _short_dir(home: Path, host: Host) -> Path:
     """The runtime directory of a host in one test; a Unix socket's path must be short."""
-    path = Path(tempfile.gettempdir()) / f"rmpa-{os.getpid()}" / f"{abs(hash(str(home))) % 10**8:08d}-{host.name}"
-    path.mkdir(parents=True, exist_ok=True, mode=0o700)
+    ours = Path(tempfile.gettempdir()) / f"rmpa-test-{os.getpid()}"
+    if not ours.exists():
+        ours.mkdir(mode=0o700)
+        atexit.register(shutil.rmtree, ours, ignore_errors=True)
+    path = ours / f"{abs(hash(str(home))) % 10**8:08d}-{host.name}"
+    path.mkdir(exist_ok=True, mode=0o700)
     return path
