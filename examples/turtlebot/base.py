@@ -65,7 +65,7 @@ async def base(master_uri: str) -> None:
     def order(received: Received) -> None:
         robot.order(received.message.linear.x, received.message.angular.z, time.monotonic())
 
-    async with joined("base", master_uri) as node:
+    async with joined("base", master_uri, "nav_msgs/Odometry", "geometry_msgs/Twist") as node:
         publisher = await node.advertise("/odom", "nav_msgs/Odometry")
         await node.subscribe("/velocity_order", "geometry_msgs/Twist", order)
         async for _ in Rate(RATE):

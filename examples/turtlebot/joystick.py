@@ -19,7 +19,7 @@ RATE = 10
 
 async def joystick(master_uri: str, stick: Stick) -> None:
     """Publish the stick's state as ``sensor_msgs/Joy`` on ``/command_information``."""
-    async with joined("joystick", master_uri) as node:
+    async with joined("joystick", master_uri, "sensor_msgs/Joy") as node:
         publisher = await node.advertise("/command_information", "sensor_msgs/Joy")
         async for _ in Rate(RATE):
             axes, buttons = stick.read()

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from rmpa.ros.aio.node import Node
+from rmpa.ros.messages import MessageType
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Coroutine
@@ -34,8 +35,16 @@ def arguments(description: str | None) -> argparse.ArgumentParser:
 
 
 @contextlib.asynccontextmanager
-async def joined(name: str, master_uri: str) -> AsyncIterator[Node]:
-    """A node at the module's core, once that is up: agent and nodes may be started in any order."""
+async def joined(name: str, master_uri: str, *types: str) -> AsyncIterator[Node]:
+    """A node at the module's core, once that is up: agent and nodes may be started in any order.
+
+    Args:
+        name: The node's.
+        master_uri: The core's.
+        types: Message types that it uses; what reads and writes them is made while the core starts.
+    """
+    for kind in map(MessageType, types):
+        kind.deserialize(kind.serialize(kind.make()))
     address = urlsplit(master_uri)
     while True:
         try:

@@ -46,7 +46,7 @@ async def pc(master_uri: str, screen: Screen, *, events: bool) -> None:
     looking = asyncio.create_task(_look(watch))
     try:
         with screen:
-            async with joined("pc", master_uri) as node:
+            async with joined("pc", master_uri, *(about.type for about in TOPICS.values())) as node:
                 await _subscribe(node, watch)
                 async for _ in Rate(screen.rate):
                     view = watch.view(time.monotonic())

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 async def velocity(master_uri: str) -> None:
     """Answer each ``sensor_msgs/Joy`` with a ``geometry_msgs/Twist`` on ``/velocity_order``, at once."""
-    async with joined("velocity", master_uri) as node:
+    async with joined("velocity", master_uri, "sensor_msgs/Joy", "geometry_msgs/Twist") as node:
         publisher = await node.advertise("/velocity_order", "geometry_msgs/Twist")
 
         def command(received: Received) -> None:
