@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import psutil
 import pytest
 
+from stick import AXIS, BUTTON, EVENT
 from tests.interop.processes import Process, eventually
 
 if TYPE_CHECKING:
@@ -221,6 +222,37 @@ def test_two_demos_on_one_machine_do_not_meet(tidy: dict[str, str]) -> None:
         wait_for_view(first, lambda view: states(view)["base"] == "gone", "base of the first gone")
         assert all_linked(views(second)[-1])
         assert first.interrupt() == second.interrupt() == 0
+
+
+def test_a_real_joystick_steers_and_may_be_unplugged(tidy: dict[str, str], tmp_path: Path) -> None:
+    device = tmp_path / "js0"
+    os.mkfifo(device)
+    plug = os.open(device, os.O_RDWR)
+    with Process([sys.executable, DEMO, "--json", "--joystick", device], env=tidy, name="demo") as demo:
+        os.write(plug, EVENT.pack(0, 1, BUTTON, 0) + EVENT.pack(0, -32767, AXIS, 1))
+        wait_for_view(demo, lambda view: bool(view["pose"]) and view["pose"]["speed"] == 0.65, "full speed ahead")
+        os.close(plug)
+        stopped = wait_for_view(
+            demo, lambda view: len(view["notes"]) == 2 and view["pose"]["speed"] == 0, "a stop and why"
+        )
+        assert stopped["topics"]["/command_information"]["rate"] > 0, "it goes on to publish"
+        assert "is gone (end of file): the robot stops" in stopped["notes"][-1]
+        assert stopped["pose"]["y"] == pytest.approx(0, abs=1e-9)
+        assert demo.interrupt() == 0, demo.output
+
+
+def test_the_pc_itself_can_be_killed(tidy: dict[str, str]) -> None:
+    with Process([sys.executable, DEMO, "--json"], env=tidy, name="demo") as demo:
+        wait_for_view(demo, flows, "messages")
+        with Process([sys.executable, DEMO, "kill", "pc"], env=tidy) as kill:
+            assert kill.wait() == 0, kill.output
+        demo.wait_for("the pc is killed, the others go on")
+        count = len(views(demo))
+        with Process([sys.executable, DEMO, "start", "pc"], env=tidy) as start:
+            assert start.wait() == 0, start.output
+        eventually(lambda: len(views(demo)) > count and flows(views(demo)[-1]), 30, what="a table again")
+        assert demo.interrupt() == 0, demo.output
+    assert summary_of(demo)["modules"]["pc"]["first_message"] > 0
 
 
 @pytest.mark.parametrize(
