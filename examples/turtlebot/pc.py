@@ -142,6 +142,7 @@ class Screen:
         self._json = as_json
         self._console = Console()
         self._live: Live | None = None
+        self._summarised = False
         if self._console.is_terminal and not as_json:
             self._live = Live(console=self._console, auto_refresh=False)
         self._unicode = "utf" in (sys.stdout.encoding or locale.getpreferredencoding()).lower()
@@ -166,11 +167,12 @@ class Screen:
 
     def note(self, text: str) -> None:
         """Show a note at once where lines are printed; the table and JSON show it with the rest."""
-        if not self._live and not self._json:
+        if not self._live and not self._json and not self._summarised:
             print(f"        {text}", flush=True)
 
     def summarise(self, view: View) -> None:
         """Show the whole run."""
+        self._summarised = True
         if self._json:
             print(table.json_summary(view), flush=True)
         else:

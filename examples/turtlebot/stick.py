@@ -110,7 +110,8 @@ class LinuxJoystick:
         self._path = path
         self._say = say
         self._fd = -1
-        self._plugged = True
+        self._working = False
+        self._missed = False
         self._state = StickState()
 
     def read(self) -> Deflections:
@@ -118,8 +119,6 @@ class LinuxJoystick:
         try:
             if self._fd < 0:
                 self._fd = os.open(self._path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-                self._say(f"joystick {self._path} is there: hold button 1 and steer with the left stick")
-                self._plugged = True
             self._read_events()
         except OSError as error:
             self._lost(error)
@@ -140,12 +139,16 @@ class LinuxJoystick:
             if not data:
                 raise OSError("end of file")
             self._state.feed(data)
+            if not self._working:
+                # Said at its first words, not at opening: one with a loose plug opens, and is gone again.
+                self._working = True
+                self._say(f"joystick {self._path} is there: hold button 1 and steer with the left stick")
 
     def _lost(self, error: OSError) -> None:
         self.close()
         self._state = StickState()
-        if self._plugged:
-            self._plugged = False
+        if self._working or not self._missed:
+            self._working, self._missed = False, True
             why = error.strerror or str(error)
             self._say(f"joystick {self._path} is gone ({why}): the robot stops; plug it in again to go on")
 

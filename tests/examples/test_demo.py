@@ -57,6 +57,8 @@ def open_ports(processes: list[psutil.Process]) -> set[int]:
 
 def assert_gone(processes: list[psutil.Process], ports: set[int]) -> None:
     _, alive = psutil.wait_procs(processes, timeout=10)
+    for process in alive:
+        process.kill()
     assert not alive, "processes are left"
     assert ports, "there was something to close"
     for port in ports:

@@ -75,6 +75,8 @@ def test_a_joystick_is_unplugged_and_comes_back(tmp_path: Path) -> None:
     os.close(keeper)
     assert joystick.read() == ((), ()), "unplugged: everything is released"
     assert "the robot stops" in said.pop()
+    assert joystick.read() == ((), ())
+    assert not said, "it can be opened but says nothing: still gone, and said once"
     joystick.close()
 
 
