@@ -27,6 +27,7 @@ async def until(wanted: Callable[[], bool]) -> None:
             await asyncio.sleep(0.01)
 
 
+@pytest.mark.trap(33)
 @KINDS
 async def test_a_twin_pushes_the_older_node_out_and_only_that(kind: str, shell: ShellFactory) -> None:
     core = RosCore(port=0)
@@ -49,6 +50,7 @@ async def test_a_twin_pushes_the_older_node_out_and_only_that(kind: str, shell: 
     await core.close()
 
 
+@pytest.mark.trap(40)
 @KINDS
 async def test_a_killed_node_is_gone_at_a_hint(kind: str, shell: ShellFactory) -> None:
     core = RosCore(port=0)
@@ -63,6 +65,7 @@ async def test_a_killed_node_is_gone_at_a_hint(kind: str, shell: ShellFactory) -
     await core.close()
 
 
+@pytest.mark.trap(18, 31)
 @KINDS
 async def test_a_stopped_node_is_not_purged_and_hears_the_latest_when_it_goes_on(
     kind: str, shell: ShellFactory

@@ -55,6 +55,7 @@ def test_killed_agent_of_the_listening_side_comes_back(modules: ModuleFactory) -
     assert (report["gaps"], report["doubled"]) == (0, 0)
 
 
+@pytest.mark.trap(40)
 def test_killed_talker_leaves_every_graph(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     talker = a.ros.roscpp("talker", topic="/chatter", rate=100)
@@ -64,6 +65,7 @@ def test_killed_talker_leaves_every_graph(modules: ModuleFactory) -> None:
     _wait_no_publisher(b, "/chatter")
 
 
+@pytest.mark.trap(14)
 def test_restarted_talker_is_heard_again_by_the_same_listener(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     heard = b.ros.rospy("listener", topic="/chatter")
@@ -131,6 +133,7 @@ def test_cable_out_between_two_of_three(modules: ModuleFactory) -> None:
     assert (report["gaps"], report["doubled"]) == (0, 0)
 
 
+@pytest.mark.trap(18)
 def test_frozen_agent_is_retracted_and_comes_back(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     a.ros.roscpp("talker", topic="/chatter", rate=100)
@@ -153,6 +156,7 @@ def test_a_peer_that_ends_in_order_leaves_nothing(modules: ModuleFactory) -> Non
     b.wait_no_topic("/chatter", 3.0)
 
 
+@pytest.mark.trap(38)
 def test_mismatched_types_are_refused_loudly_on_both_sides(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     a.ros.rospy("talker", topic="/mixed", rate=50, type="String")

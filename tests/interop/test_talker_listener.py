@@ -36,6 +36,7 @@ def test_both_directions_at_once(modules: ModuleFactory, client: str) -> None:
         whole(heard.wait_event("done"), 100)
 
 
+@pytest.mark.trap(37)
 def test_one_topic_published_and_heard_everywhere_neither_loops_nor_doubles(modules: ModuleFactory) -> None:
     everyone = modules("a", "b", "c")
     hears = [module.ros.roscpp("listener", topic="/shared") for module in everyone]
@@ -55,6 +56,7 @@ def test_echo_node_answers_across(modules: ModuleFactory, client: str) -> None:
     assert flows(heard, 50)["bad"] == 0
 
 
+@pytest.mark.trap(10)
 def test_two_latched_sources_both_reach_a_late_listener_once(modules: ModuleFactory) -> None:
     a, b, c = modules("a", "b", "c")
     for source, module in enumerate((a, b), start=1):
@@ -91,6 +93,7 @@ def test_stock_tools_see_the_remote_topic_as_their_own(modules: ModuleFactory) -
     assert "/chatter" in b.ros.tool("rostopic", "list", "-p")
 
 
+@pytest.mark.trap(36)
 def test_what_is_home_stays_home(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     a.ros.roscpp("talker", "__name:=speaker", topic="/chatter", rate=10)

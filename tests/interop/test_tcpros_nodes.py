@@ -123,6 +123,7 @@ async def test_a_real_talker_is_heard_to_the_byte(
     assert (report["count"], report["bad"], report["gaps"], report["doubled"]) == (count, 0, 0, 0)
 
 
+@pytest.mark.trap(2)
 @libraries
 async def test_the_real_talkers_own_definition_is_handed_on(node: Node, ros: Ros, library: str) -> None:
     got: list[Received] = []
@@ -137,6 +138,7 @@ async def test_the_real_talkers_own_definition_is_handed_on(node: Node, ros: Ros
     assert got[0].kind.md5sum == kind.md5sum
 
 
+@pytest.mark.trap(10)
 @libraries
 async def test_trap_10_a_real_latched_message_reaches_us_late(node: Node, ros: Ros, library: str) -> None:
     talker = ros.node(library, "talker", count=1, latch=True)
@@ -147,6 +149,7 @@ async def test_trap_10_a_real_latched_message_reaches_us_late(node: Node, ros: R
     assert got[0].header["latching"] == "1"
 
 
+@pytest.mark.trap(10)
 @libraries
 async def test_trap_10_our_latched_message_reaches_each_listener_once(node: Node, ros: Ros, library: str) -> None:
     publisher = await node.advertise("/chatter", BYTES, latch=True)
@@ -160,6 +163,7 @@ async def test_trap_10_our_latched_message_reaches_each_listener_once(node: Node
     assert (report["count"], report["last"], report["doubled"], report["gaps"]) == (2, 4, 0, 0)
 
 
+@pytest.mark.trap(9)
 @libraries
 @pytest.mark.parametrize("nodelay", [True, False])
 async def test_trap_9_tcp_nodelay_is_what_the_listener_asks_for(
@@ -172,6 +176,7 @@ async def test_trap_9_tcp_nodelay_is_what_the_listener_asks_for(
     assert link._sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == nodelay
 
 
+@pytest.mark.trap(1)
 async def test_trap_1_rostopic_echo_takes_any_type_and_prints_ours(node: Node, ros: Ros) -> None:
     publisher = await node.advertise("/joy", "sensor_msgs/Joy", latch=True)
     publisher.publish(publisher.make({"header": {"frame_id": "pad"}, "axes": [0.5], "buttons": [1, 0]}))
@@ -180,6 +185,7 @@ async def test_trap_1_rostopic_echo_takes_any_type_and_prints_ours(node: Node, r
     assert "axes: [0.5]" in output
 
 
+@pytest.mark.trap(2)
 async def test_trap_2_rosbag_records_our_definition_byte_for_byte(node: Node, ros: Ros) -> None:
     publisher = await node.advertise("/joy", "sensor_msgs/Joy", latch=True)
     publisher.publish(publisher.make({"axes": [0.5]}))
@@ -197,6 +203,7 @@ async def test_trap_2_rosbag_records_our_definition_byte_for_byte(node: Node, ro
     assert (md5, axes) == (MessageType("sensor_msgs/Joy").md5sum, [0.5])
 
 
+@pytest.mark.trap(5)
 @libraries
 async def test_trap_5_a_listener_of_another_type_is_refused_and_gets_nothing(
     node: Node, ros: Ros, library: str
@@ -211,6 +218,7 @@ async def test_trap_5_a_listener_of_another_type_is_refused_and_gets_nothing(
     assert not listener.events("first")
 
 
+@pytest.mark.trap(15, 38)
 @libraries
 async def test_a_real_listener_waits_while_the_type_is_not_known(core: RosCore, ros: Ros, library: str) -> None:
     proxy = SlaveNode("/proxy", "127.0.0.1", core.uri)
@@ -233,6 +241,7 @@ async def test_a_real_listener_waits_while_the_type_is_not_known(core: RosCore, 
     await proxy.close()
 
 
+@pytest.mark.trap(16)
 @libraries
 async def test_trap_16_a_withdrawn_topic_is_left_by_real_listeners_and_found_again(
     node: Node, ros: Ros, library: str
@@ -265,6 +274,7 @@ async def test_a_killed_talker_is_heard_again_when_it_is_back(node: Node, ros: R
     assert subscriber.publishers == 1
 
 
+@pytest.mark.trap(19)
 @libraries
 async def test_trap_19_a_stopped_listener_delays_nobody(node: Node, ros: Ros, library: str) -> None:
     publisher = await node.advertise("/chatter", BYTES, queue_messages=5)
@@ -283,6 +293,7 @@ async def test_trap_19_a_stopped_listener_delays_nobody(node: Node, ros: Ros, li
     assert drops["/fast"] == 0
 
 
+@pytest.mark.trap(11)
 @libraries
 async def test_trap_11_a_silent_connection_hurts_no_real_listener(node: Node, ros: Ros, library: str) -> None:
     publisher = await node.advertise("/chatter", BYTES)
@@ -291,6 +302,7 @@ async def test_trap_11_a_silent_connection_hurts_no_real_listener(node: Node, ro
         await asyncio.wait_for(publisher.wait_for_subscriber(), DEADLINE)
 
 
+@pytest.mark.trap(21, 22)
 @libraries
 async def test_trap_21_requestTopic_answers_as_rospy_does(node: Node, ros: Ros, core: RosCore, library: str) -> None:  # noqa: N802
     ros.node(library, "talker", name="talker")

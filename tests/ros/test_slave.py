@@ -55,6 +55,7 @@ def api(node: Node) -> SlaveApi:
     return made
 
 
+@pytest.mark.trap(21, 22)
 @pytest.mark.parametrize(
     ("method", "params", "reply"),
     [
@@ -92,6 +93,7 @@ def test_without_a_master_its_uri_is_a_failure(node: Node) -> None:
     assert SlaveApi("/n", "", 42, node).dispatch("getMasterUri", ["/c"]) == (0, "master URI not set", "")
 
 
+@pytest.mark.trap(29)
 def test_bus_info_is_in_rospys_form(api: SlaveApi) -> None:
     assert api.dispatch("getBusInfo", ["/c"]).value == [
         [1, "/listener", "o", "TCPROS", "/t", True, "port 1"],
@@ -114,6 +116,7 @@ def test_publisher_updates_reach_the_node(api: SlaveApi, node: Node) -> None:
     assert node.calls == [("publishers", "/in", ["http://x:1/"]), ("publishers", "/in", [])]
 
 
+@pytest.mark.trap(34)
 def test_param_updates_lose_the_slash_at_their_end(api: SlaveApi, node: Node) -> None:
     assert api.dispatch("paramUpdate", ["/master", "/followed/", {}]) == (1, "", 0)
     assert api.dispatch("paramUpdate", ["/master", "/other", 1]) == (-1, "not subscribed", 0)
@@ -121,6 +124,7 @@ def test_param_updates_lose_the_slash_at_their_end(api: SlaveApi, node: Node) ->
     assert [call[1] for call in node.calls] == ["/followed", "/other", "/"]
 
 
+@pytest.mark.trap(29)
 def test_the_reason_of_a_shutdown_may_be_missing(api: SlaveApi, node: Node) -> None:
     assert api.dispatch("shutdown", ["/master", "replaced"]) == (1, "shutdown", 0)
     assert api.dispatch("shutdown", ["/master"]) == (1, "shutdown", 0)

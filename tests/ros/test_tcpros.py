@@ -47,6 +47,7 @@ def test_a_header_is_these_bytes() -> None:
     assert parse_header(GOLDEN) == ({"topic": "/ta", "md5sum": "*"}, 29, 4)
 
 
+@pytest.mark.trap(7)
 def test_a_header_is_read_byte_by_byte() -> None:
     wire = encode_header({"topic": "/ta", "md5sum": "*"}) + b"rest"
     for end in range(len(wire) - 4):
@@ -79,18 +80,22 @@ def test_arbitrary_bytes_are_a_header_or_an_error(data: bytes) -> None:
     assert again == fields
 
 
+@pytest.mark.trap(7)
 def test_a_value_may_hold_equal_signs() -> None:
     assert decode_header(header(b"message_definition=int32 X=1\n")[4:]) == {"message_definition": "int32 X=1\n"}
 
 
+@pytest.mark.trap(7)
 def test_of_two_fields_with_one_name_the_last_counts() -> None:
     assert decode_header(header(b"topic=/a", b"topic=/b")[4:]) == {"topic": "/b"}
 
 
+@pytest.mark.trap(7)
 def test_blanks_around_a_name_are_taken_off_and_those_of_the_value_stay() -> None:
     assert decode_header(header(b" topic = /a")[4:]) == {"topic": " /a"}
 
 
+@pytest.mark.trap(7)
 def test_bytes_that_are_not_utf8_survive() -> None:
     wire = header(b"message_definition=# 20 \xb0C\n")
     fields, _, _ = parse_header(wire)
@@ -98,6 +103,7 @@ def test_bytes_that_are_not_utf8_survive() -> None:
     assert encode_header(fields) == wire
 
 
+@pytest.mark.trap(6, 7)
 @pytest.mark.parametrize(
     ("body", "text"),
     [
@@ -113,6 +119,7 @@ def test_a_malformed_header_is_refused(body: bytes, text: str) -> None:
         decode_header(body)
 
 
+@pytest.mark.trap(6)
 def test_a_header_of_half_a_gigabyte_is_refused_from_its_length_alone() -> None:
     with pytest.raises(LimitExceeded, match=r"connection header of 542393671 bytes exceeds the limit of 4194304"):
         parse_header(b"GET ")
@@ -150,6 +157,7 @@ def test_a_message_beyond_the_limit_is_refused_behind_those_before_it() -> None:
 SUBSCRIBER = subscriber_header("/t", "/s", type_name="std_msgs/String", md5sum=MD5)
 
 
+@pytest.mark.trap(1, 4)
 @pytest.mark.parametrize(
     ("change", "error"),
     [
@@ -182,6 +190,7 @@ def test_while_the_type_is_unknown_only_the_rest_is_checked() -> None:
     assert check_subscriber({**SUBSCRIBER, "topic": "/u"}, "/t", "/p", None) is not None
 
 
+@pytest.mark.trap(2)
 def test_a_publisher_answers_with_all_fields() -> None:
     assert publisher_header("/t", "/p", Description("std_msgs/String", MD5, "string data\n", latching=True)) == {
         "callerid": "/p",
@@ -194,12 +203,14 @@ def test_a_publisher_answers_with_all_fields() -> None:
     assert publisher_header("/t", "/p", STRING)["latching"] == "0"
 
 
+@pytest.mark.trap(2)
 @pytest.mark.parametrize("description", [Description("*", MD5, ""), Description("std_msgs/String", "*", "")])
 def test_a_publisher_never_answers_with_a_wildcard(description: Description) -> None:
     with pytest.raises(ValueError, match="cannot have the type"):
         publisher_header("/t", "/p", description)
 
 
+@pytest.mark.trap(1)
 @pytest.mark.parametrize(
     ("fields", "error"),
     [

@@ -94,11 +94,12 @@ def test_golden_response_and_fault() -> None:
     assert (caught.value.code, caught.value.text) == (4, "no <such> ? method")
 
 
+@pytest.mark.trap(27)
 @pytest.mark.parametrize(
     "trap", ["<string/>", "<value/>", "<array/>", "<data/>", "<struct/>", "<nil", "<i8>", "CDATA", "<!--"]
 )
 def test_nothing_is_written_that_xmlrpcpp_stops_at(trap: str) -> None:
-    """Trap 27: XmlRpc++ matches strings, and what it does not know ends its parsing without an error."""
+    """XmlRpc++ matches strings, and what it does not know ends its parsing without an error."""
     written = serialize_response(
         ["", [], {}, {"": ""}, [[]], "<string/>", "]]>", "&#10;", True, dt.datetime(1, 1, 1)]  # noqa: DTZ001
     )
@@ -107,6 +108,7 @@ def test_nothing_is_written_that_xmlrpcpp_stops_at(trap: str) -> None:
     assert b"<boolean>true" not in written
 
 
+@pytest.mark.trap(27)
 def test_untyped_strings_as_roscpp_sends_them() -> None:
     body = call_with("<value>/talker</value>").replace(b"</params>", b"<param><value></value></param></params>")
     assert parse_call(body) == ("m", ("/talker", ""))
@@ -119,6 +121,7 @@ def test_empty_tags_are_read() -> None:
     assert parse_call(call_with("<value><nil/></value>"))[1] == (None,)
 
 
+@pytest.mark.trap(27)
 @pytest.mark.parametrize("number", [2**31, -(2**31) - 1, 10**30])
 @pytest.mark.parametrize("tag", ["int", "i4", "i8"])
 def test_integers_beyond_32_bits_are_refused_with_a_remedy(number: int, tag: str) -> None:

@@ -86,6 +86,7 @@ async def core() -> AsyncIterator[RosCore]:
     await made.close()
 
 
+@pytest.mark.trap(35)
 async def test_it_says_what_roscore_says(core: RosCore) -> None:
     assert core.uri == f"http://127.0.0.1:{core.port}/"
     assert await call_api(core.uri, "getUri", "/x") == (1, "", core.uri)
@@ -140,8 +141,9 @@ async def test_a_listener_that_fails_or_registers_harms_nobody(
     assert "a listener failed" in caplog.text
 
 
+@pytest.mark.trap(31)
 async def test_notifications_never_wait_in_the_reply_and_one_goes_at_a_time(core: RosCore) -> None:
-    """Trap 31: a node that holds its lock while it registers would wait for itself."""
+    """A node that holds its lock while it registers would wait for itself."""
     async with Slave() as slow, Slave() as quick:
         slow.go.clear()
         for slave, name in ((slow, "/slow"), (quick, "/quick")):
@@ -200,6 +202,7 @@ async def test_what_waits_for_a_slow_node_is_bounded(core: RosCore, monkeypatch:
         assert core.counters["notify.dropped"] == 900
 
 
+@pytest.mark.trap(33)
 async def test_a_twin_pushes_the_older_node_out(core: RosCore) -> None:
     async with Slave("/twin") as old:
         core.call("registerPublisher", "/twin", "/t", STRING, old.uri)
@@ -236,6 +239,7 @@ async def test_a_nameless_node_at_its_own_uri_is_shut_down(core: RosCore) -> Non
         assert roscpp.calls[0][0] == "shutdown"
 
 
+@pytest.mark.trap(29)
 async def test_a_node_without_get_name_tells_its_name_in_its_header(monkeypatch: pytest.MonkeyPatch) -> None:
     node = SlaveNode("/like_roscpp", "127.0.0.1", "http://127.0.0.1:11311/")
     await node.start()
@@ -286,6 +290,7 @@ async def test_a_node_that_came_back_meanwhile_is_not_purged(core: RosCore, monk
         assert core.state().nodes == {"/n": again.uri}
 
 
+@pytest.mark.trap(40)
 async def test_dead_nodes_are_found_without_a_hint() -> None:
     nodes = {"/odd": "rosrpc://x"}
     found: list[str] = []

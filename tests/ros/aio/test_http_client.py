@@ -58,6 +58,7 @@ async def test_a_response_in_any_pieces() -> None:
             assert await call_api(uri, "m") == (1, "", 5)
 
 
+@pytest.mark.trap(28)
 @pytest.mark.parametrize("status", [b"200 OK", b"500 whatever", b"404 Not Found"])
 async def test_the_status_is_not_believed(status: bytes) -> None:
     async with answering(http(OK, status)) as uri:
@@ -124,11 +125,11 @@ async def test_nobody_listens() -> None:
             await connect("127.0.0.1", port)
 
 
+@pytest.mark.trap(30)
 @pytest.mark.parametrize(
     "uri", ["", "http://host/", "rosrpc://host:5", "http://:5/", "http://h:99999/", "http://[x:5/", "x"]
 )
 async def test_uris_need_a_host_and_a_port(uri: str) -> None:
-    """Trap 30."""
     with pytest.raises(UnreachableError, match="looks like"):
         await call(uri, "m")
 

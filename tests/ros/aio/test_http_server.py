@@ -99,8 +99,9 @@ def post(body: bytes, *headers: bytes, path: bytes = b"/", version: bytes = b"1.
 CALL: Final = serialize_call("echo", [1, "two"])
 
 
+@pytest.mark.trap(28)
 async def test_answers_in_one_response_that_xmlrpcpp_reads(server: XmlRpcServer) -> None:
-    """Trap 28: one HTTP response, ``Content-length: N`` with one space, no chunks."""
+    """One HTTP response, ``Content-length: N`` with one space, no chunks."""
     async with client(server) as c:
         c.writer.write(post(CALL))
         head, body = await c.response()

@@ -96,6 +96,7 @@ async def test_demand_is_told_once_each_way(known: Owner) -> None:
     await until(lambda: known.said == ["first", "last"])
 
 
+@pytest.mark.trap(15, 38)
 async def test_a_subscriber_is_held_until_the_type_is_known(held: Owner) -> None:
     link = await held.subscriber()
     assert held.said == ["first"]
@@ -149,6 +150,7 @@ async def test_any_md5_sum_gets_the_real_one(known: Owner) -> None:
     link.close()
 
 
+@pytest.mark.trap(10)
 async def test_the_latched_message_goes_to_each_new_connection_once_and_first(latched: Owner) -> None:
     early = await latched.subscriber()
     latched.publication.publish_framed(memoryview(bytearray(frame_message(b"old"))))
@@ -200,11 +202,13 @@ async def test_another_definition_closes_those_who_were_promised_the_old_one(lat
     again.close()
 
 
+@pytest.mark.trap(2)
 async def test_a_wildcard_is_never_described(held: Owner) -> None:
     with pytest.raises(ValueError, match="cannot have the type"):
         held.publication.describe(Description("*", "*", ""))
 
 
+@pytest.mark.trap(9)
 @pytest.mark.parametrize(("asked", "given"), [("1", 1), ("0", 0), ("true", 0), ("", 0)])
 async def test_tcp_nodelay_is_honoured_on_our_socket(known: Owner, asked: str, given: int) -> None:
     link = await known.subscriber(tcp_nodelay=asked)
@@ -213,6 +217,7 @@ async def test_tcp_nodelay_is_honoured_on_our_socket(known: Owner, asked: str, g
     link.close()
 
 
+@pytest.mark.trap(13)
 async def test_a_half_closed_subscriber_is_gone(known: Owner) -> None:
     link = await known.subscriber()
     link.sock.shutdown(socket.SHUT_WR)
@@ -220,6 +225,7 @@ async def test_a_half_closed_subscriber_is_gone(known: Owner) -> None:
     link.close()
 
 
+@pytest.mark.trap(20)
 async def test_junk_from_a_subscriber_is_read_away(known: Owner) -> None:
     link = await known.subscriber()
     for _ in range(40):
@@ -242,6 +248,7 @@ async def test_a_reset_is_gone_too(known: Owner) -> None:
     known.publication.publish_framed(frame_message(b"nobody"))
 
 
+@pytest.mark.trap(19)
 async def test_a_slow_subscriber_loses_the_oldest_and_delays_nobody() -> None:
     owner = Owner(STRING, queue_messages=10, queue_bytes=1 << 30)
     slow = await owner.subscriber(callerid="/slow", buffer=4096)
@@ -269,6 +276,7 @@ async def test_a_slow_subscriber_loses_the_oldest_and_delays_nobody() -> None:
     owner.close()
 
 
+@pytest.mark.trap(19)
 async def test_a_slow_subscriber_holds_no_more_than_its_bytes() -> None:
     owner = Owner(STRING, queue_messages=1000, queue_bytes=1_000_000)
     slow = await owner.subscriber(buffer=4096)
@@ -280,6 +288,7 @@ async def test_a_slow_subscriber_holds_no_more_than_its_bytes() -> None:
     owner.close()
 
 
+@pytest.mark.trap(16)
 async def test_withdrawn_all_connections_are_closed_and_nothing_is_said(known: Owner) -> None:
     link = await known.subscriber()
     await link.header()

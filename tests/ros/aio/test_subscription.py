@@ -52,6 +52,7 @@ class Said:
         await self.link.closed()
 
 
+@pytest.mark.trap(3, 11)
 async def test_it_asks_for_tcpros_only_and_sends_its_header_at_once(publisher: RawPublisher) -> None:
     said = Said(publisher.uri)
     link, fields = await publisher.serve()
@@ -63,6 +64,7 @@ async def test_it_asks_for_tcpros_only_and_sends_its_header_at_once(publisher: R
     link.close()
 
 
+@pytest.mark.trap(8)
 async def test_header_and_messages_in_one_segment_or_byte_by_byte(publisher: RawPublisher) -> None:
     wire = encode_header(publisher_header("/t", "/p", STRING)) + frame_message(b"one") + frame_message(b"")
     for chunk in (len(wire), 1):
@@ -92,6 +94,7 @@ async def test_large_messages_come_whole(publisher: RawPublisher) -> None:
     link.close()
 
 
+@pytest.mark.trap(14, 17)
 async def test_a_lost_publisher_is_found_again_and_half_a_message_is_dropped(publisher: RawPublisher) -> None:
     said = Said(publisher.uri)
     link, _ = await publisher.serve()
@@ -117,6 +120,7 @@ async def test_an_unreachable_publisher_is_tried_for_ever() -> None:
     await said.close()
 
 
+@pytest.mark.trap(21)
 @pytest.mark.parametrize(
     "answer",
     [
@@ -143,6 +147,7 @@ async def test_a_publisher_that_is_not_ready_is_asked_again(
     link.close()
 
 
+@pytest.mark.trap(15)
 async def test_an_error_header_is_final(publisher: RawPublisher) -> None:
     said = Said(publisher.uri)
     link = await publisher.accept()
@@ -156,6 +161,7 @@ async def test_an_error_header_is_final(publisher: RawPublisher) -> None:
     link.close()
 
 
+@pytest.mark.trap(1)
 async def test_a_publisher_with_another_md5_sum_is_not_believed(publisher: RawPublisher) -> None:
     publisher.description = Description("std_msgs/Int32", "0" * 32, "int32 data")
     said = Said(publisher.uri, type_name="std_msgs/String", md5sum=MD5)
@@ -180,6 +186,7 @@ async def test_a_malformed_reply_is_a_loss(publisher: RawPublisher, junk: bytes)
     link.close()
 
 
+@pytest.mark.trap(17)
 async def test_a_message_beyond_the_limit_ends_the_connection(publisher: RawPublisher) -> None:
     said = Said(publisher.uri)
     link, _ = await publisher.serve()
@@ -190,6 +197,7 @@ async def test_a_message_beyond_the_limit_ends_the_connection(publisher: RawPubl
     link.close()
 
 
+@pytest.mark.trap(18)
 async def test_one_that_never_answers_is_given_up(publisher: RawPublisher, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "TCPROS_HANDSHAKE_TIMEOUT", 0.05)
     said = Said(publisher.uri)
@@ -233,6 +241,7 @@ class Followed:
         await self.subscription.closed()
 
 
+@pytest.mark.trap(16)
 async def test_a_subscription_follows_the_list_of_publishers() -> None:
     followed = Followed(own_uri="http://127.0.0.1:1/")
     async with RawPublisher() as one, RawPublisher() as two:
@@ -256,6 +265,7 @@ async def test_a_subscription_follows_the_list_of_publishers() -> None:
         await followed.close()
 
 
+@pytest.mark.trap(15)
 async def test_a_publisher_that_refused_is_asked_again_when_it_is_named_again() -> None:
     followed = Followed()
     async with RawPublisher() as one:

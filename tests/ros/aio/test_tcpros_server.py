@@ -39,6 +39,7 @@ async def served() -> AsyncIterator[Served]:
     made.close()
 
 
+@pytest.mark.trap(7)
 async def test_a_header_may_come_byte_by_byte(served: Served) -> None:
     link = await RawSubscriber.dial(served.server.address)
     for byte in encode_header({"topic": "/t", "callerid": "/s", "md5sum": "*"}):
@@ -47,6 +48,7 @@ async def test_a_header_may_come_byte_by_byte(served: Served) -> None:
     link.close()
 
 
+@pytest.mark.trap(4, 5, 23)
 @pytest.mark.parametrize(
     ("fields", "error"),
     [
@@ -65,6 +67,7 @@ async def test_what_is_refused(served: Served, fields: dict[str, str], error: st
     link.close()
 
 
+@pytest.mark.trap(6, 7)
 @pytest.mark.parametrize(
     "data",
     [
@@ -87,6 +90,7 @@ async def test_malformed_headers_are_counted_and_closed(
     link.close()
 
 
+@pytest.mark.trap(7)
 async def test_an_empty_header_is_refused_instead_of_held(served: Served) -> None:
     link = await RawSubscriber.dial(served.server.address)
     await link.send(bytes(4))
@@ -94,6 +98,7 @@ async def test_an_empty_header_is_refused_instead_of_held(served: Served) -> Non
     link.close()
 
 
+@pytest.mark.trap("16a")
 async def test_leaving_before_the_header_is_no_error(served: Served, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING)
     for data in (b"", b"\x10\x00"):
@@ -106,6 +111,7 @@ async def test_leaving_before_the_header_is_no_error(served: Served, caplog: pyt
     assert caplog.text == ""
 
 
+@pytest.mark.trap(6, 11, 18)
 async def test_one_that_says_nothing_blocks_nobody_and_is_closed(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -51,15 +51,16 @@ def test_a_publisher_is_told_its_subscribers_and_they_of_it(master: Master) -> N
     assert master.changes == [GraphChange(Kind.PUBLISHER, True, "/t", "/p", A, STRING)]
 
 
+@pytest.mark.trap(32)
 def test_the_reply_to_a_subscriber_contains_the_publishers(master: Master) -> None:
-    """Trap 32."""
     master("registerPublisher", "/p", "/t", STRING, A)
     master("registerPublisher", "/q", "/t", STRING, C)
     assert master.value("registerSubscriber", "/s", "/t", STRING, B) == [A, C]
 
 
+@pytest.mark.trap(14)
 def test_a_repeated_registration_is_told_again_but_is_no_change(master: Master) -> None:
-    """Trap 14: rospy connects again only because of it."""
+    """Rospy connects again only because of it."""
     master("registerSubscriber", "/s", "/t", "*", B)
     master("registerPublisher", "/p", "/t", STRING, A)
     master("registerPublisher", "/p", "/t", STRING, A)
@@ -88,8 +89,9 @@ def test_a_withdrawn_publisher_leaves_the_list(master: Master) -> None:
     assert master("lookupNode", "/x", "/p").code == -1
 
 
+@pytest.mark.trap(30)
 def test_uris_are_kept_as_they_are(master: Master) -> None:
-    """Trap 30: roscpp recognises itself by the exact text."""
+    """Roscpp recognises itself by the exact text."""
     for uri in ("http://HOST:1/", "http://host:1", "http://host:1//", "http://[::1]:5/x?y"):
         master("registerPublisher", uri.replace(":", "_").replace("/", "_"), "/t", STRING, uri)
     assert master.value("registerSubscriber", "/s", "/t", STRING, B) == [
@@ -104,6 +106,7 @@ def test_nodelets_with_one_uri_are_told_once(master: Master) -> None:
     assert master.effects == [PublisherUpdate(B, "/t", (A,))]
 
 
+@pytest.mark.trap(33)
 @pytest.mark.parametrize(
     "taking",
     [
@@ -114,7 +117,7 @@ def test_nodelets_with_one_uri_are_told_once(master: Master) -> None:
     ],
 )
 def test_a_node_of_the_same_name_is_pushed_out(master: Master, taking: tuple[str, ...]) -> None:
-    """Trap 33: by any registration, subscribeParam included."""
+    """By any registration, subscribeParam included."""
     master("registerPublisher", "/twin", "/t", STRING, A)
     master("registerSubscriber", "/twin", "/u", STRING, A)
     master("registerService", "/twin", "/s", RPC, A)
@@ -130,8 +133,9 @@ def test_a_node_of_the_same_name_is_pushed_out(master: Master, taking: tuple[str
     assert ParamUpdate(A, "/p/", 1) not in master.effects
 
 
+@pytest.mark.trap(33)
 def test_late_unregisters_do_not_hit_the_new_node(master: Master) -> None:
-    """Trap 33: what the old node says on its way out is about its own URI."""
+    """What the old node says on its way out is about its own URI."""
     for uri, service in ((A, RPC), (C, RPC + "1")):
         master("registerPublisher", "/twin", "/t", STRING, uri)
         master("registerSubscriber", "/twin", "/u", STRING, uri)
@@ -148,8 +152,9 @@ def test_late_unregisters_do_not_hit_the_new_node(master: Master) -> None:
     assert master.effects == [ParamUpdate(C, "/p/", 1)]
 
 
+@pytest.mark.trap(33)
 def test_an_evicted_node_does_not_take_its_name_back_by_a_parameter(master: Master) -> None:
-    """Trap 33: roscpp subscribes a parameter while it obeys our shutdown; the newer node must not die of that."""
+    """Roscpp subscribes a parameter while it obeys our shutdown; the newer node must not die of that."""
     master("setParam", "/x", "/p", 5)
     master("registerPublisher", "/twin", "/t", STRING, A)
     master("registerPublisher", "/twin", "/t", STRING, C)
@@ -212,8 +217,8 @@ def test_parameters_handed_out_do_not_change(master: Master) -> None:
     assert before == {"a": {"b": [1, 2]}}
 
 
+@pytest.mark.trap(34)
 def test_updates_have_slashes_and_deletion_is_an_empty_dict(master: Master) -> None:
-    """Trap 34."""
     master("subscribeParam", "/s", B, "/a/b")
     master("setParam", "/x", "/a/b", 1)
     assert master.effects == [ParamUpdate(B, "/a/b/", 1)]
@@ -225,8 +230,8 @@ def test_updates_have_slashes_and_deletion_is_an_empty_dict(master: Master) -> N
     assert master.effects == [ParamUpdate(B, "/a/b/", 3)]
 
 
+@pytest.mark.trap(35)
 def test_empty_namespaces_exist_but_have_no_names(master: Master) -> None:
-    """Trap 35."""
     master("setParam", "/x", "/empty", {})
     assert master.value("hasParam", "/x", "/empty") is True
     assert master.value("getParamNames", "/x") == []
