@@ -381,6 +381,59 @@ def test_two_peers_of_one_name_both_stay_and_it_is_said_once(one: Harness) -> No
     assert all("rename one" in view.conflicts[0] for view in one.roster.peers())
 
 
+def moved(identity: Identity, port: int) -> Identity:
+    """The same machine and name, another run at another port."""
+    return replace(identity, guid=Guid.of(identity.guid.address, port, 9), instance=bytes([port & 255] * 16))
+
+
+def test_a_killed_agent_that_starts_again_at_another_port_is_no_namesake_of_its_ghost(one: Harness) -> None:
+    ghost = who(2, name="base")
+    again = moved(ghost, 50000)
+    one.hear(Speaker(ghost)())
+    one.roster.link_up(ghost, one.now)
+    one.run(3)
+    one.roster.link_down(ghost.guid, one.now)
+    one.roster.events()
+    one.run(0.3)
+    speaker = Speaker(again)
+    one.hear(speaker())
+    assert one.roster.events() == [
+        PeerFound(again, again.guid.endpoint, Heard.MULTICAST),
+        PeerLost(ghost, LossReason.MOVED),
+    ]
+    for _ in range(3):
+        one.run(5)
+        one.hear(speaker())
+    assert one.roster.events() == []
+    assert one.present() == ["base"]
+
+
+def test_a_namesake_on_the_same_machine_that_lives_comes_back_and_is_said(one: Harness) -> None:
+    first = Speaker(who(2, name="base"))
+    second = Speaker(moved(first.identity, 50000))
+    one.hear(first())
+    one.run(1)
+    one.hear(second())
+    one.run(4)
+    one.roster.link_up(second.identity, one.now)
+    one.hear(first())
+    events = one.roster.events()
+    assert [e.kind for e in events if isinstance(e, Conflict)] == [ConflictKind.NAME]
+    assert one.present() == ["base", "base"]
+
+
+def test_a_namesake_elsewhere_is_said_only_once_it_has_shown_to_live(one: Harness) -> None:
+    first, second = Speaker(who(2, name="base")), Speaker(who(3, name="base"))
+    one.hear(first())
+    one.run(1)
+    one.hear(second())
+    assert not [e for e in one.roster.events() if isinstance(e, Conflict)]
+    assert not any(view.conflicts for view in one.roster.peers())
+    one.run(1)
+    one.hear(first())
+    assert [e.kind for e in one.roster.events() if isinstance(e, Conflict)] == [ConflictKind.NAME]
+
+
 def test_a_peer_with_our_own_name() -> None:
     one = Harness(name="base")
     one.hear(Speaker(who(2, name="base"))())

@@ -16,6 +16,7 @@ from rmpa.agent.station import Station
 from rmpa.agent.view import View
 from rmpa.bridge.aio.bridge import Bridge
 from rmpa.bridge.policy import Policy
+from rmpa.core.aio.loop import AgentLoop
 from rmpa.core.aio.notify import notify_service_manager
 from rmpa.core.config_values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
@@ -161,5 +162,6 @@ def run(settings: Settings) -> int:
     Raises:
         StartError: It cannot start on this machine as asked.
     """
-    asyncio.run(_serve(settings))
+    with asyncio.Runner(loop_factory=AgentLoop) as runner:
+        runner.run(_serve(settings))
     return 0

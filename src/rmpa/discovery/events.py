@@ -30,6 +30,7 @@ class LossReason(Enum):
 
     SILENCE = "silent for its lease"
     GOODBYE = "said goodbye"
+    MOVED = "started anew at another port"
     CONFLICT = "another live peer has its GUID address"
 
 

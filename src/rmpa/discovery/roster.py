@@ -68,6 +68,7 @@ class Roster:
         self._multicast = multicast
         self._lease_ms = round(lease * 1000)
         self._seats: dict[int, Seat] = {}
+        self._named: set[frozenset[bytes]] = set()
         self._answers = AnswerLimit()
         self._greetings = Greetings(rng)
         self._seeds: tuple[Address, ...] = ()
@@ -275,16 +276,17 @@ class Roster:
         current = seat.current
         if current is None:
             return
-        if verdict is Verdict.NEW:
+        if verdict is Verdict.KNOWN and seat.present:
+            self._check_name(seat)
+        elif verdict is Verdict.NEW:
             self._found(seat, now)
         elif verdict is Verdict.CHANGED and previous is not None and seat.present:
             self._events.append(PeerChanged(current.identity, previous))
-            if current.identity.name != previous.name:
-                self._check_name(seat, current.identity)
+            self._check_name(seat)
         elif verdict is Verdict.RESTARTED and previous is not None:
             if seat.present:
                 self._events.append(PeerRestarted(current.identity, previous, source))
-                self._check_name(seat, current.identity)
+                self._check_name(seat)
                 self._news(now)
             elif not seat.conflict:
                 self._found(seat, now)
@@ -308,28 +310,61 @@ class Roster:
         seat.present = True
         voice.since = now
         self._events.append(PeerFound(voice.identity, voice.source, voice.found_by))
-        self._check_name(seat, voice.identity)
+        self._retire_ghosts(seat, voice)
+        self._check_name(seat)
         self._news(now)
 
     def _lost(self, seat: Seat, reason: LossReason) -> None:
         if seat.present and seat.current is not None:
             seat.present = False
             self._events.append(PeerLost(seat.current.identity, reason))
+            self._named = {pair for pair in self._named if seat.current.identity.instance not in pair}
 
-    def _check_name(self, seat: Seat, identity: Identity) -> None:
-        for other in self._namesakes(seat, identity):
-            self._events.append(Conflict(ConflictKind.NAME, identity, other))
-            return
+    def _retire_ghosts(self, seat: Seat, voice: Voice) -> None:
+        """A killed agent that starts again at another port: one name, one machine, and the old one has no link.
 
-    def _namesakes(self, seat: Seat, identity: Identity) -> list[Identity]:
-        return [
-            other.current.identity
-            for other in self._ordered()
-            if other is not seat
-            and other.current is not None
-            and (other.present or other.own)
-            and other.current.identity.name == identity.name
-        ]
+        If the old one lives all the same, its next beacon brings it back.
+        """
+        for other in self._ordered():
+            ghost = other.current
+            if (
+                ghost is not None
+                and other is not seat
+                and not other.own
+                and not ghost.linked
+                and ghost.heard < voice.since
+                and ghost.identity.name == voice.identity.name
+                and ghost.identity.guid.address == voice.identity.guid.address
+            ):
+                key = _key(ghost.identity.guid)
+                self._lost(other, LossReason.MOVED)
+                other.vacate()
+                self._drop_if_empty(key)
+
+    def _check_name(self, seat: Seat) -> None:
+        """Say once that two peers share a name, if both live beyond doubt: a ghost is none's namesake."""
+        for one, other in self._namesakes(seat):
+            pair = frozenset({one.identity.instance, other.identity.instance})
+            if pair not in self._named:
+                self._named.add(pair)
+                self._events.append(Conflict(ConflictKind.NAME, one.identity, other.identity))
+                return
+
+    def _namesakes(self, seat: Seat) -> list[tuple[Voice, Voice]]:
+        """This seat's peer with each other of its name, the newer of both first."""
+        mine = seat.current
+        if mine is None:
+            return []
+        pairs = []
+        for other in self._ordered():
+            voice = other.current
+            if voice is None or other is seat or not (other.present or other.own):
+                continue
+            newer, older = (mine, voice) if (mine.since, other.own) >= (voice.since, seat.own) else (voice, mine)
+            alive = older.linked or older.heard >= newer.since or other.own or seat.own
+            if voice.identity.name == mine.identity.name and alive:
+                pairs.append((newer, older))
+        return pairs
 
     def _settle(self, seat: Seat, now: float) -> None:
         """After somebody of this seat fell silent or left: is a conflict over?"""
@@ -345,9 +380,9 @@ class Roster:
 
     def _leases(self, now: float) -> None:
         for key in sorted(self._seats):
-            seat = self._seats[key]
-            timer = seat.next_timer()
-            if timer is None or timer > now:
+            seat = self._seats.get(key)  # one that came back may have retired another
+            timer = seat.next_timer() if seat is not None else None
+            if seat is None or timer is None or timer > now:
                 continue
             voice = seat.current
             if voice is not None and not voice.linked and voice.deadline <= now:
@@ -486,7 +521,8 @@ class Roster:
             kind = ConflictKind.OWN_GUID if seat.own else ConflictKind.GUID
             conflicts.append(str(Conflict(kind, voice.identity, other.identity)))
         conflicts += [
-            str(Conflict(ConflictKind.NAME, voice.identity, o)) for o in self._namesakes(seat, voice.identity)
+            str(Conflict(ConflictKind.NAME, one.identity, other.identity))
+            for one, other in (self._namesakes(seat) if voice is seat.current else ())
         ]
         return PeerView(
             voice.identity,

@@ -62,7 +62,9 @@ class Stream:
         self.last_in = self._loop.time()
         """When bytes last came (``loop.time()``), whether or not ``on_bytes`` was called for them."""
         self._fd = sock.fileno()
-        self._loop.add_reader(self._fd, self._readable)
+        # An agent's loop has a short way for the data path; elsewhere (tools, tests) the usual one does.
+        add_reader = getattr(self._loop, "add_direct_reader", self._loop.add_reader)
+        add_reader(self._fd, self._readable)
 
     @property
     def closed(self) -> bool:

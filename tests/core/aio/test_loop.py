@@ -1,0 +1,197 @@
+from __future__ import annotations
+
+import asyncio
+import selectors
+import socket
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.core.aio.loop import AgentLoop, DirectSelector
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine, Iterator
+
+DEADLINE = 20.0
+
+
+@pytest.fixture
+def pair() -> Iterator[tuple[socket.socket, socket.socket]]:
+    one, other = socket.socketpair()
+    one.setblocking(False)
+    other.setblocking(False)
+    yield one, other
+    one.close()
+    other.close()
+
+
+def run(main: Coroutine[object, object, None]) -> None:
+    with asyncio.Runner(loop_factory=AgentLoop) as runner:
+        runner.run(asyncio.wait_for(main, DEADLINE))
+
+
+def agent_loop() -> AgentLoop:
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, AgentLoop)
+    return loop
+
+
+def test_a_direct_reader_is_called_and_ends_with_remove_reader(pair: tuple[socket.socket, socket.socket]) -> None:
+    one, other = pair
+
+    async def main() -> None:
+        loop = agent_loop()
+        got: list[bytes] = []
+        came = asyncio.Event()
+
+        def read() -> None:
+            got.append(one.recv(100))
+            came.set()
+
+        loop.add_direct_reader(one.fileno(), read)
+        for word in (b"a", b"b"):
+            came.clear()
+            other.send(word)
+            await came.wait()
+        assert got == [b"a", b"b"]
+        loop.remove_reader(one.fileno())
+        other.send(b"c")
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        assert got == [b"a", b"b"]
+
+    run(main())
+
+
+def test_reader_and_writer_of_one_socket_both_work(pair: tuple[socket.socket, socket.socket]) -> None:
+    one, other = pair
+
+    async def main() -> None:
+        loop = agent_loop()
+        read, written = asyncio.Event(), asyncio.Event()
+
+        def take() -> None:
+            one.recv(100)
+            read.set()
+
+        loop.add_direct_reader(one.fileno(), take)
+        loop.add_writer(one.fileno(), written.set)
+        other.send(b"a")
+        await read.wait()
+        await written.wait()
+        loop.remove_writer(one.fileno())
+        read.clear()
+        other.send(b"b")
+        await read.wait()
+        loop.remove_reader(one.fileno())
+
+    run(main())
+
+
+def test_timers_and_callbacks_set_by_a_direct_reader_run(pair: tuple[socket.socket, socket.socket]) -> None:
+    one, other = pair
+
+    async def main() -> None:
+        loop = agent_loop()
+        soon, later = asyncio.Event(), asyncio.Event()
+
+        def read() -> None:
+            one.recv(100)
+            loop.call_soon(soon.set)
+            loop.call_later(0.001, later.set)
+
+        loop.add_direct_reader(one.fileno(), read)
+        other.send(b"a")
+        await soon.wait()
+        await later.wait()
+        loop.remove_reader(one.fileno())
+
+    run(main())
+
+
+def test_a_direct_reader_that_raises_does_not_end_the_loop(pair: tuple[socket.socket, socket.socket]) -> None:
+    one, other = pair
+
+    async def main() -> None:
+        loop = agent_loop()
+        problems: list[object] = []
+        told = asyncio.Event()
+
+        def handler(_loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
+            problems.append(context["exception"])
+            told.set()
+
+        def read() -> None:
+            one.recv(100)
+            raise RuntimeError("mine")
+
+        loop.set_exception_handler(handler)
+        loop.add_direct_reader(one.fileno(), read)
+        other.send(b"a")
+        await told.wait()
+        assert [str(problem) for problem in problems] == ["mine"]
+        loop.remove_reader(one.fileno())
+
+    run(main())
+
+
+def test_a_reader_may_close_another_that_is_ready_too() -> None:
+    async def main() -> None:
+        loop = agent_loop()
+        pairs = [socket.socketpair() for _ in range(2)]
+        called = asyncio.Event()
+        calls: list[int] = []
+
+        def read(index: int) -> None:
+            calls.append(index)
+            for one, _ in pairs:
+                loop.remove_reader(one.fileno())
+                one.close()
+            called.set()
+
+        for index, (one, _) in enumerate(pairs):
+            loop.add_direct_reader(one.fileno(), lambda index=index: read(index))  # type: ignore[misc]
+        for _, other in pairs:
+            other.send(b"a")
+        await called.wait()
+        await asyncio.sleep(0)
+        assert len(calls) == 1
+        for _, other in pairs:
+            other.close()
+
+    run(main())
+
+
+def test_the_selector_keeps_to_the_contract_of_selectors(pair: tuple[socket.socket, socket.socket]) -> None:
+    one, other = pair
+    selector = DirectSelector()
+    key = selector.register(one, selectors.EVENT_READ, "mine")
+    with pytest.raises(KeyError):
+        selector.register(one, selectors.EVENT_READ)
+    assert selector.get_key(one) is key
+    assert selector.select(0) == []
+    other.send(b"a")
+    assert selector.select(None) == [(key, selectors.EVENT_READ)]
+    changed = selector.modify(one, selectors.EVENT_READ | selectors.EVENT_WRITE, "ours")
+    assert selector.select(5.0) == [(changed, selectors.EVENT_READ | selectors.EVENT_WRITE)]
+    selector.unregister(one)
+    with pytest.raises(KeyError):
+        selector.unregister(one)
+    with pytest.raises(KeyError):
+        selector.get_key(one)
+    assert not selector.get_map()
+    selector.close()
+
+
+def test_a_peer_that_hangs_up_is_a_read(pair: tuple[socket.socket, socket.socket]) -> None:
+    one, other = pair
+
+    async def main() -> None:
+        loop = agent_loop()
+        ended = asyncio.Event()
+        loop.add_direct_reader(one.fileno(), lambda: ended.set() if one.recv(10) == b"" else None)
+        other.close()
+        await ended.wait()
+        loop.remove_reader(one.fileno())
+
+    run(main())
