@@ -75,6 +75,7 @@ class Agent:
         # What lives now lives until the end: the collector need not look at it again. (Collecting first would cost
         # 20 ms of the start and find next to nothing.)
         gc.freeze()
+        gc.enable()
         _log.info("= ROS_MASTER_URI=%s", self.core.uri)
 
     async def close(self) -> None:
