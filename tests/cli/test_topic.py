@@ -142,7 +142,7 @@ def test_no_master(place: Place) -> None:
         code, _, err = place.run("topic", *command)
         assert code == 1
         assert err == (
-            "rmpa: no ROS master answers at http://127.0.0.1:1 (ROS_MASTER_URI; no agent runs); "
+            "rmpa: no ROS master answers at http://127.0.0.1:1 (ROS_MASTER_URI); "
             "start one with `rmpa up` or `rmpa core`, or name it with --master\n"
         )
     assert place.run("topic", "list", "--master", "x")[0] == 2
@@ -150,8 +150,11 @@ def test_no_master(place: Place) -> None:
 
 def test_the_agents_core_is_asked(place: Place, agent: Callable[..., None], core: RosCore) -> None:
     agent(snapshot=with_core(core.uri))
-    place.environ["ROS_MASTER_URI"] = "http://127.0.0.1:1"
+    place.environ.pop("ROS_MASTER_URI", None)
     assert "/rosout" in place.run("topic", "list")[1]
+    place.environ["ROS_MASTER_URI"] = "http://127.0.0.1:1"
+    assert "not the core of base: unset it, or say --agent" in place.run("topic", "list")[2]
+    assert "/rosout" in place.run("topic", "list", "--agent", "base")[1]
     core.call("registerPublisher", "/n", "/cmd", "sensor_msgs/Joy", "http://127.0.0.1:9/")
     code, out, _ = place.run("topic", "info", "/cmd", "--agent", "base")
     assert code == 0

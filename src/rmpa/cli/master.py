@@ -1,7 +1,7 @@
 """Which ROS master a topic command asks, and what its graph holds.
 
-In this order: ``--master``; the core of the agent named by ``--agent`` or RMPA_AGENT; the core of the only agent of
-this machine; ROS_MASTER_URI; ``http://localhost:11311``.
+In this order: ``--master``; the core of the agent named by ``--agent`` or RMPA_AGENT; ROS_MASTER_URI, as the stock
+tools have it; the core of the only agent of this machine; ``http://localhost:11311``.
 """
 
 from __future__ import annotations
@@ -67,11 +67,10 @@ def choose_master(master: str | None, agent: str | None, environ: Mapping[str, s
         return _with_agent(master, "--master", environ)
     uri = environ.get("ROS_MASTER_URI", "")
     if not agent and not environ.get("RMPA_AGENT"):
-        agents = find_agents(environ)
-        if not agents:
-            return Master(uri, "ROS_MASTER_URI; no agent runs") if uri else Master(DEFAULT_URI, "no agent runs")
-        if len(agents) > 1 and uri:
+        if uri:
             return _with_agent(uri, "ROS_MASTER_URI", environ)
+        if not find_agents(environ):
+            return Master(DEFAULT_URI, "no agent runs")
     found = choose_agent(environ, agent)
     with ControlClient(found.path) as client:
         return Master(client.snapshot().agent.core_uri, f"the core of agent {found.name}", found.path)
@@ -83,7 +82,9 @@ def _with_agent(uri: str, source: str, environ: Mapping[str, str]) -> Master:
         with contextlib.suppress(RmpaError), ControlClient(found.path) as client:
             if same_core(client.snapshot().agent.core_uri, uri):
                 return Master(uri, source, found.path)
-    return Master(uri, source)
+    others = ", ".join(found.name for found in find_agents(environ))
+    # The classic mistake: a shell that still points to yesterday's robot.
+    return Master(uri, f"{source}; not the core of {others}: unset it, or say --agent" if others else source)
 
 
 @dataclass(frozen=True, slots=True)
