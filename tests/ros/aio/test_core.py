@@ -357,3 +357,27 @@ async def test_another_rosout_takes_over(monkeypatch: pytest.MonkeyPatch) -> Non
         await until(lambda: core.counters["notify.sent"] >= 1)
         await core.close()
         assert core.state().nodes == {"/rosout": other.uri}, "our late unregisters do not hit it"
+
+
+@pytest.mark.trap(26)
+async def test_services_are_looked_up_at_once_whatever_else_waits(core: RosCore) -> None:
+    async with Slave() as stopped:
+        stopped.go.clear()
+        core.call("registerSubscriber", "/s", "/t", STRING, stopped.uri)
+        core.call("registerPublisher", "/p", "/t", STRING, "http://127.0.0.1:1/")
+        await stopped.wait(lambda: bool(stopped.calls))
+        await call(core.uri, "registerService", "/p", "/add", "rosrpc://127.0.0.1:5/", "http://127.0.0.1:1/")
+        assert (await call_api(core.uri, "lookupService", "/c", "/add"))[::2] == (1, "rosrpc://127.0.0.1:5/")
+        assert (await call_api(core.uri, "lookupService", "/c", "/none"))[::2] == (-1, "")
+        assert stopped.at_once == 1, "the notification still waits"
+
+
+@pytest.mark.trap(29)
+async def test_no_connection_to_a_node_is_kept_open(core: RosCore) -> None:
+    async with Slave() as slave:
+        core.call("registerSubscriber", "/s", "/t", STRING, slave.uri)
+        for number in range(1, 9):
+            core.call("registerPublisher", f"/p{number}", "/t", STRING, f"http://127.0.0.1:{number}/")
+            await slave.wait(lambda wanted=number: len(slave.calls) == wanted)  # type: ignore[misc]
+        await until(lambda: core.counters["notify.sent"] == 8)
+        await until(lambda: not slave.server._connections)

@@ -124,6 +124,28 @@ async def test_a_failing_callback_is_logged_and_called_again(core: RosCore, capl
     assert "the user's mistake" in caplog.text
 
 
+@pytest.mark.trap(17)
+async def test_a_bad_message_is_one_error_and_the_next_is_read(
+    core: RosCore, caplog: pytest.LogCaptureFixture
+) -> None:
+    """rospy closes, and reads what comes next behind the bytes that are left of the bad one."""
+    heard: list[str] = []
+    async with node(core, "talker") as talker, node(core, "listener") as listener:
+        publisher = await talker.advertise("/t", "std_msgs/String")
+        subscriber = await listener.subscribe(
+            "/t", "std_msgs/String", lambda received: heard.append(received.message.data)
+        )
+        await publisher.wait_for_subscriber()
+        good = b"\x02\x00\x00\x00ok"
+        for bad in (b"", b"\xff\xff\xff\x7fx", good[:-1], good + b"trailing"):
+            publisher.publish_raw(bad)
+            publisher.publish_raw(good)
+        await until(lambda: len(heard) == 4)
+        assert subscriber.publishers == 1
+    assert set(heard) == {"ok"}
+    assert caplog.text.count("bytes are not a std_msgs/String") == 4
+
+
 async def test_another_md5_sum_is_told_to_both_sides(core: RosCore, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING)
     async with node(core, "talker") as talker, node(core, "listener") as listener:

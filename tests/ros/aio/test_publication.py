@@ -322,3 +322,17 @@ async def test_what_was_published_can_be_waited_for(known: Owner) -> None:
     assert reading == [100_000] * 20
     assert limits.SUBSCRIBER_QUEUE_MESSAGES > 20
     link.close()
+
+
+@pytest.mark.trap(18)
+async def test_a_machine_that_was_switched_off_is_noticed_by_the_kernel(known: Owner) -> None:
+    link = await known.subscriber()
+    (inbound,) = known.publication._open
+    for level, option, value in (
+        (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
+        (socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 60),
+        (socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 10),
+        (socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 9),
+    ):
+        assert inbound._sock.getsockopt(level, option) == value
+    link.close()

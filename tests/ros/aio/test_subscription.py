@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import socket
 import struct
 from typing import TYPE_CHECKING
 
@@ -281,3 +282,24 @@ async def test_a_publisher_that_refused_is_asked_again_when_it_is_named_again() 
         link.close()
         again.close()
         await followed.close()
+
+
+@pytest.mark.trap(18)
+async def test_half_a_message_holds_nobody_else_up_and_the_kernel_watches(publisher: RawPublisher) -> None:
+    async with RawPublisher() as other:
+        stuck, fine = Said(publisher.uri), Said(other.uri)
+        half, _ = await publisher.serve()
+        whole, _ = await other.serve()
+        await half.send(frame_message(b"first") + b"\x10\x00\x00\x00half")
+        await until(lambda: stuck.messages)
+        for _ in range(3):
+            await whole.send(frame_message(b"whole"))
+        await until(lambda: len(fine.messages) == 3)
+        assert len(stuck.messages) == 1
+        assert stuck.link._stream is not None
+        assert stuck.link._stream._sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
+        await half.send(b" a minute ago")
+        await stuck.close()
+        await fine.close()
+        half.close()
+        whole.close()

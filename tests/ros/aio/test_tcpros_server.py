@@ -11,7 +11,7 @@ from rmpa.core.counters import Counters
 from rmpa.core.errors import StartError
 from rmpa.ros.aio.publication import Publication
 from rmpa.ros.aio.tcpros_server import TcprosServer
-from rmpa.ros.tcpros import encode_header
+from rmpa.ros.tcpros import encode_header, frame_message
 from tests.ros.aio.peers import STRING, RawSubscriber, until
 
 if TYPE_CHECKING:
@@ -167,3 +167,40 @@ async def test_a_service_can_be_taken_over() -> None:
 async def test_an_address_in_use_is_a_clear_error(served: Served) -> None:
     with pytest.raises(StartError, match=r"TCPROS server of /q at 127.0.0.1:\d+: "):
         TcprosServer("/q", {}).start(*served.server.address)
+
+
+@pytest.mark.trap(3)
+@pytest.mark.parametrize("definition", ["", "another text\n", "string data\n"])
+async def test_a_subscriber_may_or_may_not_send_its_definition(served: Served, definition: str) -> None:
+    link = await RawSubscriber.connect(served.server.address, message_definition=definition)
+    assert (await link.header())["message_definition"] == "string data\n"
+    link.close()
+
+
+@pytest.mark.trap(8)
+async def test_what_comes_in_one_segment_with_the_header_does_no_harm(served: Served) -> None:
+    link = await RawSubscriber.dial(served.server.address)
+    header = encode_header({"topic": "/t", "callerid": "/s", "md5sum": "*"})
+    await link.send(header + b"a request that should have waited for the reply")
+    assert (await link.header())["callerid"] == "/p"
+    served.publication.publish_framed(frame_message(b"served"))
+    assert await link.message() == b"served"
+    link.close()
+
+
+@pytest.mark.trap(23)
+async def test_a_probe_for_a_service_that_is_gone_is_answered_and_not_logged(
+    served: Served, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING)
+    probe = {"topic": "", "service": "/add", "probe": "1"}
+    for _ in range(5):
+        hasty = await RawSubscriber.connect(served.server.address, buffer=0, **probe)
+        hasty.close()  # wait_for_service does not read the reply
+    patient = await RawSubscriber.connect(served.server.address, buffer=0, **probe)
+    assert await patient.header() == {"error": "[/p] does not offer the service [/add]"}
+    assert await patient.ended()
+    patient.close()
+    await until(lambda: not served.server._waiting)
+    assert served.counters.as_dict() == {}
+    assert caplog.records == []

@@ -157,11 +157,14 @@ class TcprosServer:
             self._on_service(link)
             return
         problem = check_request(fields)
-        if problem is None and "service" in fields:
-            problem = f"[{self._name}] does not offer the service [{printable(fields['service'])}]"
         if problem is not None:
             self._refuse("header", link.peer[0], f"{self._name}: a connection from {link.peer[0]}: {problem}")
             link.refuse(problem)
+            return
+        if "service" in fields:
+            # Quiet: a client, or only its probe, that was told of a service which is gone.
+            _log.debug("! %s: no service %s", self._name, printable(fields["service"]))
+            link.refuse(f"[{self._name}] does not offer the service [{printable(fields['service'])}]")
             return
         publication = self._publications.get(fields["topic"])
         if publication is None:
