@@ -102,6 +102,16 @@ def direct(client: str, *, nodelay: bool) -> Callable[[Bed], Contender]:
     return start
 
 
+def direct_hosts(bed: Bed) -> Contender:
+    """Roscpp straight from host to host by the same kind of cable as the agents': classic ROS at its best."""
+    a, b = bed.lab.hosts("classic_a", "classic_b")
+    here, there = bed.shell(a), bed.shell(b)
+    here.env["ROS_IP"], there.env["ROS_IP"] = a.address, b.address
+    here.env["ROS_MASTER_URI"] = there.env["ROS_MASTER_URI"] = f"http://{a.address}:{here.port}"
+    here.master()
+    return _nodes("roscpp_hosts", "roscpp direct, two hosts", here, there, "roscpp")
+
+
 def relays(bed: Bed) -> Contender:
     """Roscpp through two C++ relays each way: as many hops as through two agents."""
     shell = bed.shell()
@@ -161,6 +171,7 @@ ALL: Final[dict[str, Callable[[Bed], Contender]]] = {
     "floor_python": floor_python,
     "roscpp_nodelay": direct("roscpp", nodelay=True),
     "roscpp_nagle": direct("roscpp", nodelay=False),
+    "roscpp_hosts": direct_hosts,
     "rospy_nodelay": direct("rospy", nodelay=True),
     "rospy_nagle": direct("rospy", nodelay=False),
     "relays": relays,
