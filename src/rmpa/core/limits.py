@@ -253,6 +253,8 @@ TOPICS_PER_PEER_MAX: Final = 16384
 """(topic, node) pairs that one peer may advertise."""
 MISMATCHES_MAX: Final = 16
 """Refused subscribers of one source that are remembered for the user."""
+CALL_BACK_DELAYS: Final = (0.05, 1.0)
+"""When a proxy is registered again whose subscribers were hung up on: at once, and for those that noticed late."""
 RECONCILE_INTERVAL: Final = 5.0
 """The plan is compared with what is really open this often, so that nothing stays stuck."""
 

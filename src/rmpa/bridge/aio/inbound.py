@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.bridge.aio.flows import ImportFlow
 from rmpa.bridge.proxy_names import LOOPBACK, proxy_name
+from rmpa.core import limits
 from rmpa.core.errors import RmpaError
 from rmpa.ros.aio.publication import Publication
 from rmpa.ros.aio.slave_server import SlaveNode
@@ -97,7 +98,16 @@ class Inbound:
         self.flows[action.route] = ImportFlow(publication)
         about = action.description
         text = about.definition.encode("latin-1").decode(errors="surrogateescape")
-        publication.describe(Description(about.type, about.md5, text, about.latching))
+        if publication.describe(Description(about.type, about.md5, text, about.latching)):
+            # Those who were hung up on come again when the master names the proxy; rospy only then, and only if it
+            # has noticed the end by that time.
+            for delay in limits.CALL_BACK_DELAYS:
+                asyncio.get_running_loop().call_later(delay, self._call_back, action.source, publication)
+
+    def _call_back(self, source: Source, publication: Publication) -> None:
+        proxy = self._proxies.get(source.node)
+        if proxy is not None and proxy.publications.get(source.topic) is publication:
+            self._register(proxy, source.topic)
 
     def detach(self, action: Detach) -> None:
         """No data comes on a route any more."""

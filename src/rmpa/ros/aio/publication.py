@@ -125,17 +125,21 @@ class Publication:
         if first and self.subscribers:
             self._on_first()
 
-    def describe(self, description: Description) -> None:
+    def describe(self, description: Description) -> int:
         """Say what is published from now on: held subscribers are served, those that do not fit are refused.
 
         A publisher may have come back with another definition. Then everybody who was promised the old one is
         closed, for there is no other way to tell them; rospy subscribers come again on the next ``publisherUpdate``.
+
+        Returns:
+            How many subscribers were closed: if any, the owner should register the topic again.
 
         Raises:
             ValueError: Type or md5 sum is ``*``; see ``tcpros.publisher_header``.
         """
         before = self.subscribers
         reply = publisher_header(self.topic, self.caller_id, description)
+        old: tuple[Inbound, ...] = ()
         if self._reply and self._reply != reply:
             self._latched = None
             old, self._open = self._open, ()
@@ -153,6 +157,7 @@ class Publication:
                 self._refuse(link, problem)
         if before and not self.subscribers:
             self._on_last()
+        return len(old)
 
     def publish_framed(self, framed: Buffer) -> int:
         """Send one message to all subscribers; none waits for another.

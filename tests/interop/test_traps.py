@@ -1,0 +1,360 @@
+"""Traps of ROS 1 (docs/design/ros-traps.md) that only real nodes spring; those of a bridge through two agents."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+import struct
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.bridge.actions import Describe, Publish
+from rmpa.bridge.aio.inbound import Inbound
+from rmpa.bridge.messages import Description as About
+from rmpa.bridge.messages import Source
+from rmpa.ros.aio.core import RosCore
+from rmpa.ros.aio.http_client import call_api
+from rmpa.ros.aio.node import Node
+from rmpa.ros.environment import RosEnvironment
+from rmpa.ros.messages import MessageType
+from rmpa.ros.tcpros import encode_header, frame_message, subscriber_header
+from tests.interop.modules import flows, whole
+from tests.interop.nodes.payload import Pattern
+from tests.interop.processes import eventually
+from tests.interop.ros import PYTHON
+from tests.ros.aio.peers import RawSubscriber
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from tests.interop.agents import Agent
+    from tests.interop.conftest import AgentFactory, ShellFactory
+    from tests.interop.ros import Ros
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
+libraries = pytest.mark.parametrize("library", ["rospy", "roscpp"])
+BYTES = "std_msgs/UInt8MultiArray"
+DEADLINE = 40.0
+
+
+def framed(payload: bytes) -> bytes:
+    """A std_msgs/UInt8MultiArray as raw bytes."""
+    return bytes(8) + struct.pack("<I", len(payload)) + payload
+
+
+@pytest.fixture
+async def core() -> AsyncIterator[RosCore]:
+    made = RosCore("127.0.0.1", 0)
+    await made.start()
+    yield made
+    await made.close()
+
+
+@pytest.fixture
+def ros(core: RosCore, shell: ShellFactory) -> Ros:
+    return shell(port=core.port)
+
+
+@pytest.fixture
+async def closing(core: RosCore) -> AsyncIterator[AsyncExitStack]:
+    async with AsyncExitStack() as stack:
+        yield stack
+
+
+def node(name: str, core: RosCore | Agent) -> Node:
+    uri = core.uri if isinstance(core, RosCore) else f"http://127.0.0.1:{core.core_port}/"
+    return Node(name, master_uri=uri, environment=RosEnvironment())
+
+
+async def until(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(DEADLINE):
+        while not condition():
+            await asyncio.sleep(0.005)
+
+
+# --- at one core ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.trap(3)
+@libraries
+async def test_only_rospy_sends_a_definition_along_and_both_are_served(core: RosCore, ros: Ros, library: str) -> None:
+    async with node("ours", core) as ours:
+        publisher = await ours.advertise("/chatter", BYTES, latch=True)
+        publisher.publish_raw(framed(Pattern(64).payload(1, 1)))
+        listener = ros.node(library, "listener", count=1)
+        await until(lambda: publisher.publication._open)
+        fields = publisher.publication._open[0].fields
+        assert {"callerid", "md5sum", "tcp_nodelay", "topic", "type"} <= fields.keys()
+        assert ("message_definition" in fields) is (library == "rospy")
+        await listener.expect_event("done", DEADLINE)
+
+
+@pytest.mark.trap(12)
+@libraries
+async def test_a_second_connection_of_one_caller_id_closes_the_first_at_rospy(
+    core: RosCore, ros: Ros, library: str
+) -> None:
+    ros.node(library, "talker", name="talker", rate=50)
+    await until(lambda: "/talker" in core.state().publishers.get("/chatter", {}))
+    api = core.state().publishers["/chatter"]["/talker"]
+
+    async def connect() -> RawSubscriber:
+        reply = await call_api(api, "requestTopic", "/twin", "/chatter", [["TCPROS"]])
+        assert isinstance(reply.value, list)
+        link = await RawSubscriber.dial((str(reply.value[1]), int(str(reply.value[2]))))
+        await link.send(encode_header(subscriber_header("/chatter", "/twin")))
+        assert (await link.header())["callerid"] == "/talker"
+        await link.message()
+        return link
+
+    first = await connect()
+    second = await connect()
+    if library == "rospy":
+        while not await first.ended():
+            first.data = b""
+    else:
+        await first.message()
+    await second.message()
+    first.close()
+    second.close()
+
+
+@pytest.mark.trap("16a")
+async def test_publishers_that_come_at_one_moment_are_all_heard_and_nothing_is_refused(
+    core: RosCore, ros: Ros, caplog: pytest.LogCaptureFixture
+) -> None:
+    """rospy answers the two lists by connecting twice to one publisher, and hangs one up, perhaps headerless."""
+    caplog.set_level(logging.WARNING, "rmpa")
+    listener = ros.rospy("listener", each=True)
+    await until(lambda: core.state().subscribers.get("/chatter"))
+    pattern = Pattern(64)
+    for turn in range(4):
+        async with node("one", core) as one, node("two", core) as two:
+            both = await asyncio.gather(one.advertise("/chatter", BYTES), two.advertise("/chatter", BYTES))
+            for source, publisher in enumerate(both, start=10 * turn + 1):
+                await asyncio.wait_for(publisher.wait_for_subscriber(), DEADLINE)
+                key = str(source)
+                sequence = 0
+                # What is sent while rospy hangs one of its two connections up may get lost: send until it is heard.
+                while not any(f"'{key}'" in str(report["sources"]) for report in listener.events("report")):
+                    sequence += 1
+                    publisher.publish_raw(framed(pattern.payload(source, sequence)))
+                    await asyncio.sleep(0.02)
+            refused = {**one.slave.counters.as_dict(), **two.slave.counters.as_dict()}
+            assert not [name for name in refused if "refused" in name], refused
+    assert all(report["bad"] == 0 for report in listener.events("report"))
+    assert [record.getMessage() for record in caplog.records] == []
+
+
+@pytest.mark.trap(17)
+async def test_messages_of_no_bytes_go_both_ways(core: RosCore, ros: Ros) -> None:
+    async with node("ours", core) as ours:
+        got: list[bytes] = []
+        await ours.subscribe("/theirs", "std_msgs/Empty", lambda r: got.append(r.raw))
+        ros.start("rostopic", "pub", "-r", "20", "/theirs", "std_msgs/Empty", name="pub")
+        await until(lambda: len(got) >= 3)
+        assert set(got) == {b""}
+        publisher = await ours.advertise("/ours", "std_msgs/Empty")
+        echo = ros.start("rostopic", "echo", "-n", "3", "/ours", name="echo")
+        await asyncio.wait_for(publisher.wait_for_subscriber(), DEADLINE)
+        while echo.returncode is None:
+            publisher.publish_raw(b"")
+            await asyncio.sleep(0.02)
+        assert echo.output.count("---") == 3, echo.output
+
+
+@pytest.mark.trap(14)
+@libraries
+async def test_listeners_come_back_when_a_remote_publisher_has_another_header(
+    core: RosCore, ros: Ros, library: str, closing: AsyncExitStack
+) -> None:
+    """They are promised another definition by hanging up; rospy comes again only if the master names the proxy."""
+    kind = MessageType(BYTES)
+    source = Source("/chatter", "/speaker")
+    inbound = Inbound(core, "/rmpa/peer", on_demand=lambda _s, _w: None, on_mismatch=lambda _s, _c, _t: None)
+    inbound.publish(Publish(1, source, BYTES))
+    closing.push_async_callback(inbound.close)
+    listener = ros.node(library, "listener", each=True)
+    await until(lambda: (p := inbound.publication(source)) is not None and p.subscribers)
+    for route, latching in ((1, False), (2, True)):
+        inbound.describe(Describe(1, source, route, About(BYTES, kind.md5sum, kind.definition, latching)))
+        sequence = 0
+        while not any(f"'{route}'" in str(r["sources"]) for r in listener.events("report")):
+            sequence += 1
+            message = frame_message(framed(Pattern(64).payload(route, sequence)))
+            inbound.flows[route].message(sequence, 0, memoryview(message))
+            await asyncio.sleep(0.02)
+
+
+# --- through two agents -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Two:
+    """Two linked agents on this machine, and a shell at each core."""
+
+    a: Agent
+    b: Agent
+    at_a: Ros
+    at_b: Ros
+
+
+@pytest.fixture
+def two(agent: AgentFactory, shell: ShellFactory) -> Two:
+    a, b = agent(name="a"), agent(name="b")
+    a.wait_peer("b")
+    b.wait_peer("a")
+    return Two(a, b, shell(port=a.core_port), shell(port=b.core_port))
+
+
+def topics(ros: Ros) -> set[str]:
+    return set(ros.tool("rostopic", "list").split())
+
+
+@pytest.mark.trap(12)
+def test_two_peers_and_two_listeners_each_are_one_connection_to_a_rospy_talker(
+    two: Two, agent: AgentFactory, shell: ShellFactory
+) -> None:
+    c = agent(name="c")
+    c.wait_peer("a")
+    hears = [
+        ros.node(kind, "listener") for ros in (two.at_b, shell(port=c.core_port)) for kind in ("rospy", "roscpp")
+    ]
+    two.at_a.rospy("talker", "__name:=speaker", rate=100)
+    for heard in hears:
+        flows(heard)
+    info = two.at_a.tool("rosnode", "info", "/speaker").splitlines()
+    connections = [line for line, topic in zip(info[1:], info, strict=False) if topic.strip() == "* topic: /chatter"]
+    assert [line.strip() for line in connections] == ["* to: /rmpa"], info
+    for heard in hears:
+        report = flows(heard, 50)
+        assert (report["bad"], report["gaps"], report["doubled"]) == (0, 0, 0)
+
+
+@pytest.mark.trap(14)
+@libraries
+def test_a_listener_stays_connected_when_another_node_takes_the_talkers_name(two: Two, library: str) -> None:
+    """Its header differs (it latches), so the subscribers must be hung up on; rospy comes again only if told to."""
+    heard = two.at_b.node(library, "listener")
+    older = two.at_a.roscpp("talker", "__name:=speaker", rate=100)
+    flows(heard)
+    two.at_a.rospy("talker", "__name:=speaker", rate=100, latch=True, source=2)
+    assert older.wait(DEADLINE) == 0
+    heard.wait_event("report", where=lambda event: "2" in event["sources"])  # type: ignore[operator]
+    assert flows(heard)["bad"] == 0
+
+
+@pytest.mark.trap(36)
+def test_logs_time_and_logger_services_stay_home(two: Two) -> None:
+    speak = (
+        "import sys, rospy\nrospy.init_node(sys.argv[1])\nr = rospy.timer.Rate(20)\n"
+        "while not rospy.is_shutdown():\n    rospy.logwarn('said by ' + sys.argv[1])\n    r.sleep()\n"
+    )
+    echoes = {ros: ros.start("rostopic", "echo", "/rosout_agg/msg", name="echo") for ros in (two.at_a, two.at_b)}
+    for name, ros in (("node_a", two.at_a), ("node_b", two.at_b)):
+        ros.start(PYTHON, "-c", speak, name, name=name)
+    echoes[two.at_a].wait_for("said by node_a")
+    echoes[two.at_b].wait_for("said by node_b")
+    two.at_a.rospy("talker", "__name:=clock", topic="/clock", type="String", rate=50)
+    two.at_a.rospy("talker", "__name:=crosses", topic="/crosses", rate=50)
+    eventually(lambda: "/crosses" in topics(two.at_b), what="a topic that crosses")
+    eventually(lambda: "/clock" in topics(two.at_a), what="/clock at home")
+    assert "/clock" not in topics(two.at_b)
+    for ros, other in ((two.at_a, "node_b"), (two.at_b, "node_a")):
+        for topic in ("/rosout", "/rosout_agg"):
+            assert other not in ros.tool("rostopic", "info", topic)
+            assert "/rmpa" not in ros.tool("rostopic", "info", topic)
+        assert other not in ros.tool("rosservice", "list")
+        assert f"said by {other}" not in echoes[ros].output
+    two.at_a.tool("rosparam", "set", "/use_sim_time", "true")
+    assert "/use_sim_time" not in two.at_b.tool("rosparam", "list").split()
+
+
+@pytest.mark.trap(37)
+@libraries
+def test_a_topic_published_and_heard_on_both_sides_is_heard_once_each(two: Two, library: str) -> None:
+    hears = [ros.node(library, "listener", topic="/shared") for ros in (two.at_a, two.at_b)]
+    for heard in hears:
+        heard.wait_event("up")
+    for source, ros in enumerate((two.at_a, two.at_b), start=1):
+        # Each waits for both listeners: its own, and by the agent's subscription the other one.
+        ros.node(library, "talker", topic="/shared", rate=100, count=50, source=source, wait=2)
+    for heard in hears:
+        whole(heard.wait_event("report", where=lambda event: int(str(event["count"])) >= 100), 100)
+    # A loop would go on by itself: another topic's messages come and go meanwhile, and nothing was added.
+    after = two.at_b.node(library, "listener", topic="/after", count=50)
+    two.at_a.node(library, "talker", topic="/after", rate=100, count=50, wait=1)
+    after.wait_event("done")
+    for heard in hears:
+        whole(heard.events("report")[-1], 100)
+    nodes = two.at_b.tool("rosnode", "list").split()
+    assert not [name for name in nodes if name.count("/rmpa") > 1], nodes
+
+
+@pytest.mark.trap(38)
+@libraries
+def test_who_subscribes_before_anybody_publishes_loses_nothing(two: Two, library: str) -> None:
+    first = two.at_b.node(library, "listener", "__name:=first", count=100)
+    anything = two.at_b.start("rostopic", "echo", "-n", "1", "/other", name="echo")
+    first.wait_event("up")
+    anything.wait_for("does not appear to be published yet")
+    assert two.at_b.start("rostopic", "type", "/other", name="type").wait() == 1
+    two.at_a.node(library, "talker", "__name:=speaker", rate=100, count=100, wait=1)
+    whole(first.wait_event("done"), 100)
+    assert two.at_b.tool("rostopic", "type", "/chatter").strip() == BYTES
+    two.at_a.node(library, "talker", "__name:=other", topic="/other", rate=20)
+    assert anything.wait() == 0
+    assert "layout:" in anything.output
+
+
+@pytest.mark.trap(38)
+def test_a_listener_of_another_type_that_was_first_gets_nothing_and_both_sides_say_why(two: Two) -> None:
+    wrong = two.at_b.rospy("listener", "__name:=wrong", topic="/mixed")
+    wrong.wait_event("up")
+    two.at_a.rospy("talker", "__name:=speaker", topic="/mixed", type="String", rate=50)
+    for side in (two.a, two.b):
+        side.process.wait_for("(?i)warning.*/wrong.*/mixed.*type/md5sum")
+    assert wrong.events("first") == []
+    assert wrong.returncode is None
+
+
+@pytest.mark.trap(17, 39)
+async def test_header_seq_and_every_other_byte_arrive_as_they_were_sent(two: Two) -> None:
+    kind = MessageType("sensor_msgs/Joy")
+    sequences = (4711, 3, 4294967295)
+    values = [{"header": {"seq": seq, "frame_id": "pad"}, "axes": [0.5]} for seq in sequences]
+    messages = [kind.serialize(kind.make(value)) for value in values]  # type: ignore[arg-type]  # plain values
+    messages.append(messages[0] + b"trailing bytes")  # rospy and roscpp take such a message without a word
+    got: list[bytes] = []
+    async with node("ours", two.a) as ours, node("hears", two.b) as hears:
+        await hears.subscribe("/joy", None, lambda received: got.append(received.raw))
+        publisher = await ours.advertise("/joy", "sensor_msgs/Joy")
+        await asyncio.wait_for(publisher.wait_for_subscriber(), DEADLINE)
+        for message in messages:
+            publisher.publish_raw(message)
+        await until(lambda: len(got) == len(messages))
+        assert got == messages
+        echo = await asyncio.to_thread(two.at_b.start, "rostopic", "echo", "-n", "1", "/joy/header/seq", name="echo")
+        while echo.returncode is None:
+            publisher.publish_raw(messages[0])
+            await asyncio.sleep(0.05)
+        assert "4711" in echo.output
+
+
+@pytest.mark.trap(40)
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+@libraries
+def test_a_node_that_was_killed_leaves_both_graphs(two: Two, library: str, number: signal.Signals) -> None:
+    """roscpp unregisters at no signal but SIGINT; the agent learns it from the connection that breaks."""
+    talker = two.at_a.node(library, "talker", "__name:=speaker", rate=100)
+    flows(two.at_b.roscpp("listener"))
+    talker.send(number)
+    talker.wait()
+    for ros, name in ((two.at_a, "/speaker"), (two.at_b, "/rmpa/a/speaker")):
+        eventually(lambda ros=ros, name=name: name not in ros.tool("rosnode", "list").split(), what=f"{name} gone")  # type: ignore[misc]
+    assert "/chatter" not in topics(two.at_a)
+    assert "Publishers: None" in two.at_b.tool("rostopic", "info", "/chatter")
