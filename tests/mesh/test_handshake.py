@@ -121,8 +121,18 @@ def test_the_answer_is_judged_too() -> None:
         assert verdict.code == code
 
 
+@pytest.mark.parametrize("place", ["0.0.0.0:0", "0.1.2.3:40001", "224.0.0.1:40001", "240.0.0.1:1", "10.0.0.1:0"])
+def test_a_guid_where_nobody_can_be_reached_is_malformed(place: str) -> None:
+    """Discovery gossips the GUIDs of its links; one that no beacon may carry stopped all its beacons."""
+    with pytest.raises(HandshakeError, match="no peer can be reached") as caught:
+        Hello.parse(replace(HELLO, guid=Guid.parse(place)).serialize())
+    assert caught.value.refuse.code == Refusal.MALFORMED
+
+
 @given(
-    guid=st.integers(0, 2**64 - 1),
+    guid=st.builds(
+        Guid.of, st.ip_addresses(v=4, network="64.0.0.0/2"), st.integers(1, 0xFFFF), st.integers(0, 0xFFFF)
+    ),
     instance=st.binary(min_size=16, max_size=16),
     name=st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,63}", fullmatch=True),
     domain=st.integers(0, 0xFFFF),
@@ -131,7 +141,7 @@ def test_the_answer_is_judged_too() -> None:
     lane=st.integers(0, 255),
 )
 def test_any_hello_survives(
-    guid: int, instance: bytes, name: str, domain: int, lease: int, expected: int, lane: int
+    guid: Guid, instance: bytes, name: str, domain: int, lease: int, expected: int, lane: int
 ) -> None:
-    hello = Hello(Guid(guid), instance, name, domain, lease, Guid(expected), lane)
+    hello = Hello(guid, instance, name, domain, lease, Guid(expected), lane)
     assert Hello.parse(hello.serialize()) == hello

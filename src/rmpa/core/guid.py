@@ -75,6 +75,20 @@ class Guid:
         """``(address, port)`` as sockets want it; shared by all incarnations of one peer."""
         return str(self.address), self.port
 
+    @property
+    def dialable(self) -> bool:
+        """Whether one peer can be reached there; see ``dialable``."""
+        return dialable(self.address, self.port)
+
     def __str__(self) -> str:
         """``10.0.0.1:40001#7``."""
         return f"{self.address}:{self.port}#{self.incarnation}"
+
+
+def dialable(address: IPv4Address, port: int) -> bool:
+    """Whether one peer can be reached there: no multicast, broadcast or "any" address, no port 0.
+
+    Who named such an address could make those who believe it shout at a whole network.
+    """
+    high = int(address) >> 24
+    return 0 < high < 224 and port != 0

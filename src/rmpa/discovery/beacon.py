@@ -21,7 +21,7 @@ from typing import Final
 
 from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
-from rmpa.core.guid import Guid
+from rmpa.core.guid import Guid, dialable
 from rmpa.core.identity import Identity
 
 MAGIC: Final = b"RMPA"
@@ -79,15 +79,6 @@ class BeaconOtherDomain(RemoteProtocolError):  # noqa: N818
         return f"is of domain {self.domain}"
 
 
-def dialable(address: IPv4Address, port: int) -> bool:
-    """Whether one peer can be reached there: no multicast, broadcast or "any" address, no port 0.
-
-    A beacon that named such an address could make its readers shout at a whole network.
-    """
-    high = int(address) >> 24
-    return 0 < high < 224 and port != 0
-
-
 @dataclass(frozen=True, slots=True)
 class Beacon:
     """One beacon.
@@ -121,7 +112,7 @@ class Beacon:
             if not dialable(address, port):
                 raise ValueError(f"no peer can be reached at {address}:{port}")
         for guid in self.gossip:
-            if not dialable(guid.address, guid.port):
+            if not guid.dialable:
                 raise ValueError(f"no gossiped peer can be reached at {guid}")
 
     @classmethod

@@ -167,6 +167,9 @@ class Hello:
             raise _malformed(problem)
         if lease_ms == 0:
             raise _malformed("a lease of 0")
+        if not Guid(guid).dialable:
+            # Discovery would pass it on, and no beacon may carry it.
+            raise _malformed(f"no peer can be reached at {Guid(guid)}")
         return cls(Guid(guid), instance, name, domain, lease_ms, Guid(expected) if expected else None, lane, features)
 
     def serialize(self) -> bytes:
