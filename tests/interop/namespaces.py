@@ -141,8 +141,8 @@ class Network:
 
     def plug(self, host: Host, *, octet: int | None = None) -> Cable:
         """Connect a host; its interface is ``eth`` with the number of its cable."""
-        octet = octet or self._next
-        self._next = max(self._next, octet) + 1
+        if octet is None:
+            octet, self._next = self._next, self._next + 1
         interface, port = f"eth{len(host.cables)}", f"port{octet}"
         cable = Cable(interface, f"10.77.{self.number}.{octet}", self.switch, port)
         names = ["link", "add", interface, "netns", host.namespace]
