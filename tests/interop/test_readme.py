@@ -31,9 +31,8 @@ def commands(program: str) -> list[list[str]]:
 
 
 def starts(program: str, *words: str) -> list[str]:
-    """The one command of the guide that begins with these words."""
-    [found] = [command for command in commands(program) if command[1 : len(words) + 1] == list(words)]
-    return found[1:]
+    """The arguments of the guide's first command that begins with these words."""
+    return next(command[1:] for command in commands(program) if command[1 : len(words) + 1] == list(words))
 
 
 @pytest.fixture
