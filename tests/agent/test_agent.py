@@ -15,6 +15,7 @@ from rmpa.bridge.proxy_names import proxied_node
 from rmpa.core.config import PolicySettings, Settings
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.monitor.aio.control_client import ControlClient
+from rmpa.ros.aio.http_client import call_api
 from rmpa.ros.aio.node import Node
 
 if TYPE_CHECKING:
@@ -303,3 +304,19 @@ async def test_the_control_socket_tells_and_pings(settings: Callable[..., Settin
         assert all(time is not None and 0 <= time < DEADLINE for time in answer.times)
         with pytest.raises(UnreachableError, match="did you mean a"):
             await b._ping({"peer": "aa"})
+
+
+async def test_the_agents_own_node_tells_what_it_is_connected_to(settings: Callable[..., Settings]) -> None:
+    """``rosnode info /rmpa`` and rqt_graph ask it for that."""
+    async with (
+        running(settings("a"), settings("b")) as (a, b),
+        node("talker", a) as talker,
+        node("hearer", b) as hearer,
+    ):
+        publisher = await talker.advertise("/chatter", "std_msgs/String")
+        subscriber = await hearer.subscribe("/chatter")
+        await until(lambda: publisher.subscribers and subscriber.publishers)
+        uri = a.core.call("lookupNode", "/test", "/rmpa")[2]
+        assert (await call_api(uri, "getSubscriptions", "/test")).value == [["/chatter", "std_msgs/String"]]
+        [bus] = (await call_api(uri, "getBusInfo", "/test")).value
+        assert bus[1:6] == [talker.uri, "i", "TCPROS", "/chatter", True]

@@ -67,7 +67,7 @@ class Bridge:
         self._core = core
         self._exports = Exports(policy)
         self._imports = Imports(policy, rng)
-        self._node = SlaveNode(OWN_NODE, LOOPBACK, core.uri)
+        self._node = SlaveNode(OWN_NODE, LOOPBACK, core.uri, taps=lambda: self._outbound.connections)
         self._outbound = Outbound(core, self._node, on_described=self._described, on_lost=self._lost)
         self._numbers = itertools.count(1)
         self._by_number: dict[int, Attached] = {}

@@ -12,7 +12,7 @@ from rmpa.ros.aio.subscription import PublisherConnection
 from rmpa.ros.tcpros import Description as TcprosDescription
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
     from rmpa.bridge.actions import AddRoute, Connect, RemoveRoute
     from rmpa.ros.aio.core import RosCore
@@ -51,6 +51,11 @@ class Outbound:
         """What flows, for the monitor."""
         return self._flows
 
+    @property
+    def connections(self) -> Iterable[PublisherConnection]:
+        """To the local publishers."""
+        return self._connections.values()
+
     def connect(self, action: Connect) -> None:
         """Subscribe to one publisher; its answer comes by ``on_described`` or ``on_lost``."""
         source = action.source
@@ -66,6 +71,7 @@ class Outbound:
             on_header=lambda fields: self._header(source, fields),
             on_refused=lambda text: self._gone(source, connection, f"its publisher refuses: {text}"),
             on_lost=lambda reason: self._gone(source, connection, reason),
+            number=self._node.next_number(),
         )
         self._connections[source] = connection
         connection.start()

@@ -15,10 +15,10 @@ from rmpa.ros.tcpros import ANY
 from rmpa.ros.xmlrpc import RosFault
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from rmpa.ros.aio.publication import Publication
-    from rmpa.ros.aio.subscription import Subscription
+    from rmpa.ros.aio.subscription import PublisherConnection, Subscription
     from rmpa.ros.slave import Connection
     from rmpa.ros.xmlrpc import XmlRpcValue
 
@@ -48,6 +48,7 @@ class SlaveNode:
         on_shutdown: ``(reason)``: the master wants this node to end; its owner closes it.
         on_param_update: ``(key, value) -> whether the node follows that key``.
         on_publisher_update: ``(topic, uris)``, behind the node's own subscriptions.
+        taps: Connections to publishers that the owner made by itself, for those who ask what the node is connected to.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class SlaveNode:
         on_shutdown: Callable[[str], None] = _ignore,
         on_param_update: Callable[[str, XmlRpcValue], bool] = _not_followed,
         on_publisher_update: Callable[[str, Sequence[str]], None] = _ignore,
+        taps: Callable[[], Iterable[PublisherConnection]] = tuple,
     ) -> None:
         self.name = name
         self.counters = counters if counters is not None else Counters()
@@ -73,6 +75,7 @@ class SlaveNode:
         self._on_shutdown = on_shutdown
         self._on_param_update = on_param_update
         self._on_publisher_update = on_publisher_update
+        self._taps = taps
         self._api = SlaveApi(name, master_uri, os.getpid(), self)
         self._http = XmlRpcServer(self._call, host, port, counters=self.counters, name=f"node {name}")
         self._tcpros = TcprosServer(name, self._publications, counters=self.counters, numbers=self._numbers)
@@ -147,13 +150,15 @@ class SlaveNode:
 
     def subscriptions(self) -> list[tuple[str, str]]:
         """Topics and types that are subscribed to."""
-        return [(s.topic, s.type_name) for s in self._subscriptions.values()]
+        found = {s.topic: s.type_name for s in self._subscriptions.values()}
+        found |= {tap.topic: tap.fields.get("type", ANY) for tap in self._taps()}
+        return list(found.items())
 
     def connections(self) -> list[Connection]:
         """All topic connections."""
         found = [c for publication in self._publications.values() for c in publication.connections()]
         found += [c for subscription in self._subscriptions.values() for c in subscription.connections()]
-        return found
+        return found + [tap.connection() for tap in self._taps()]
 
     def address_of(self, topic: str) -> tuple[str, int] | None:
         """Where to connect for a published topic."""
