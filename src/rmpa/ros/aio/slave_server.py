@@ -48,7 +48,7 @@ class SlaveNode:
         on_shutdown: ``(reason)``: the master wants this node to end; its owner closes it.
         on_param_update: ``(key, value) -> whether the node follows that key``.
         on_publisher_update: ``(topic, uris)``, behind the node's own subscriptions.
-        taps: Connections to publishers that the owner made by itself, for those who ask what the node is connected to.
+        taps: Connections to publishers that the owner made by itself, for ``getBusInfo`` and its like.
     """
 
     def __init__(
