@@ -133,6 +133,20 @@ def test_a_route_opened_twice_is_ignored_and_said(exports: Exports) -> None:
     assert isinstance(action, Warn)
 
 
+def test_a_peer_gets_one_copy_of_a_source_however_often_it_asks(exports: Exports) -> None:
+    exports.graph({CMD: JOY})
+    exports.link_up(1)
+    exports.opened(1, Open(7, "/cmd", "/joy"))
+    for route in (8, 9):
+        [action] = exports.opened(1, Open(route, "/cmd", "/joy"))
+        assert isinstance(action, Send)
+        assert isinstance(action.message, Closed)
+        assert action.message.route == route
+    assert exports.described(CMD, ABOUT) == [Send(1, Opened(7, ABOUT)), AddRoute(CMD, 1, 7)]
+    exports.closed(1, Close(7))
+    assert exports.opened(1, Open(10, "/cmd", "/joy")) == [Connect(CMD, JOY.type, JOY.uri)]
+
+
 def test_the_number_of_routes_is_bounded(exports: Exports, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "ROUTES_PER_LINK_MAX", 1)
     exports.graph({CMD: JOY})

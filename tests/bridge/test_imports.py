@@ -176,6 +176,19 @@ def test_the_number_of_topics_is_bounded(imports: Imports, monkeypatch: pytest.M
     assert isinstance(action, Warn)
 
 
+def test_the_number_of_nodes_is_bounded(imports: Imports, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "NODES_PER_PEER_MAX", 1)
+    imports.advertised(1, Advertise(added=(OFFER,)))
+    [action] = imports.advertised(1, Advertise(added=(Offer("/b", "/other", "a/B"),)))
+    assert isinstance(action, Warn)
+    assert action.kind == "nodes.too_many"
+    more = Offer("/b", "/joy", "a/B")
+    assert imports.advertised(1, Advertise(added=(more,))) == [Publish(1, more.source, "a/B")]
+    imports.advertised(1, Advertise(removed=(CMD, more.source)))
+    other = Offer("/b", "/other", "a/B")
+    assert imports.advertised(1, Advertise(added=(other,))) == [Publish(1, other.source, "a/B")]
+
+
 def test_every_state_can_be_left() -> None:
     assert set(TRANSITIONS) == set(RouteState)
     assert all(TRANSITIONS.values())

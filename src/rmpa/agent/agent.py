@@ -18,6 +18,7 @@ from rmpa.bridge.aio.bridge import Bridge
 from rmpa.bridge.policy import Policy
 from rmpa.core.aio.loop import AgentLoop
 from rmpa.core.aio.notify import notify_service_manager
+from rmpa.core.aio.sockets import raise_file_limit
 from rmpa.core.config_values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
 from rmpa.monitor.aio.control_server import ControlServer
@@ -53,7 +54,7 @@ class Agent:
         self.bridge = Bridge(self.core, Policy(settings.policy), rng=random.random)
         self.station: Station | None = None
         self._moving: asyncio.Task[None] | None = None
-        self._view = View(settings, self.core, self.bridge, started=time.time())
+        self._view = View(settings, self.core, self.bridge, self._control.counters, started=time.time())
 
     async def start(self) -> None:
         """Start every part; the network last, so that who finds us finds us ready.
@@ -163,6 +164,7 @@ def run(settings: Settings) -> int:
     Raises:
         StartError: It cannot start on this machine as asked.
     """
+    raise_file_limit()
     with asyncio.Runner(loop_factory=AgentLoop) as runner:
         runner.run(_serve(settings))
     return 0

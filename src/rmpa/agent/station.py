@@ -107,7 +107,7 @@ class Station:
                 _log.info("- %s %s", identity, reason.value)
                 self.mesh.peer_gone(identity.guid)
             case Conflict():
-                _log.error("! %s", event)
+                pass  # said by the discovery, no more often than a log can bear
 
     def _link_up(self, link: MeshLink) -> None:
         # Its beacons' port is its mesh port, whichever port an accepted connection came from.

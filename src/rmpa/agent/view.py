@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import Counter
 from typing import TYPE_CHECKING
 
 import psutil
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from rmpa.agent.station import Station
     from rmpa.bridge.aio.bridge import Attached, Bridge
     from rmpa.core.config import Settings
+    from rmpa.core.counters import Counters
     from rmpa.discovery.events import PeerView
     from rmpa.mesh.aio.link import MeshLink
     from rmpa.mesh.peering import PeerStatus
@@ -31,13 +33,17 @@ class View:
         settings: The agent's settings.
         core: Its ROS core.
         bridge: Its bridge.
+        counters: Those of its other parts.
         started: Seconds since the epoch.
     """
 
-    def __init__(self, settings: Settings, core: RosCore, bridge: Bridge, *, started: float) -> None:
+    def __init__(
+        self, settings: Settings, core: RosCore, bridge: Bridge, *counters: Counters, started: float
+    ) -> None:
         self._settings = settings
         self._core = core
         self._bridge = bridge
+        self._counters = counters
         self._started = started
         self._process = psutil.Process()
         self._clock = SystemClock()
@@ -46,11 +52,12 @@ class View:
 
     def snapshot(self) -> Snapshot:
         """Everything at this moment."""
-        counters = dict(self._bridge.counters.as_dict())
-        counters.update(self._core.counters.as_dict())
+        rooms = [self._bridge.counters, self._core.counters, *self._counters]
         if self.station is not None:
-            counters.update(self.station.mesh.counters.as_dict())
-            counters.update(self.station.discovery.counters.as_dict())
+            rooms += [self.station.mesh.counters, self.station.discovery.counters]
+        counters: Counter[str] = Counter()
+        for room in rooms:  # the core and the proxies have the same servers: their counts add up
+            counters.update(room.as_dict())
         return Snapshot(
             agent=self._agent(),
             taken=time.time(),

@@ -131,8 +131,11 @@ class Exports:
         local = self._local.get(source)
         if local is None:
             return [Send(peer, Closed(message.route, f"{source}: not published here, or policy keeps it home"))]
-        routes[message.route] = source
         flow = self._flows.get(source)
+        if flow is not None and any(other == peer for other, _ in flow.routes):
+            # One copy a peer: more would let it multiply what we send at will.
+            return [Send(peer, Closed(message.route, f"{source} is open on another route of this link"))]
+        routes[message.route] = source
         if flow is None:
             flow = self._flows[source] = _Flow(local.uri)
             flow.routes[peer, message.route] = False

@@ -12,6 +12,7 @@ of each peer is in one state of this table::
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
@@ -98,6 +99,7 @@ class Imports:
         self._peers: dict[int, dict[Source, Import]] = {}
         self._routes: dict[int, dict[int, Source]] = {}
         self._next_route: dict[int, int] = {}
+        self._nodes: dict[int, Counter[str]] = {}
         self._local_types: dict[str, str] = {}
         self._timed: set[tuple[int, Source]] = set()
 
@@ -129,6 +131,7 @@ class Imports:
         self._peers[peer] = {}
         self._routes[peer] = {}
         self._next_route[peer] = 1
+        self._nodes[peer] = Counter()
         return []
 
     def link_down(self, peer: int) -> list[Action]:
@@ -143,6 +146,7 @@ class Imports:
                 actions.append(Retract(peer, source))
         self._routes.pop(peer, None)
         self._next_route.pop(peer, None)
+        self._nodes.pop(peer, None)
         return actions
 
     def advertised(self, peer: int, message: Advertise) -> list[Action]:
@@ -243,6 +247,17 @@ class Imports:
             return [
                 Warn("topics.too_many", str(peer), f"a peer offers more than {limits.TOPICS_PER_PEER_MAX} topics")
             ]
+        nodes = self._nodes[peer]
+        if source.node not in nodes and len(nodes) >= limits.NODES_PER_PEER_MAX:
+            return [
+                Warn(
+                    "nodes.too_many",
+                    str(peer),
+                    f"a peer offers topics of more than {limits.NODES_PER_PEER_MAX} nodes; the rest stays hidden: "
+                    "deny some by bridge.deny over there",
+                )
+            ]
+        nodes[source.node] += 1
         backoff = Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng)
         entry = known[source] = Import(offer.type, backoff)
         actions += self._show_or_hide(peer, source, entry)
@@ -288,6 +303,10 @@ class Imports:
         if entry.shown:
             actions.append(Retract(peer, source))
         del self._peers[peer][source]
+        nodes = self._nodes[peer]
+        nodes[source.node] -= 1
+        if not nodes[source.node]:
+            del nodes[source.node]
         return actions
 
     def _move(self, peer: int, source: Source, entry: Import, state: RouteState, timer: float | None = None) -> None:

@@ -10,6 +10,10 @@ from typing import Final
 KIB: Final = 1024
 MIB: Final = 1024 * KIB
 
+# --- process --------------------------------------------------------------------------------------------------
+OPEN_FILES: Final = 65_536
+"""File descriptors that an agent asks for, as far as the hard limit allows: the usual 1024 are 500 proxies."""
+
 # --- identity -------------------------------------------------------------------------------------------------
 INSTANCE_ID_BYTES: Final = 16
 """Random id of one run of one agent: 128 bits, so that two runs never share one."""
@@ -251,6 +255,8 @@ ROUTES_PER_LINK_MAX: Final = 8192
 """Open routes that one peer may hold with us."""
 TOPICS_PER_PEER_MAX: Final = 16384
 """(topic, node) pairs that one peer may advertise."""
+NODES_PER_PEER_MAX: Final = 256
+"""Nodes of one peer that get a proxy here: each takes two listening sockets; large robots have some 100 nodes."""
 MISMATCHES_MAX: Final = 16
 """Refused subscribers of one source that are remembered for the user."""
 CALL_BACK_DELAYS: Final = (0.05, 1.0)

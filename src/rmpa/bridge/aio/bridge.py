@@ -67,7 +67,10 @@ class Bridge:
         self._core = core
         self._exports = Exports(policy)
         self._imports = Imports(policy, rng)
-        self._node = SlaveNode(OWN_NODE, LOOPBACK, core.uri, taps=lambda: self._outbound.connections)
+        self.counters = Counters()
+        self._node = SlaveNode(
+            OWN_NODE, LOOPBACK, core.uri, counters=self.counters, taps=lambda: self._outbound.connections
+        )
         self._outbound = Outbound(core, self._node, on_described=self._described, on_lost=self._lost)
         self._numbers = itertools.count(1)
         self._by_number: dict[int, Attached] = {}
@@ -79,7 +82,6 @@ class Bridge:
         self._closed = False
         self._types: dict[Source, str] = {}
         self._mismatches: dict[Source, dict[str, str]] = {}
-        self.counters = Counters()
         self._refusals = RefusalLog(_log, self.counters)
 
     @property
@@ -135,6 +137,7 @@ class Bridge:
         inbound = Inbound(
             self._core,
             prefix,
+            counters=self.counters,
             on_demand=lambda source, wanted: self._demand(peer, source, wanted=wanted),
             on_mismatch=lambda source, subscriber, text: self._mismatched(peer, source, subscriber, text),
         )

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.actions import Describe, Detach, Publish, Retract
     from rmpa.bridge.messages import Source
+    from rmpa.core.counters import Counters
     from rmpa.ros.aio.core import RosCore
 
 _log = logging.getLogger(__name__)
@@ -48,6 +49,7 @@ class Inbound:
     Args:
         core: The local core, in which the proxies are registered.
         prefix: The namespace of this peer's proxies.
+        counters: Where refusals at the proxies' ports are counted.
         on_demand: Called with a source and whether somebody local listens to it.
         on_mismatch: Called with a source, the caller id of a refused subscriber and the text it was told.
     """
@@ -57,11 +59,13 @@ class Inbound:
         core: RosCore,
         prefix: str,
         *,
+        counters: Counters | None = None,
         on_demand: Callable[[Source, bool], None],
         on_mismatch: Callable[[Source, str, str], None],
     ) -> None:
         self.prefix = prefix
         self._core = core
+        self._counters = counters
         self._on_demand = on_demand
         self._on_mismatch = on_mismatch
         self._proxies: dict[str, Proxy] = {}
@@ -150,7 +154,13 @@ class Inbound:
         proxy = self._proxies.get(source.node)
         if proxy is None:
             name = proxy_name(self.prefix, source.node)
-            node = SlaveNode(name, LOOPBACK, self._core.uri, on_shutdown=lambda reason: _not_here(name, reason))
+            node = SlaveNode(
+                name,
+                LOOPBACK,
+                self._core.uri,
+                counters=self._counters,
+                on_shutdown=lambda reason: _not_here(name, reason),
+            )
             await node.start()
             proxy = self._proxies[source.node] = Proxy(node)
         if self._wanted.get(source) != type_name:

@@ -1,15 +1,27 @@
-"""The mesh port: TCP for links and UDP for unicast beacons under one number, the one in the GUID."""
+"""The mesh port: TCP for links and UDP for unicast beacons under one number; and room for all the other sockets."""
 
 from __future__ import annotations
 
 import errno
+import resource
 import socket
 from typing import Final
 
+from rmpa.core import limits
 from rmpa.core.errors import StartError
 
 _ATTEMPTS: Final = 32
 _BACKLOG: Final = 64
+
+
+def raise_file_limit() -> int:
+    """Let this process open as many files as it may, up to ``limits.OPEN_FILES``; return how many that are."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = limits.OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, limits.OPEN_FILES)
+    if soft == resource.RLIM_INFINITY or soft >= wanted:
+        return soft
+    resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    return wanted
 
 
 def open_mesh_port(port: int = 0) -> tuple[socket.socket, socket.socket]:
