@@ -12,11 +12,13 @@ import pytest
 
 from rmpa.agent import Agent
 from rmpa.bridge.proxy_names import proxied_node
+from rmpa.core import limits
 from rmpa.core.config import PolicySettings, Settings
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.monitor.aio.control_client import ControlClient
 from rmpa.ros.aio.http_client import call_api
 from rmpa.ros.aio.node import Node
+from rmpa.ros.aio.slave_server import SlaveNode
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -323,3 +325,23 @@ async def test_the_agents_own_node_tells_what_it_is_connected_to(settings: Calla
                 assert bus == [talker.uri, "i", "TCPROS", "/chatter", True]
             case other:
                 pytest.fail(f"getBusInfo answers {other}")
+
+
+async def test_a_proxy_that_could_not_be_made_is_made_later(
+    settings: Callable[..., Settings], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "RECONCILE_INTERVAL", 0.1)
+    async with running(settings("a"), settings("b")) as (a, b), node("talker", a) as talker:
+        start = SlaveNode.start
+        refusals: list[str] = []
+
+        async def refuse(proxy: SlaveNode) -> None:
+            if proxy.name == "/rmpa/a/talker" and len(refusals) < 2:
+                refusals.append(proxy.name)
+                raise StartError("a socket", "there are too many open files")
+            await start(proxy)
+
+        monkeypatch.setattr(SlaveNode, "start", refuse)
+        await talker.advertise("/chatter", "std_msgs/String")
+        await until(lambda: "/chatter" in b.core.state().publishers)
+        assert len(refusals) == 2

@@ -7,18 +7,19 @@ import logging
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from rmpa.bridge.actions import Publish
 from rmpa.bridge.aio.flows import ImportFlow
 from rmpa.bridge.proxy_names import LOOPBACK, proxy_name
 from rmpa.core import limits
 from rmpa.core.errors import RmpaError
 from rmpa.ros.aio.publication import Publication
 from rmpa.ros.aio.slave_server import SlaveNode
-from rmpa.ros.tcpros import Description
+from rmpa.ros.tcpros import Description, printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from rmpa.bridge.actions import Describe, Detach, Publish, Retract
+    from rmpa.bridge.actions import Describe, Detach, Retract
     from rmpa.bridge.messages import Source
     from rmpa.core.counters import Counters
     from rmpa.ros.aio.core import RosCore
@@ -130,6 +131,10 @@ class Inbound:
         ]
         for proxy, topic in missing:
             self._register(proxy, topic)
+        if self._jobs.empty():
+            for source, type_name in self._wanted.items():
+                if self.publication(source) is None:
+                    self._jobs.put_nowait(Publish(0, source, type_name))
         return len(missing)
 
     async def close(self) -> None:
@@ -141,16 +146,21 @@ class Inbound:
     async def _work(self) -> None:
         while (job := await self._jobs.get()) is not None:
             try:
-                if hasattr(job, "type"):
+                if isinstance(job, Publish):
                     await self._publish(job.source, job.type)
                 else:
                     await self._retract(job.source)
-            except (RmpaError, OSError):
-                _log.exception("! %s: %s cannot be carried out", self.prefix, job)
+            except (RmpaError, OSError) as error:
+                # Most likely no file descriptor is left; what is wanted is tried again by ``reconcile``.
+                _log.error("! %s: %s is not in the local graph: %s", self.prefix, job.source, error)
+            except Exception:  # noqa: BLE001 - the task's top: one source that fails must not stop the others
+                _log.exception("! %s: %s failed; the others go on", self.prefix, job)
         for node in list(self._proxies):
             await self._close_proxy(node)
 
     async def _publish(self, source: Source, type_name: str) -> None:
+        if self.publication(source) is not None:
+            return  # asked for again while the first attempt was still at work
         proxy = self._proxies.get(source.node)
         if proxy is None:
             name = proxy_name(self.prefix, source.node)
@@ -173,7 +183,7 @@ class Inbound:
             proxy.node.name,
             on_first_subscriber=lambda: self._on_demand(source, True),
             on_last_subscriber=lambda: self._on_demand(source, False),
-            on_mismatch=lambda fields, text: self._on_mismatch(source, fields.get("callerid", ""), text),
+            on_mismatch=lambda fields, text: self._on_mismatch(source, printable(fields.get("callerid", "")), text),
         )
         proxy.node.add_publication(publication)
         proxy.publications[source.topic] = publication
