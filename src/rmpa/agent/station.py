@@ -118,11 +118,14 @@ class Station:
         self._bridge.link_down(link)
         self.discovery.link_down(link.identity.guid, link.identity.instance)
 
-    def _interfaces(self, usable: tuple[Interface, ...]) -> None:
+    def _interfaces(self, usable: tuple[Interface, ...]) -> bool:
+        """Whether we stay where we are."""
         ours = self.identity.guid.address
         there = {address for interface in usable for address in interface.addresses}
         better = ours.is_loopback and not pick_address(usable).is_loopback
         # An address that is only gone (a cable pulled, a lease renewed) may come back; one that has been replaced
         # will not, and until then those who know us by the old one are not confused.
-        if better or (ours not in there and not pick_address(usable).is_loopback):
+        displaced = better or (ours not in there and not pick_address(usable).is_loopback)
+        if displaced:
             self._on_displaced()
+        return not displaced

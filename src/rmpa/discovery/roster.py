@@ -263,6 +263,11 @@ class Roster:
             if voice is not None and not (seat.own and voice is seat.current)
         )
 
+    def silent_seeds(self) -> list[Address]:
+        """Seeds at whose address nobody in the roster is."""
+        met = {host for voice in self._present() for host, _ in _addresses(voice)}
+        return [seed for seed in self._seeds if seed[0] not in met]
+
     @property
     def identity(self) -> Identity:
         """Our own, as the next beacon will say it."""

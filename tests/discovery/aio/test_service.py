@@ -144,7 +144,7 @@ async def test_garbage_is_counted_said_once_and_survived(
     lines = [r.getMessage() for r in caplog.records]
     assert len([line for line in lines if "malformed" in line]) == 1
     assert any("127.0.0.1 speaks version 2 of the protocol, we speak 1: update" in line for line in lines)
-    assert not any("domain" in line for line in lines)
+    assert len([line for line in lines if "is of domain 7, we are of domain 0" in line]) == 1
     pc = Agent("pc", settings)
     await start(agents, pc)
     await until(lambda: base.names() == {"pc"})
@@ -318,3 +318,54 @@ async def test_close_twice_and_before_start(settings: Settings) -> None:
     with contextlib.closing(agent.sock):
         await agent.discovery.close()
         await agent.discovery.close()
+
+
+async def test_loopback_that_the_user_chose_is_no_trouble(
+    agents: list[Agent], settings: Settings, caplog: pytest.LogCaptureFixture
+) -> None:
+    base = Agent("base", settings)
+    await start(agents, base)
+    assert base.discovery.notes() == ()
+    assert not [r for r in caplog.records if r.levelno >= logging.WARNING]
+
+
+async def test_what_leaves_by_loopback_comes_from_loopback(agents: list[Agent], settings: Settings) -> None:
+    """Linux would take another interface's address, where there is one, which goes when that interface does."""
+    base, pc = Agent("base", settings), Agent("pc", settings)
+    await start(agents, base, pc)
+    await until(lambda: base.names() == {"pc"} and pc.names() == {"base"})
+    assert [event.source for event in base.events if isinstance(event, PeerFound)] == [("127.0.0.1", pc.port)]
+
+
+async def test_an_identity_that_no_longer_fits_is_announced_no_more(agents: list[Agent], settings: Settings) -> None:
+    """Peers that heard the old one on the new network dialled an address that is not ours."""
+    now_there = [*list_interfaces()]
+    asked: list[tuple[Interface, ...]] = []
+
+    def fits(usable: tuple[Interface, ...]) -> bool:
+        asked.append(usable)
+        return len(asked) > 1
+
+    base = Agent("base", settings, look=lambda: tuple(now_there), on_interfaces=fits)
+    await start(agents, base)
+    await until(lambda: not base.discovery._roster._burst)
+    for times in (1, 2):
+        now_there.append(Interface(f"new{times}", 4242 + times, (), up=False, multicast=False, loopback=False))
+        base.discovery._watcher._compare()
+        assert len(asked) == times
+        assert bool(base.discovery._roster._burst) == (times == 2)
+
+
+async def test_seeds_that_do_not_answer_and_another_domain_are_told(
+    agents: list[Agent], settings: Settings, caplog: pytest.LogCaptureFixture
+) -> None:
+    quiet = {"group": settings.group, "group_port": settings.group_port, "multicast": False}
+    hub = Agent("hub", Settings(**quiet, domain=1))  # type: ignore[arg-type]
+    seed = (HostPort("127.0.0.1", hub.port),)
+    left = Agent("left", Settings(**quiet, domain=2, seeds=seed))  # type: ignore[arg-type]
+    await start(agents, hub, left)
+    await until(lambda: "is of domain 2, we are of domain 1: start both with the same --domain" in caplog.text)
+    assert f"seed 127.0.0.1:{hub.port}: no answer" in left.discovery.notes()[0]
+    right = Agent("right", Settings(**quiet, domain=1, seeds=seed))  # type: ignore[arg-type]
+    await start(agents, right)
+    await until(lambda: right.discovery.notes() == ())

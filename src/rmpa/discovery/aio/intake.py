@@ -34,8 +34,12 @@ class Intake:
         self._recent: OrderedDict[bytes, None] = OrderedDict()
         self._sources: OrderedDict[str, tuple[float, int]] = OrderedDict()
 
-    def take(self, data: bytes, source: Address, now: float) -> Beacon | None:
-        """The beacon in a packet; ``None`` if there is none, which is counted and, where it helps, logged."""
+    def take(self, data: bytes, source: Address, now: float, *, multicast: bool) -> Beacon | None:
+        """The beacon in a packet; ``None`` if there is none, which is counted and, where it helps, logged.
+
+        Other domains have ports of their own, and are none of our business. But one that speaks to us alone was
+        given our address, and waits for an answer.
+        """
         host, _ = source
         if self._floods(host, now):
             self._refusals.refuse(
@@ -51,8 +55,12 @@ class Intake:
                 self._recent.popitem(last=False)
         try:
             beacon = Beacon.parse(data, self._domain)
-        except BeaconOtherDomain:
-            self._counters.add("beacon.other_domain")
+        except BeaconOtherDomain as error:
+            if multicast:
+                self._counters.add("beacon.other_domain")
+            else:
+                remedy = f"we are of domain {self._domain}: start both with the same --domain (ROS_DOMAIN_ID)"
+                self._refusals.refuse(now, "beacon.other_domain", host, f"the peer at {host} {error}, {remedy}")
         except BeaconOtherVersion as error:
             self._refusals.refuse(now, "beacon.version", host, f"the peer at {host} {error}")
         except RemoteProtocolError as error:

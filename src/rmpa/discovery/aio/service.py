@@ -50,7 +50,8 @@ class Discovery:
         settings: Group, port, domain, interfaces, seeds, and whether to use multicast.
         udp_socket: Bound to the mesh's port, non-blocking; lent, not closed here.
         on_event: Called in the loop with each event of the roster, in order.
-        on_interfaces: Called in the loop with the interfaces that are used now, after they changed.
+        on_interfaces: Called in the loop with the interfaces that are used now, after they changed; says whether our
+            identity still fits them. If not we are about to be closed, and announce nothing more.
         clock: Tells monotonic seconds.
         look: How interfaces are listed.
         resolve: How the host name of a seed is looked up; runs in a thread.
@@ -63,7 +64,7 @@ class Discovery:
         udp_socket: socket.socket,
         *,
         on_event: Callable[[Event], None],
-        on_interfaces: Callable[[tuple[Interface, ...]], None] = lambda _: None,
+        on_interfaces: Callable[[tuple[Interface, ...]], bool] = lambda _: True,
         clock: Clock | None = None,
         look: Callable[[], tuple[Interface, ...]] = list_interfaces,
         resolve: Callable[[str], list[str]] = resolve_ipv4,
@@ -195,7 +196,7 @@ class Discovery:
             except OSError as error:  # an ICMP error that some earlier packet of ours caused
                 _log.debug("< %s", error)
                 continue
-            beacon = self._intake.take(data, source, now)
+            beacon = self._intake.take(data, source, now, multicast=multicast)
             if beacon is not None:
                 _log.debug("< %s:%d (interface %d): %s", *source, index, beacon)
                 self._roster.receive(beacon, source, now, multicast=multicast)
@@ -205,13 +206,19 @@ class Discovery:
 
     def _interfaces_changed(self, everything: tuple[Interface, ...]) -> None:
         self._use(everything)
+        if not self._on_interfaces(self._interfaces):
+            return
         self._roster.interfaces_changed(self._clock.now(), self._further_addresses(everything))
         self._flush()
-        self._on_interfaces(self._interfaces)
 
     def notes(self) -> tuple[str, ...]:
         """What the user should know of the network, ready to read."""
-        return tuple(sorted(self._warned))
+        silent = [
+            f"seed {host}:{port}: no answer; is `rmpa up` running there, in domain {self._settings.domain} too, "
+            "and its UDP port open?"
+            for host, port in self._roster.silent_seeds()
+        ]
+        return (*sorted(self._warned), *silent)
 
     def _further_addresses(self, everything: tuple[Interface, ...]) -> tuple[IPv4Address, ...]:
         wanted = self._settings.interfaces
@@ -229,7 +236,7 @@ class Discovery:
             return
         if self._interfaces != before:
             _log.info("= multicast %s:%d on %s", *self._group, ", ".join(map(str, self._interfaces)) or "nothing")
-        if any(not i.loopback for i in self._interfaces):
+        if any(not i.loopback for i in self._interfaces) or (wanted and self._interfaces):
             self._warned.discard(_ALONE)
         else:
             self._warn(_ALONE)

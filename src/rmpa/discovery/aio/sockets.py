@@ -124,7 +124,10 @@ class Sender:
         """Send to the group on each of these; return on how many it worked."""
         sent = 0
         for interface in interfaces:
-            ancillary = [(socket.IPPROTO_IP, _IP_PKTINFO, _PKTINFO.pack(interface.index, _ANY, _ANY))]
+            # Left alone, Linux takes an address of another interface for what leaves by loopback: its own has only
+            # host scope.
+            source = interface.addresses[0].packed if interface.loopback and interface.addresses else _ANY
+            ancillary = [(socket.IPPROTO_IP, _IP_PKTINFO, _PKTINFO.pack(interface.index, source, _ANY))]
             try:
                 self._sock.sendmsg([data], ancillary, 0, self._group)
             except (BlockingIOError, InterruptedError):
