@@ -317,6 +317,25 @@ async def test_no_file_descriptors_left_pauses_and_recovers(monkeypatch: pytest.
         assert one.mesh.counters["link.accept_failed"] == 2
 
 
+async def test_a_dial_without_file_descriptors_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It used to end the task without a word, and that peer was never dialled again."""
+    async with peers(2, found=False) as (one, other):
+        real = socket.socket
+        full = [True, True]
+
+        def none_left(*args: object, **options: object) -> socket.socket:
+            if full:
+                full.pop()
+                raise OSError(errno.EMFILE, "Too many open files")
+            return real(*args, **options)  # type: ignore[arg-type]
+
+        monkeypatch.setattr("rmpa.mesh.aio.mesh.socket.socket", none_left)
+        one.mesh.peer_found(other.identity)
+        other.mesh.peer_found(one.identity)
+        await until(lambda: one.linked(other) and other.linked(one), "linked after all")
+        assert not full
+
+
 async def test_silent_connections_from_one_address_are_bounded() -> None:
     async with peers(1) as (one,):
         writers = []

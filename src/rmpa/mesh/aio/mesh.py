@@ -301,19 +301,22 @@ class Mesh:
     async def _dial(self, dial: Dial) -> None:
         host, port = dial.endpoint
         _log.debug("> dialling %s at %s:%d", dial.guid, host, port)
-        sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+        sock: socket.socket | None = None
         try:
+            sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
             tune_express(sock, self.counters)
             async with asyncio.timeout(limits.DIAL_TIMEOUT):
                 await asyncio.get_running_loop().sock_connect(sock, dial.endpoint)
-        except OSError as error:  # TimeoutError is one
-            sock.close()
+        except OSError as error:  # TimeoutError is one, no file descriptor for the socket another
+            if sock is not None:
+                sock.close()
             self.counters.add("link.dial_failed")
             problem = os.strerror(error.errno) if error.errno else f"no answer within {limits.DIAL_TIMEOUT:g} s"
             self._peering.dial_failed(dial.guid, f"{host}:{port}: {problem}", self._clock.now())
             self._act()
         except BaseException:
-            sock.close()
+            if sock is not None:
+                sock.close()
             raise
         else:
             self._open(sock, Role.DIALLER, dial.endpoint, dial.guid)
