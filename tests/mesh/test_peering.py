@@ -99,6 +99,16 @@ def test_where_it_worked_is_dialled_first() -> None:
     assert until_dial(low, 9.0)[1] == good
 
 
+def test_since_when_a_peer_is_linked_or_not() -> None:
+    low = of(LOW)
+    low.peer_found(HIGH, 0.0)
+    assert [status.since for status in low.peers()] == [None]
+    low.link_up(1, HIGH, 3.0, dialled=True, endpoint=HIGH.guid.endpoint)
+    assert [status.since for status in low.peers()] == [3.0]
+    low.link_down(1, "lost", 9.0)
+    assert [status.since for status in low.peers()] == [9.0]
+
+
 def test_a_link_from_an_unknown_peer_is_up_and_is_forgotten_a_while_after_it_fell() -> None:
     low = of(LOW)
     low.link_up(7, HIGH, 0.0, dialled=False)

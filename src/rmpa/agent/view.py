@@ -104,14 +104,15 @@ class View:
     ) -> PeerInfo:
         identity = (view or status or attached.link).identity  # type: ignore[union-attr] # one of the three is there
         conflicts = view.conflicts if view is not None else ()
+        unlinked = status.since if status is not None and status.since is not None else view.since if view else now
         if attached is not None:
             state, since = "linked", attached.link.since or now
         elif view is not None and not view.present:
             state, since = "conflict", view.since
         elif status is not None and status.state == "refused":
-            state, since = "refused", view.since if view else now
+            state, since = "refused", unlinked
         else:
-            state, since = "linking", view.since if view else now
+            state, since = "linking", unlinked
         next_attempt = status.next_attempt if status is not None else None
         return PeerInfo(
             name=identity.name,

@@ -83,7 +83,7 @@ class PeerStatus:
         state: ``refused`` is a wait after a no that waiting seldom mends.
         link_id: Its link, if linked.
         lower: Whether we are the lower GUID, which dials first.
-        since: When the link came up, in monotonic seconds.
+        since: When the link came up, or the last one fell; ``None`` before the first. In monotonic seconds.
         attempts: Dials since the last link.
         last_error: Why there is no link, as far as we know; for a linked peer, why the last one ended.
         next_attempt: When we dial next, in monotonic seconds.
@@ -119,6 +119,7 @@ class _Peer:
     source: str | None = None
     good: Endpoint | None = None
     link: _LinkInfo | None = None
+    fell: float | None = None
     dialling: Endpoint | None = None
     tried: set[Endpoint] = field(default_factory=set)
     next_attempt: float | None = None
@@ -248,6 +249,7 @@ class Peering:
             return
         link = peer.link
         self._drop(peer, link, reason)
+        peer.fell = now
         peer.last_error = reason
         if now - link.since >= limits.LINK_STABLE:
             peer.backoff.reset()
@@ -407,7 +409,7 @@ def _status(peer: _Peer) -> PeerStatus:
         state,
         None if link is None else link.id,
         peer.lower,
-        None if link is None else link.since,
+        peer.fell if link is None else link.since,
         peer.attempts,
         peer.last_error,
         peer.next_attempt,
