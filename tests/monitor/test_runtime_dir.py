@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -92,3 +93,15 @@ def test_a_killed_holder_lets_go(place: Path) -> None:
         holder.wait(10)
     assert (place / "base.lock").exists()
     NameLock(place, "base").release()
+
+
+def test_a_full_disk_does_not_keep_an_agent_from_starting(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", full)
+        lock = NameLock(place, "base")
+    with pytest.raises(StartError, match="already runs on this machine"):
+        NameLock(place, "base")
+    lock.release()

@@ -104,8 +104,9 @@ class NameLock:
                 break
             os.close(fd)  # its last holder removed it between our open and our lock
         self._fd = fd
-        os.ftruncate(fd, 0)
-        os.write(fd, f"{os.getpid()}\n".encode())
+        with contextlib.suppress(OSError):  # a full disk; it is the lock that counts, not who is said to hold it
+            os.ftruncate(fd, 0)
+            os.write(fd, f"{os.getpid()}\n".encode())
 
     def _still_there(self, fd: int) -> bool:
         try:
