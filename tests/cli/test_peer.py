@@ -11,11 +11,10 @@ import msgspec
 import pytest
 
 from rmpa.core.errors import RmpaError
-from rmpa.monitor.snapshot import PeerInfo
+from rmpa.monitor.snapshot import PeerInfo, PingReply
 from tests.monitor.samples import SNAPSHOT
 
 if TYPE_CHECKING:
-    from rmpa.monitor.snapshot import PingReply
     from tests.cli.conftest import Place
 
 Agent = Callable[..., None]
@@ -83,6 +82,18 @@ def test_ping(place: Place, agent: Agent) -> None:
         "3 sent, 2 received, 33 % lost",
         "rtt min/avg/max/sd = 0.400/0.500/0.600/0.100 ms",
     ]
+
+
+def test_ping_asks_for_the_guid_because_names_may_be_given_twice(place: Place, agent: Agent) -> None:
+    asked: list[object] = []
+
+    def note(args: dict[str, object]) -> PingReply:
+        asked.append(args["peer"])
+        return PingReply(times=(0.001,), remote="10.0.0.2:40002")
+
+    agent(ping=note)
+    assert place.run("peer", "ping", "joystick", "-c", "1")[0] == 0
+    assert asked == [place.json("peer", "info", "joystick", "--json")[0]["guid"]]
 
 
 def test_ping_as_json(place: Place, agent: Agent) -> None:

@@ -203,16 +203,18 @@ def ping(name: str, count: int | None, interval: float, as_json: bool, agent: st
                 if sent:
                     time.sleep(interval)
                 sent += 1
-                _ping_once(client, found.name, sent, times, as_json=as_json)
+                _ping_once(client, found, sent, times, as_json=as_json)
         except KeyboardInterrupt:
             pass
     _ping_summary(found.name, sent, times, as_json=as_json)
     return 0 if times else 1
 
 
-def _ping_once(client: ControlClient, name: str, number: int, times: list[float], *, as_json: bool) -> None:
+def _ping_once(client: ControlClient, peer: PeerInfo, number: int, times: list[float], *, as_json: bool) -> None:
+    name = peer.name
     try:
-        reply = client.call("ping", PingReply, peer=name, count=1)
+        # By its GUID: names may be given twice.
+        reply = client.call("ping", PingReply, peer=peer.guid, count=1)
         elapsed, problem = (reply.times[0] if reply.times else None), "no answer"
     except PeerRefused as error:
         reply, elapsed, problem = PingReply(times=()), None, error.reason
