@@ -35,6 +35,11 @@ def test_a_new_link_is_told_all_that_policy_lets_cross(exports: Exports) -> None
     ]
 
 
+def test_names_that_no_peer_would_take_stay_home(exports: Exports) -> None:
+    exports.graph({Source("/" + "x" * 1024, "/n"): JOY, Source("/a//b", "/n"): JOY, CMD: JOY})
+    assert set(exports.offered) == {CMD}
+
+
 def test_changes_are_told_to_every_link_and_only_changes(exports: Exports) -> None:
     exports.link_up(1)
     exports.link_up(2)

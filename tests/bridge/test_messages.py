@@ -88,6 +88,10 @@ def test_golden_bytes(message: Message, wire: bytes) -> None:
             b'"definition":"\xe2\x82\xac","latching":false}}'
         ),
         b'{"op":"close","route":1}trailing',
+        b'{"op":"open","route":1,"topic":"/' + b"x" * 1024 + b'","node":"/b"}',
+        b'{"op":"advertise","added":[{"topic":"/a","node":"/b","type":"a/' + b"B" * 1024 + b'"}]}',
+        b'{"op":"closed","route":1,"reason":"' + b"x" * 16385 + b'"}',
+        b'{"op":"mismatch","topic":"/a","node":"/b","subscriber":"/c","text":"' + b"x" * 16385 + b'"}',
         b"[" * 100_000,
     ],
 )

@@ -18,9 +18,19 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, Warn
-from rmpa.bridge.messages import Advertise, Close, Closed, Description, Offer, Open, Opened, Source
+from rmpa.bridge.messages import (
+    Advertise,
+    Close,
+    Closed,
+    Description,
+    Offer,
+    Open,
+    Opened,
+    Source,
+    is_crossing_name,
+    is_crossing_type,
+)
 from rmpa.core import limits
-from rmpa.core.names import is_global_name, is_type_name
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -79,9 +89,9 @@ class Exports:
         crossing = [
             source
             for source, local in sources.items()
-            if is_type_name(local.type)
-            and is_global_name(source.topic)
-            and is_global_name(source.node)
+            if is_crossing_type(local.type)
+            and is_crossing_name(source.topic)
+            and is_crossing_name(source.node)
             and self._policy.judge(source.topic, local.type, source.node).allowed
         ]
         actions: list[Action] = []

@@ -136,6 +136,16 @@ _MD5: Final = re.compile(r"[0-9a-f]{32}")
 _ROUTE_MAX: Final = (1 << 32) - 1
 
 
+def is_crossing_name(name: str) -> bool:
+    """Whether a topic's or node's name may be in a message: a global one that is not too long."""
+    return len(name) <= limits.CROSSING_NAME_MAX and is_global_name(name)
+
+
+def is_crossing_type(name: str) -> bool:
+    """Whether a type's name may be in a message."""
+    return len(name) <= limits.CROSSING_NAME_MAX and is_type_name(name)
+
+
 def encode(message: Message) -> bytes:
     """One message as the payload of a control frame."""
     return _ENCODER.encode(message)
@@ -166,17 +176,27 @@ def _validate(message: Message) -> None:
             raise LimitExceeded("advertisement (in topics)", len(message.added), limits.TOPICS_PER_PEER_MAX)
         for offer in message.added:
             _check_names(offer.topic, offer.node)
-            if not is_type_name(offer.type):
-                raise RemoteProtocolError(f"{offer.type!r}, offered for {offer.topic}, is not a message type")
+            if not is_crossing_type(offer.type):
+                raise RemoteProtocolError(f"{offer.type[:200]!r}, offered for {offer.topic}, is not a message type")
         for source in message.removed:
             _check_names(source.topic, source.node)
     elif isinstance(message, Open | Mismatch):
         _check_names(message.topic, message.node)
+        if isinstance(message, Mismatch):
+            _check_text(message.subscriber)
+            _check_text(message.text)
+    elif isinstance(message, Closed):
+        _check_text(message.reason)
     elif isinstance(message, Opened) and message.description.problem:
         raise RemoteProtocolError(f"route {message.route}: {message.description.problem}")
 
 
 def _check_names(topic: str, node: str) -> None:
     for name in (topic, node):
-        if not is_global_name(name):
+        if not is_crossing_name(name):
             raise RemoteProtocolError(f"{name[:200]!r} is not a global ROS name")
+
+
+def _check_text(text: str) -> None:
+    if len(text) > limits.CONTROL_TEXT_MAX:
+        raise LimitExceeded("text in a control message", len(text), limits.CONTROL_TEXT_MAX)

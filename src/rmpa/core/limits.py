@@ -259,6 +259,10 @@ NODES_PER_PEER_MAX: Final = 256
 """Nodes of one peer that get a proxy here: each takes two listening sockets; large robots have some 100 nodes."""
 MISMATCHES_MAX: Final = 16
 """Refused subscribers of one source that are remembered for the user."""
+CROSSING_NAME_MAX: Final = 1024
+"""Characters of a topic's, node's or type's name that crosses the mesh; the longest seen have some 200."""
+CONTROL_TEXT_MAX: Final = 16 * KIB
+"""Characters of a text for people in a control message."""
 CALL_BACK_DELAYS: Final = (0.05, 1.0)
 """When a proxy is registered again whose subscribers were hung up on: at once, and for those that noticed late."""
 RECONCILE_INTERVAL: Final = 5.0

@@ -193,9 +193,10 @@ class Bridge:
             case Close():
                 self._act(self._exports.closed(peer, message))
             case Closed():
-                _log.info("< %s closes route %d: %s", attached.link.name, message.route, message.reason)
-                self._act(self._imports.closed(peer, message, now))
-            case Mismatch():
+                if actions := self._imports.closed(peer, message, now):
+                    _log.info("< %s closes route %d: %s", attached.link.name, message.route, message.reason)
+                    self._act(actions)
+            case Mismatch() if message.source in self._exports.offered:
                 who = f"{attached.link.name}: {message.source}"
                 self._remember(message.source, f"{attached.link.name}{message.subscriber}", message.text)
                 self._warn("mismatch.remote", who, f"{who}: {message.text}")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from rmpa.bridge.aio.flows import DataLink, ExportFlow
 from rmpa.bridge.messages import Description, Source
 from rmpa.bridge.policy import OWN_NODE
+from rmpa.core import limits
 from rmpa.ros.aio.subscription import PublisherConnection
 from rmpa.ros.tcpros import Description as TcprosDescription
 
@@ -113,7 +114,7 @@ class Outbound:
             return
         self._connections.pop(source).close()
         _log.info("= %s: %s", source, reason)
-        self._on_lost(source, reason)
+        self._on_lost(source, reason[: limits.CONTROL_TEXT_MAX])
         self._drop(source)
         self._core.suspect(source.node)
 

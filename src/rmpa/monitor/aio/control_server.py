@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 Handler = Callable[[dict[str, object]], Awaitable[object] | object]
-_BACKLOG: Final = 16
+_BACKLOG: Final = 128
+"""Clients with a time-out are refused by the kernel, not kept waiting, when these are taken."""
 
 
 class ControlServer:
