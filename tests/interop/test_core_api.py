@@ -335,3 +335,36 @@ async def test_answers_and_callbacks_are_those_of_rosmaster(shell: ShellFactory)
     assert len(calls) > 150
     assert not different, "\n".join(different)
     assert any(slave_calls for step in theirs_heard for slave_calls in step.values())  # type: ignore[attr-defined]
+
+
+@pytest.mark.trap(33)
+async def test_a_parameter_kills_the_newer_node_at_rosmaster_and_not_at_ours(shell: ShellFactory) -> None:
+    """The one difference by intent: what a pushed-out roscpp node does while it ends must not hit its successor."""
+    real = shell(port=free_port())
+    real.master()
+    core = RosCore(port=0, rosout=False)
+    await core.start()
+    seated = {}
+    for who, uri in (("theirs", real.uri), ("ours", core.uri)):
+        old, new = Slave(), Slave()
+        old_api, new_api = await old.start(), await new.start()
+        old.name = new.name = "/twin"
+        for number, (slave, api) in enumerate(((old, old_api), (new, new_api))):
+            await call(uri, "subscribeParam", f"/fence_{number}", api, "/fence")
+            await call(uri, "registerPublisher", "/twin", "/t", "std_msgs/String", api)
+            assert slave.calls == []
+        async with old.news, asyncio.timeout(DEADLINE):
+            await old.news.wait_for(lambda: old.calls)  # noqa: B023 - awaited within the turn
+        assert [method for method, _ in old.calls] == ["shutdown"]
+        reply = await call(uri, "subscribeParam", "/twin", old_api, "/tcp_keepalive")
+        assert _judged("", reply) == [1, {}]
+        await call(uri, "setParam", "/x", "/fence", 1)
+        for slave in (old, new):
+            await slave.wait_fence(1)
+        answer = await call(uri, "lookupNode", "/x", "/twin")
+        assert isinstance(answer, list)
+        seated[who] = (answer[2] == new_api, [method for method, _ in new.calls])
+        for slave in (old, new):
+            await slave.server.close()
+    await core.close()
+    assert seated == {"theirs": (False, ["shutdown"]), "ours": (True, [])}

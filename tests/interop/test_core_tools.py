@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from tests.interop.processes import Process, eventually
-from tests.interop.ros import Ros, free_port
+from tests.interop.ros import PYTHON, Ros, free_port
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(240)]
 
 RUN: Final = "from rmpa.cli.core import core; core()"
+RUN_WITHOUT_CHECKS: Final = f"from rmpa.core import limits; limits.NODE_CHECK_INTERVAL = 1e6; {RUN}"
+"""A core that does not look by itself whether its nodes live."""
 DEADLINE: Final = 40.0
 LAUNCH: Final = """<launch>
   <param name="speed" value="1.5"/>
@@ -43,8 +45,8 @@ rospy.spin()
 """
 
 
-def start_ours(ros: Ros) -> Process:
-    process = ros.start(sys.executable, "-c", RUN, "-p", str(ros.port), name="rmpa core")
+def start_ours(ros: Ros, program: str = RUN) -> Process:
+    process = ros.start(sys.executable, "-c", program, "-p", str(ros.port), name="rmpa core")
     process.wait_for("started core service", DEADLINE)
     return process
 
@@ -64,7 +66,11 @@ def normal(text: str) -> list[str]:
     return [line.rstrip() for line in text.splitlines() if line.strip()]
 
 
-def both(shell: ShellFactory, scenario: Callable[[Ros], dict[str, str]]) -> None:
+def both(
+    shell: ShellFactory,
+    scenario: Callable[[Ros], dict[str, str]],
+    start_ours: Callable[[Ros], Process] = start_ours,
+) -> None:
     """Play a scenario beside the real core and beside ours; every output must be the same."""
     outputs = []
     for start in (start_real, start_ours):
@@ -96,9 +102,6 @@ def test_topics_nodes_and_services(shell: ShellFactory) -> None:
                 ("rostopic", "type", "/chatter"),
                 ("rostopic", "find", "std_msgs/Header"),
                 ("rosservice", "list"),
-                ("rosservice", "info", "/talker/get_loggers"),
-                ("rosservice", "type", "/talker/get_loggers"),
-                ("rosservice", "call", "/talker/set_logger_level", "rosout", "debug"),
             )
         }
         # Ours has no logger services of its own /rosout: they would be of no use.
@@ -115,6 +118,53 @@ def test_topics_nodes_and_services(shell: ShellFactory) -> None:
         return found
 
     both(shell, scenario)
+
+
+@pytest.mark.trap(23, 26)
+@pytest.mark.parametrize("library", ["rospy", "roscpp"])
+def test_services(shell: ShellFactory, library: str) -> None:
+    def scenario(ros: Ros) -> dict[str, str]:
+        node = ros.node(library, "listener", "__name:=server", topic="/chatter")
+        node.wait_event("up", DEADLINE)
+        logger = "ros" if library == "roscpp" else "rosout"
+        wait = "import sys, rospy; rospy.wait_for_service(sys.argv[1], 10); print('there')"
+        found = {
+            " ".join(words[1:]): ros.tool(*words, timeout=DEADLINE)
+            for words in (
+                ("rosservice", "info", "/server/get_loggers"),
+                ("rosservice", "type", "/server/get_loggers"),
+                ("rosservice", "args", "/server/set_logger_level"),
+                ("rosservice", "node", "/server/set_logger_level"),
+                ("rosservice", "uri", "/server/set_logger_level"),
+                # Not to debug: roscpp may hang itself by logging what its logging does.
+                ("rosservice", "call", "/server/set_logger_level", logger, "warn"),
+                ("rosservice", "call", "/server/get_loggers"),
+                (PYTHON, "-c", wait, "/server/get_loggers"),
+            )
+        }
+        found["find"] = "\n".join(sorted(ros.tool("rosservice", "find", "roscpp/SetLoggerLevel").split()))
+        found["find"] = found["find"].replace("/rosout/set_logger_level\n", "")
+        node.terminate()
+        gone = ros.start("rosservice", "call", "/nobody/get_loggers", name="rosservice call")
+        found["unknown"] = f"{gone.wait(DEADLINE)} {gone.output}"
+        return found
+
+    both(shell, scenario)
+
+
+def test_cleanup_of_a_node_that_was_killed(shell: ShellFactory) -> None:
+    def scenario(ros: Ros) -> dict[str, str]:
+        victim = ros.rospy("talker", "__name:=victim", topic="/chatter", rate=10, count=0)
+        ros.roscpp("listener", "__name:=listener", topic="/chatter").wait_event("first", DEADLINE)
+        victim.kill()
+        before = ros.tool("rosnode", "list")
+        cleanup = ros.start("rosnode", "cleanup", name="cleanup", commands=True)
+        cleanup.tell("y")
+        assert cleanup.wait(DEADLINE) == 0
+        after = {words: ros.tool(*words.split()) for words in ("rosnode list", "rostopic info /chatter")}
+        return {"before": before, "cleanup": cleanup.output, **after}
+
+    both(shell, scenario, lambda ros: start_ours(ros, RUN_WITHOUT_CHECKS))
 
 
 def test_parameters(shell: ShellFactory, tmp_path: Path) -> None:

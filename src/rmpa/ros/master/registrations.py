@@ -134,8 +134,9 @@ class Registrations:
     def subscribe_param(self, key: str, node: str, api: str) -> None:
         """Tell this node of changes below ``key``, which ends in ``/``.
 
-        A node that was pushed out does not take its name back by this. roscpp logs that it was asked to end, and
-        its log asks for a parameter with ``getCached``: at rosmaster, that kills the new node too.
+        A node that was pushed out does not take its name back by this, as it does at rosmaster, which then asks the
+        new node to end (the one difference by intent; tests/interop/test_core_api.py shows both). roscpp does so: it
+        logs that it was asked to end, and its log asks for a parameter with ``getCached``.
         """
         if self._evicted.get(node) != api:
             self._register(Kind.PARAM, key, node, api)
