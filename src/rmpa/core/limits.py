@@ -152,6 +152,9 @@ FORGET_UNANNOUNCED: Final = ROSTER_LEASE
 LINK_UNACKED: Final = 2.0
 """Sent bytes that nobody acknowledged for this long end a connection (TCP_USER_TIMEOUT): two leases, so that the
 lease, which can say why, is the first to speak."""
+LINK_UNSENT_BYTES: Final = 64 * KIB
+"""Bytes that the kernel keeps for one link before they can leave (TCP_NOTSENT_LOWAT): what waits there is overtaken
+by no control frame and dropped by no rule. A pong on 5 Mbit/s came 1.2 s late without, 0.3 s with it."""
 LINK_URGENT_BYTES: Final = 32 * MIB
 """Control frames that wait for one link: two of the longest. Beyond it the link is closed: they are never dropped."""
 CLOCK_SAMPLES: Final = 16

@@ -241,7 +241,7 @@ def judge(hello: Hello, ours: Identity, links: Iterable[KnownLink], *, busy: boo
     if hello.lane not in LANES:
         return Refuse(Refusal.LANE, f"lane {hello.lane} is not supported here: install the same release on both")
     if hello.expected is not None and not same_place(hello.expected, ours.guid):
-        text = f"you called {hello.expected}, but this is {ours}: that address is used by two machines"
+        text = f"you called {hello.expected}, but this is {ours}: the address changed hands, or two have it"
         return Refuse(Refusal.WRONG_PEER, text)
     there = [link for link in links if same_place(link.guid, hello.guid)]
     for link in there:
@@ -266,7 +266,7 @@ def judge_welcome(welcome: Hello, ours: Identity, expected: Guid | None) -> Verd
     if refuse := _stranger(welcome, ours):
         return refuse
     if expected is not None and not same_place(expected, welcome.guid):
-        text = f"we called {expected}, but {welcome.name} ({welcome.guid}) answers: two machines use that address"
+        text = f"we called {expected}, but {welcome.name} ({welcome.guid}) answers: the address changed hands, or two have it"
         return Refuse(Refusal.WRONG_PEER, text)
     if welcome.expected != ours.guid:
         return Refuse(Refusal.MALFORMED, f"the welcome is for {welcome.expected}, but we are {ours.guid}")

@@ -297,7 +297,6 @@ class MeshLink:
             self._arm()
             self._owner.link_opened(self)
         elif isinstance(event, Refused):
-            self._malformed = event.by_us
             self._owner.link_refused(self, event.refuse, by_us=event.by_us)
         elif isinstance(event, Closed):
             self._finish(event.reason)
