@@ -11,10 +11,12 @@ import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from rmpa.bridge.proxy_names import proxied_node
 from rmpa.core.config_values import did_you_mean
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.names import is_legal_name
 from rmpa.monitor.aio.control_client import ControlClient, choose_agent, find_agents, same_core
+from rmpa.ros.environment import DEFAULT_MASTER_URI
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -22,8 +24,6 @@ if TYPE_CHECKING:
 
     from rmpa.monitor.snapshot import Snapshot
 
-DEFAULT_URI: Final = "http://localhost:11311"
-_PROXY: Final = "/rmpa/"
 _REMEDY: Final = "start one with `rmpa up` or `rmpa core`, or name it with --master"
 
 
@@ -63,14 +63,14 @@ def choose_master(master: str | None, agent: str | None, environ: Mapping[str, s
     """
     if master is not None:
         if not re.fullmatch(r"http://[^\s/:]+:[0-9]{1,5}/?", master):
-            raise ConfigError("--master", f"{master!r} is not a master's URI", f"one looks like {DEFAULT_URI}")
+            raise ConfigError("--master", f"{master!r} is not a master's URI", f"one looks like {DEFAULT_MASTER_URI}")
         return _with_agent(master, "--master", environ)
     uri = environ.get("ROS_MASTER_URI", "")
     if not agent and not environ.get("RMPA_AGENT"):
         if uri:
             return _with_agent(uri, "ROS_MASTER_URI", environ)
         if not find_agents(environ):
-            return Master(DEFAULT_URI, "no agent runs")
+            return Master(DEFAULT_MASTER_URI, "no agent runs")
     found = choose_agent(environ, agent)
     with ControlClient(found.path) as client:
         return Master(client.snapshot().agent.core_uri, f"the core of agent {found.name}", found.path)
@@ -108,7 +108,7 @@ class Graph:
 
     def peers(self, topic: str) -> list[str]:
         """The peers that publish a topic."""
-        remote = (split_proxy(node) for node in self.publishers.get(topic, ()))
+        remote = (proxied_node(node) for node in self.publishers.get(topic, ()))
         return sorted({r[0] for r in remote if r is not None})
 
     def require(self, topic: str) -> None:
@@ -154,14 +154,6 @@ def _nodes(pairs: list[object]) -> dict[str, list[str]]:
     return found
 
 
-def split_proxy(node: str) -> tuple[str, str] | None:
-    """The peer and the node behind a proxy: ``/rmpa/base/driver`` gives ``("base", "/driver")``; else ``None``."""
-    if not node.startswith(_PROXY):
-        return None
-    peer, slash, name = node.removeprefix(_PROXY).partition("/")
-    return (peer, f"/{name}") if peer and slash and name else None
-
-
 @dataclass(frozen=True, slots=True)
 class TopicName:
     """A topic as a user names it: ``/cmd``, ``cmd``, or ``joystick:/cmd`` for one peer's sources alone."""
@@ -171,7 +163,7 @@ class TopicName:
 
     def takes(self, node: str) -> bool:
         """Whether a publisher's messages are meant."""
-        proxy = split_proxy(node)
+        proxy = proxied_node(node)
         return self.peer is None or (proxy is not None and proxy[0] == self.peer)
 
     def __str__(self) -> str:

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from rmpa.ros.aio.node import Node, Received
 
 
+class Enough(Exception):  # noqa: N818 - not an error
+    """As many messages came as were asked for: raised by a command's callback, caught around ``watch_topic``."""
+
+
 class Watch:
     """Until when a command runs, and where its callbacks hand over what went wrong."""
 

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.cli.master import Graph, Master, TopicName, choose_master, read_graph, read_topic, split_proxy
+from rmpa.bridge.proxy_names import proxied_node
+from rmpa.cli.master import Graph, Master, TopicName, choose_master, read_graph, read_topic
 from rmpa.cli.message_text import flatten, pick, shorten, to_text
 from rmpa.cli.options import agent_option, json_option, master_option
 from rmpa.cli.output import print_json, print_line, warn
-from rmpa.cli.stream import Watch, run_stream, watch_topic
+from rmpa.cli.stream import Enough, Watch, run_stream, watch_topic
 from rmpa.core.config_values import did_you_mean
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ class _Printer:
             print_line((_CLEAR if self._clear else "") + to_text(plain) + "\n---")
 
     def _json(self, received: Received, plain: Plain) -> None:
-        proxy = split_proxy(received.caller_id)
+        proxy = proxied_node(received.caller_id)
         whence = {"node": received.caller_id} if proxy is None else {"peer": proxy[0], "node": proxy[1]}
         line = {"topic": str(self._wanted), **whence, "time": received.stamp_ns / 1e9, "message": plain}
         print_json(line, flush=True)
@@ -134,16 +135,12 @@ async def _echo(
         if count is None or printer.count < count:
             printer.show(received)
         if count is not None and printer.count >= count:
-            raise _Enough
+            raise Enough
 
     async def body(watch: Watch) -> None:
         await watch.finished()
 
     try:
         await watch_topic(master, wanted, take, body)
-    except _Enough:
+    except Enough:
         return
-
-
-class _Enough(Exception):  # noqa: N818 - not an error
-    """As many messages came as were asked for."""

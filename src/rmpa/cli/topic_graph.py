@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.cli.master import Graph, Master, choose_master, read_graph, read_topic, split_proxy
+from rmpa.bridge.proxy_names import proxied_node
+from rmpa.cli.master import Graph, Master, choose_master, read_graph, read_topic
 from rmpa.cli.options import agent_option, json_option, master_option
 from rmpa.cli.output import coloured, duration, print_json, printable, warn
 from rmpa.core.errors import RmpaError
@@ -26,7 +27,7 @@ def _ends(nodes: list[str]) -> list[dict[str, str]]:
     """Publishers or subscribers for JSON: a proxy's with the peer and the node behind it."""
     found = []
     for node in nodes:
-        proxy = split_proxy(node)
+        proxy = proxied_node(node)
         found.append({"node": node} if proxy is None else {"node": node, "peer": proxy[0], "remote_node": proxy[1]})
     return found
 
@@ -124,7 +125,7 @@ def info(topic: str, as_json: bool, agent: str | None, master: str | None) -> No
         meant = [node for node in nodes.get(wanted.topic, []) if wanted.takes(node) or title == "Subscribers"]
         click.echo(f"\n{title}:" + ("" if meant else " none"))
         for node in meant:
-            proxy = split_proxy(node)
+            proxy = proxied_node(node)
             whence = "" if proxy is None else f"{proxy[1]} of peer {proxy[0]}, by its proxy "
             click.echo(f" * {printable(whence + node)}")
     if crossing is not None:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import click
 
 from rmpa.cli.master import choose_master, read_topic
 from rmpa.cli.options import agent_option, json_option, master_option
 from rmpa.cli.output import print_json, print_line, size
-from rmpa.cli.stream import Watch, run_stream, watch_topic
+from rmpa.cli.stream import Enough, Watch, run_stream, watch_topic
 from rmpa.core.errors import RmpaError
 from rmpa.core.stats import Flow, Ring, Summary
 
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
     from rmpa.ros.aio.node import Received
 
-_EVERY = 1.0
+_EVERY: Final = 1.0
+"""Seconds between two lines, as rostopic has it."""
 
 
 class Figures:
@@ -158,32 +159,34 @@ def _watch(
             return  # more had come before the node could be left
         figures.add(received, time.monotonic())
         if figures.flow.messages == count:
-            raise _Enough
+            raise Enough
 
     async def run() -> None:
         try:
             await watch_topic(chosen, wanted, take, body)
-        except _Enough:
+        except Enough:
             _show(figures, str(wanted), as_json=as_json)
 
     run_stream(run)
-
-
-class _Enough(Exception):  # noqa: N818 - not an error
-    """As many messages came as were asked for."""
 
 
 def _shared(window: int) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """The arguments and flags of all three."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        shown = "Over how many messages." + (" [default: 50000]" if window == 50_000 else f" [default: {window}]")
         for option in (
             master_option,
             agent_option,
             json_option,
             click.option("-n", "--count", type=click.IntRange(1), help="Stop after so many messages."),
-            click.option("-w", "--window", type=click.IntRange(2, 1_000_000), default=window, help=shown),
+            click.option(
+                "-w",
+                "--window",
+                type=click.IntRange(2, 1_000_000),
+                default=window,
+                show_default=True,
+                help="Over how many messages.",
+            ),
             click.argument("topic"),
         ):
             command = option(command)
