@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.cli.master import read_topic, split_proxy
+from rmpa.cli.master import read_topic
 from rmpa.cli.message_text import flatten, pick, shorten, to_text
 from rmpa.cli.output import duration, printable, size
 from rmpa.cli.topic_pub import fill_stamps, read_values
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
         (3599.9, "1 h 0 min"),
         (7500, "2 h 5 min"),
         (86400 * 3 + 3600 * 4, "3 d 4 h"),
+        (-90, "-1 min 30 s"),
+        (-3661, "-1 h 1 min"),
     ],
 )
 def test_durations(seconds: float | None, text: str) -> None:
@@ -93,9 +95,7 @@ def test_stamps_are_filled() -> None:
     assert filled == {"header": {"stamp": stamp}, "poses": [{"stamp": stamp, "text": "now"}]}
 
 
-def test_proxies_and_topics() -> None:
-    assert split_proxy("/rmpa/base/ns/driver") == ("base", "/ns/driver")
-    assert [split_proxy(n) for n in ("/driver", "/rmpa/base", "/rmpa//x")][:2] == [None, None]
+def test_topics_with_and_without_a_peer() -> None:
     assert str(read_topic("joystick:cmd/")) == "joystick:/cmd"
     for text in ("", ":", ":/x", "a b", "~x", "base:"):
         with pytest.raises(ConfigError):

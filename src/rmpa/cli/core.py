@@ -10,20 +10,19 @@ import sys
 
 import click
 
-from rmpa.core.errors import StartError, UnreachableError
-
-_FALLBACK_PORT = 11311
+from rmpa.core.errors import UnreachableError
 
 
 def _default_port() -> int:
     """The port of ``ROS_MASTER_URI`` if that names this machine, as roscore has it; else ROS's own."""
+    from rmpa.ros.aio.core import DEFAULT_PORT
     from rmpa.ros.aio.http_client import is_own_name, split_uri
 
     try:
         host, port, _ = split_uri(os.environ.get("ROS_MASTER_URI", ""))
     except UnreachableError:
-        return _FALLBACK_PORT
-    return port if is_own_name(host) or host.startswith("127.") else _FALLBACK_PORT
+        return DEFAULT_PORT
+    return port if is_own_name(host) or host.startswith("127.") else DEFAULT_PORT
 
 
 @click.command()
@@ -44,11 +43,7 @@ def core(port: int | None, host: str, advertise: str, verbose: bool, debug: bool
     """Run a ROS core: master, parameter server and /rosout, as roscore does."""
     level = logging.DEBUG if debug else logging.INFO if verbose else logging.WARNING
     logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(name)s %(message)s")
-    try:
-        asyncio.run(_run(host, _default_port() if port is None else port, advertise))
-    except StartError as error:
-        click.echo(f"rmpa core: {error}", err=True)
-        sys.exit(1)
+    asyncio.run(_run(host, _default_port() if port is None else port, advertise))
 
 
 async def _run(host: str, port: int, advertise: str) -> None:

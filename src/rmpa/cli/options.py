@@ -8,4 +8,6 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON; 
 agent_option = click.option(
     "--agent", metavar="NAME", help="Which agent of this machine to ask, if several run. [env: RMPA_AGENT]"
 )
-master_option = click.option("--master", metavar="URI", help="A ROS master to ask instead of an agent's core.")
+master_option = click.option(
+    "--master", metavar="URI", help="The ROS master to ask. [default: see rmpa topic --help]"
+)

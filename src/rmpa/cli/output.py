@@ -105,20 +105,22 @@ def duration(seconds: float | None) -> str:
     """How long: ``432 µs``, ``12.3 ms``, ``4.2 s``, ``3 min 20 s``, ``2 h 5 min``, ``3 d 4 h``; ``-`` for none."""
     if seconds is None or math.isnan(seconds):
         return "-"
-    size = abs(seconds)
-    if size < 0.9995e-3:
+    length = abs(seconds)
+    if length < 0.9995e-3:
         return f"{seconds * 1e6:.0f} µs"
-    if size < 0.09995:
+    if length < 0.09995:
         return f"{seconds * 1e3:.2f} ms"
-    if size < 1:
+    if length < 1:
         return f"{seconds * 1e3:.0f} ms"
-    if size < 59.95:
+    if length < 59.95:
         return f"{seconds:.1f} s"
-    whole = round(seconds)
-    for unit, smaller, big, small in ((60, 1, "min", "s"), (3600, 60, "h", "min"), (86400, 3600, "d", "h")):
-        if abs(whole) < unit * (24 if big == "h" else 60) or big == "d":
-            return f"{whole // unit} {big} {whole % unit // smaller} {small}"
-    raise AssertionError
+    whole = round(length)
+    sign = "-" if seconds < 0 else ""  # a clock may be behind by hours; floor division would round away from zero
+    if whole < 3600:
+        return f"{sign}{whole // 60} min {whole % 60} s"
+    if whole < 86400:
+        return f"{sign}{whole // 3600} h {whole % 3600 // 60} min"
+    return f"{sign}{whole // 86400} d {whole % 86400 // 3600} h"
 
 
 def size(count: float | None) -> str:

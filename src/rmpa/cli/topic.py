@@ -28,7 +28,8 @@ _WATCH: Final = "rmpa.cli.topic_watch"
     epilog="""\
 \b
 A topic is written /name; PEER:/name means the sources of one peer alone.
-The master: --master, else the agent's core, else ROS_MASTER_URI, else http://localhost:11311.
+The master: --master, else the core of --agent (or RMPA_AGENT), else ROS_MASTER_URI, else the core of the only
+agent of this machine, else http://localhost:11311.
 """,
 )
 def topic() -> None:
