@@ -10,12 +10,13 @@ import os
 import random
 import signal
 import time
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from rmpa.agent.station import Station
 from rmpa.agent.view import View
 from rmpa.bridge.aio.bridge import Bridge
 from rmpa.bridge.policy import Policy
+from rmpa.core import limits
 from rmpa.core.aio.loop import AgentLoop
 from rmpa.core.aio.notify import notify_service_manager
 from rmpa.core.aio.sockets import raise_file_limit
@@ -31,9 +32,6 @@ if TYPE_CHECKING:
     from rmpa.mesh.aio.link import MeshLink
 
 _log = logging.getLogger(__name__)
-
-_RETRY: Final = 1.0
-_PINGS_MAX: Final = 100
 
 
 class Agent:
@@ -112,7 +110,7 @@ class Agent:
                     await self._join(port)
                 except RmpaError as error:
                     _log.warning("! cannot join with the new address yet: %s", error)
-                    await asyncio.sleep(_RETRY)
+                    await asyncio.sleep(limits.JOIN_RETRY)
         finally:
             self._moving = None
 
@@ -124,8 +122,8 @@ class Agent:
     async def _ping(self, args: dict[str, object]) -> PingReply:
         link = self._link(str(args.get("peer", "")))
         count = args.get("count", 1)
-        if not isinstance(count, int) or not 1 <= count <= _PINGS_MAX:
-            raise ConfigError("count", f"{count!r} is not between 1 and {_PINGS_MAX}")
+        if not isinstance(count, int) or not 1 <= count <= limits.CONTROL_PINGS_MAX:
+            raise ConfigError("count", f"{count!r} is not between 1 and {limits.CONTROL_PINGS_MAX}")
         times = [await link.ping() for _ in range(count)]
         host, port = link.remote_endpoint
         return PingReply(times=tuple(times), remote=f"{host}:{port}")

@@ -50,8 +50,7 @@ class ConfigError(RmpaError):
         where = ""
         if self.path is not None:
             where = f"{self.path}:{self.line}: " if self.line is not None else f"{self.path}: "
-        remedy = f"; {self.remedy}" if self.remedy else ""
-        return f"{where}{self.source}: {self.problem}{remedy}"
+        return _advised(f"{where}{self.source}: {self.problem}", self.remedy)
 
 
 @dataclass
@@ -64,8 +63,7 @@ class StartError(RmpaError):
 
     def __str__(self) -> str:
         """Say ``what: problem; remedy``."""
-        remedy = f"; {self.remedy}" if self.remedy else ""
-        return f"{self.what}: {self.problem}{remedy}"
+        return _advised(f"{self.what}: {self.problem}", self.remedy)
 
 
 class LocalProtocolError(RmpaError):
@@ -99,8 +97,7 @@ class PeerRefused(RmpaError):  # noqa: N818 - an event's name
 
     def __str__(self) -> str:
         """Say who refused, why, and what to do."""
-        remedy = f"; {self.remedy}" if self.remedy else ""
-        return f"{self.peer} refused: {self.reason}{remedy}"
+        return _advised(f"{self.peer} refused: {self.reason}", self.remedy)
 
 
 @dataclass
@@ -113,5 +110,8 @@ class UnreachableError(RmpaError):
 
     def __str__(self) -> str:
         """Say what was looked for, where, and what to do."""
-        remedy = f"; {self.remedy}" if self.remedy else ""
-        return f"no {self.what} answers at {self.where}{remedy}"
+        return _advised(f"no {self.what} answers at {self.where}", self.remedy)
+
+
+def _advised(text: str, remedy: str) -> str:
+    return f"{text}; {remedy}" if remedy else text

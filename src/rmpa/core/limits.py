@@ -168,6 +168,12 @@ CLOCK_INTERVAL: Final = 1.0
 """Between pings on a link whose pongs alone keep it alive."""
 PENDING_PER_ADDRESS: Final = 8
 """Of the connections without a handshake, those from one address: one scanner must not shut the others out."""
+MESH_BACKLOG: Final = 64
+"""Connections that the kernel holds until we accept them: all peers of a restarted agent dial at once."""
+MESH_PORT_ATTEMPTS: Final = 32
+"""Tries to find a number that is free for TCP and UDP both; the first nearly always is."""
+JOIN_RETRY: Final = 1.0
+"""Before an agent whose addresses have changed tries again to take a new place."""
 ACCEPT_PAUSE: Final = 0.5
 """Before accepting again when the process has no file descriptors left."""
 
@@ -220,6 +226,8 @@ HTTP_BODY_INLINE: Final = 256 * KIB
 """Bodies above this are parsed in a thread: 8 MiB of numbers would hold the loop for seconds."""
 HTTP_HEADERS_MAX: Final = 64 * KIB
 """A request's headers, all together."""
+HTTP_BACKLOG: Final = 128
+"""Connections that the kernel holds until we accept them: all nodes of a robot register at once."""
 HTTP_CONNECTIONS_MAX: Final = 512
 """Open connections to one XML-RPC server: rospy keeps one per thread alive."""
 HTTP_IDLE_TIMEOUT: Final = 60.0
@@ -280,9 +288,14 @@ CONTROL_CLIENTS_MAX: Final = 32
 """Simultaneous clients of the control socket."""
 CONTROL_IDLE_TIMEOUT: Final = 60.0
 """A client that asks nothing for this long is closed."""
-
 CONTROL_CALL_TIMEOUT: Final = 10.0
 """For one call over the control socket; a stopped agent must not hang the command line."""
+CONTROL_LOOK_TIMEOUT: Final = 1.0
+"""For the connection by which a client sees whether an agent lives: the kernel takes it, even for a stopped one."""
+CONTROL_BACKLOG: Final = 128
+"""Clients with a time-out are refused by the kernel, not kept waiting, when these are taken."""
+CONTROL_PINGS_MAX: Final = 100
+"""Pings of one call: it must come to an end. The command line asks for one at a time."""
 CONTROL_HANDLER_TIMEOUT: Final = 30.0
 """For the agent's own part of a call."""
 CONTROL_PATH_MAX: Final = 107

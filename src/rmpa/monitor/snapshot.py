@@ -1,4 +1,4 @@
-"""What an agent shows of itself: one value, built in ``rmpa.agent``, read by the CLI and the web page.
+"""What an agent shows of itself: one value, built in ``rmpa.agent``, read by the CLI.
 
 It crosses the control socket as JSON (``msgspec``). Times are seconds; ``…_ago`` counts back from the snapshot.
 A field that is ``None`` is not known, or not yet.

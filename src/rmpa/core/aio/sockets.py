@@ -5,13 +5,9 @@ from __future__ import annotations
 import errno
 import resource
 import socket
-from typing import Final
 
 from rmpa.core import limits
 from rmpa.core.errors import StartError
-
-_ATTEMPTS: Final = 32
-_BACKLOG: Final = 64
 
 
 def raise_file_limit() -> int:
@@ -36,7 +32,7 @@ def open_mesh_port(port: int = 0) -> tuple[socket.socket, socket.socket]:
     Raises:
         StartError: The port is taken, or not for this user.
     """
-    for attempt in range(_ATTEMPTS):
+    for attempt in range(limits.MESH_PORT_ATTEMPTS):
         tcp = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -45,11 +41,11 @@ def open_mesh_port(port: int = 0) -> tuple[socket.socket, socket.socket]:
             tcp.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             tcp.bind(("", port))
             udp.bind(("", tcp.getsockname()[1]))
-            tcp.listen(_BACKLOG)
+            tcp.listen(limits.MESH_BACKLOG)
         except OSError as error:
             tcp.close()
             udp.close()
-            if port == 0 and error.errno == errno.EADDRINUSE and attempt + 1 < _ATTEMPTS:
+            if port == 0 and error.errno == errno.EADDRINUSE and attempt + 1 < limits.MESH_PORT_ATTEMPTS:
                 continue  # the TCP port was free, the UDP port of that number was not
             raise _refused(port, error) from error
         tcp.setblocking(False)

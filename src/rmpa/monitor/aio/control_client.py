@@ -129,7 +129,7 @@ def find_agents(environ: Mapping[str, str]) -> list[FoundAgent]:
     found = []
     for place in runtime_dirs(environ):
         for path in sorted(place.glob("*.sock")):
-            with contextlib.suppress(UnreachableError), ControlClient(path, timeout=1.0):
+            with contextlib.suppress(UnreachableError), ControlClient(path, timeout=limits.CONTROL_LOOK_TIMEOUT):
                 found.append(FoundAgent(path.stem, path))
     return sorted(found, key=lambda agent: agent.name)
 

@@ -9,7 +9,7 @@ import logging
 import os
 import socket
 from collections.abc import Awaitable, Callable, Mapping
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from rmpa.core import limits
 from rmpa.core.config_values import did_you_mean
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 Handler = Callable[[dict[str, object]], Awaitable[object] | object]
-_BACKLOG: Final = 128
-"""Clients with a time-out are refused by the kernel, not kept waiting, when these are taken."""
 
 
 class ControlServer:
@@ -67,7 +65,7 @@ class ControlServer:
             raise StartError(str(self.path), problem, "set RMPA_RUNTIME_DIR to a shorter directory")
         sock = await asyncio.to_thread(self._bind)
         self._server = await asyncio.start_unix_server(
-            self._connected, sock=sock, limit=limits.CONTROL_REQUEST_MAX, backlog=_BACKLOG
+            self._connected, sock=sock, limit=limits.CONTROL_REQUEST_MAX, backlog=limits.CONTROL_BACKLOG
         )
         _log.info("= control socket %s", self.path)
 

@@ -32,8 +32,6 @@ _log = logging.getLogger(__name__)
 Handler = Callable[[str, tuple[XmlRpcValue, ...], str], XmlRpcValue | Awaitable[XmlRpcValue]]
 """``(method, params, address of the client) -> value``, at once or awaited; a ``RosFault`` raised becomes a fault."""
 
-_BACKLOG: Final = 128
-
 
 class XmlRpcServer:
     """Listens at one address and hands each call to ``handler``, in the loop.
@@ -81,7 +79,11 @@ class XmlRpcServer:
         loop = asyncio.get_running_loop()
         try:
             self._server = await loop.create_server(
-                lambda: _Connection(self), self._host, self._wanted_port, family=socket.AF_INET, backlog=_BACKLOG
+                lambda: _Connection(self),
+                self._host,
+                self._wanted_port,
+                family=socket.AF_INET,
+                backlog=limits.HTTP_BACKLOG,
             )
         except OSError as error:
             raise self._start_error(error) from error
