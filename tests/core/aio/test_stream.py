@@ -232,3 +232,126 @@ async def test_drained_waits_for_the_last_byte_and_not_for_ever(sockets: Sockets
     assert not one.stream.pending_bytes
     one.stream.close()
     other.stream.close()
+
+
+class Counted(socket.socket):
+    """A socket that keeps how many bytes each ``sendmsg`` was given."""
+
+    calls: list[int]
+
+    def sendmsg(self, buffers, *rest):  # type: ignore[no-untyped-def]
+        parts = list(buffers)
+        self.calls.append(sum(map(len, parts)))
+        return super().sendmsg(parts, *rest)
+
+
+def counted(sock: socket.socket) -> Counted:
+    made = Counted(fileno=sock.detach())
+    made.setblocking(False)
+    made.calls = []
+    return made
+
+
+class Relay:
+    """Hands each message that ``inbound`` brings on to ``outbound``, as views of the read buffer."""
+
+    def __init__(self, inbound: socket.socket, outbound: socket.socket, outbox: Outbox | None = None) -> None:
+        inbound.setblocking(False)
+        box = Outbox(1 << 20, 1 << 30) if outbox is None else outbox
+        self.out = Stream(outbound, on_bytes=lambda view: (len(view), 0), on_close=self.ended, outbox=box)
+        self.into = Stream(inbound, on_bytes=self.take, on_close=self.ended, outbox=Outbox(1, 1))
+
+    def ended(self, error: Exception | None) -> None:
+        raise AssertionError(error)
+
+    def take(self, view: memoryview) -> tuple[int, int]:
+        at = 0
+        while len(view) - at >= 4:
+            end = at + 4 + int.from_bytes(view[at : at + 4], "big")
+            if end > len(view):
+                return at, end - at
+            self.out.send([view[at : at + 4], view[at + 4 : end]], 1)
+            at = end
+        return at, 0
+
+    def close(self) -> None:
+        self.into.close()
+        self.out.close()
+
+
+async def test_messages_of_one_read_leave_in_one_call(sockets: Sockets) -> None:
+    left, right = socket.socketpair()
+    target = counted(sockets[0])
+    relay, end = Relay(right, target), End(sockets[1])
+    messages = [b"%d" % i for i in range(100)]
+    left.send(b"".join(len(m).to_bytes(4, "big") + m for m in messages))
+    await until(lambda: len(end.got) == 100)
+    assert end.got == messages
+    assert len(target.calls) == 1
+    left.send(b"\0\0\0\1x")
+    await until(lambda: len(end.got) == 101)
+    assert target.calls[1:] == [5]
+    relay.close()
+    end.stream.close()
+    left.close()
+
+
+async def test_batches_keep_order_and_bytes_through_full_buffers(sockets: Sockets) -> None:
+    sockets[0].setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 32768)
+    left, right = socket.socketpair()
+    relay, source = Relay(right, counted(sockets[0])), End(left)
+    messages = [b"%d " % i * (i % 97) for i in range(20_000)]
+    for message in messages:
+        source.send(message)
+    await until(lambda: bool(relay.out.pending_bytes))  # nobody reads yet
+    end = End(sockets[1])
+    await until(lambda: len(end.got) == len(messages))
+    assert end.got == messages
+    assert not relay.out.pending_bytes
+    relay.close()
+    source.stream.close()
+    end.stream.close()
+
+
+async def test_what_is_sent_in_a_read_leaves_before_a_close_in_the_same_read(sockets: Sockets) -> None:
+    """As a publisher refuses a subscriber: an error header, then the end."""
+    one, other = End(sockets[0]), End(sockets[1])
+
+    def refuse(_message: bytes) -> None:
+        one.send(b"no")
+        one.send(b"never")
+        one.stream.close()
+
+    one.on_message = refuse
+    other.send(b"may I?")
+    await until(lambda: bool(other.ends))
+    assert other.got == [b"no", b"never"]
+    assert other.ends == [None]
+
+
+async def test_a_read_within_a_read_moves_nothing_that_still_waits(sockets: Sockets) -> None:
+    """A reader feeds another stream whose messages go to the same target; views of both must stay whole."""
+    target, end = counted(sockets[0]), End(sockets[1])
+    (a_far, a_near), (b_far, b_near) = socket.socketpair(), socket.socketpair()
+    first = Relay(a_near, target)
+    inner: list[bytes] = [b"inner 1", b"inner 2", b"the beginning of inner 3"]
+    wire = b"".join(len(m).to_bytes(4, "big") + m for m in inner)
+    b_near.setblocking(False)
+    second = Stream(b_near, on_bytes=first.take, on_close=first.ended, outbox=Outbox(1, 1))
+    take = first.take
+
+    def both(view: memoryview) -> tuple[int, int]:
+        taken = take(view)
+        second.feed(wire[:-10])
+        second.feed(wire[-10:])
+        return taken
+
+    first.into._on_bytes = both
+    a_far.send(b"\0\0\0\5outer")
+    await until(lambda: len(end.got) == 4)
+    assert end.got == [b"outer", *inner]
+    second.close()
+    first.close()
+    end.stream.close()
+    a_far.close()
+    b_far.close()

@@ -11,7 +11,7 @@ import contextlib
 import logging
 import socket
 from collections.abc import Callable, Sequence
-from typing import Final
+from typing import Final, cast
 
 from rmpa.core import limits
 from rmpa.core.errors import RemoteProtocolError
@@ -22,10 +22,15 @@ _log = logging.getLogger(__name__)
 _FIRST_BUFFER: Final = 64 * limits.KIB
 _KEPT_BUFFER: Final = 4 * limits.MIB
 _IOV: Final = 64
+_CORK_MESSAGES: Final = 128
+_CORK_BYTES: Final = 64 * limits.KIB
 
 Buffer = bytes | bytearray | memoryview
 OnBytes = Callable[[memoryview], tuple[int, int]]
 OnClose = Callable[[Exception | None], None]
+
+_corked: list[Stream] | None = None
+"""While a read is dealt with: the streams that keep messages for its end; see ``Stream.send``."""
 
 
 class Stream:
@@ -54,6 +59,8 @@ class Stream:
         self._wanted = 0
         self._writing = False
         self._finishing = False
+        self._kept: list[tuple[Sequence[Buffer], int]] = []
+        self._kept_bytes = 0
         self._closed = False
         self._drained: asyncio.Future[None] | None = None
         self._report: asyncio.Handle | None = None
@@ -95,7 +102,9 @@ class Stream:
         """Send one message made of ``parts``, or queue what the socket does not take.
 
         Args:
-            parts: In order, views of single bytes; not kept after the call.
+            parts: In order, views of single bytes. From within ``on_bytes`` they may be views of what was read:
+                messages that one read brings for one stream are sent in one call when it is done with. Elsewhere
+                they are not kept after the call.
             key: Which flow it belongs to, for the overflow policy; ``URGENT`` is never dropped.
 
         Returns:
@@ -105,6 +114,12 @@ class Stream:
             return 0
         if self._writing:
             return self._queue(b"".join(parts), key)
+        if _corked is not None:
+            self._cork(parts, key)
+            return 0
+        return self._send_now(parts, key)
+
+    def _send_now(self, parts: Sequence[Buffer], key: int) -> int:
         try:
             sent = self._sock.sendmsg(parts)
         except (BlockingIOError, InterruptedError):
@@ -125,8 +140,51 @@ class Stream:
         self._outbox.push_rest(_behind(parts, sent), key)
         return 0
 
+    def _cork(self, parts: Sequence[Buffer], key: int) -> None:
+        """Keep a message until the read that it came from is done with; what is kept is sent in one call."""
+        cast("list[Stream]", _corked).append(self)
+        self._kept.append((parts, key))
+        for part in parts:
+            self._kept_bytes += len(part)
+        if len(self._kept) >= _CORK_MESSAGES or self._kept_bytes >= _CORK_BYTES:
+            self._uncork()
+
+    def _uncork(self) -> None:
+        kept, self._kept = self._kept, []
+        size, self._kept_bytes = self._kept_bytes, 0
+        if self._closed or not kept:
+            return
+        if len(kept) == 1:
+            self._send_now(*kept[0])
+            return
+        try:
+            sent = self._sock.sendmsg([part for parts, _ in kept for part in parts])
+        except (BlockingIOError, InterruptedError):
+            sent = 0
+        except OSError as error:
+            self._lost(error)
+            return
+        self.bytes_out += sent
+        if sent < size:
+            self._keep_rest(kept, sent)
+
+    def _keep_rest(self, kept: list[tuple[Sequence[Buffer], int]], sent: int) -> None:
+        """Queue what a batch's ``sendmsg`` did not take: the rest of one message perhaps, then whole ones."""
+        self._writing = True
+        self._loop.add_writer(self._fd, self._writable)
+        for parts, key in kept:
+            length = sum(map(len, parts))
+            if sent >= length:
+                sent -= length
+            elif sent > 0:
+                self._outbox.push_rest(_behind(parts, sent), key)
+                sent = 0
+            else:
+                self._queue(b"".join(parts), key)
+
     def close(self) -> None:
         """Close at once; what still waits is lost. ``on_close`` is not called."""
+        self._uncork()
         if self._report is not None:
             self._report.cancel()
             self._report = None
@@ -138,6 +196,7 @@ class Stream:
         Not for ROS connections: rospy and roscpp take a half-closed socket for dead.
         """
         if not self._finishing:
+            self._uncork()
             self._finishing = True
             if not self._writing:
                 self._shut_write()
@@ -209,6 +268,9 @@ class Stream:
             self._deliver()
 
     def _deliver(self) -> None:
+        global _corked  # noqa: PLW0603 - one loop, one thread: whoever reads holds the cork
+        outer = _corked
+        _corked = []
         try:
             consumed, wanted = self._on_bytes(self._view[: self._filled])
         except RemoteProtocolError as error:
@@ -218,6 +280,11 @@ class Stream:
             _log.error("! a reader of bytes failed; its connection is closed", exc_info=error)
             self._lost(error)
             return
+        finally:
+            # Before anything moves in the buffer that the messages are views of.
+            for stream in _corked:
+                stream._uncork()  # noqa: SLF001 - its own class
+            _corked = outer
         if self._closed:
             return
         rest = self._filled - consumed
