@@ -72,7 +72,7 @@ REFUSED: list[tuple[Hello, list[KnownLink], Refusal, str]] = [
     (hello_of(HIGH), [], Refusal.MYSELF, "its own port"),
     (hello_of(replace(HIGH, instance=b"x" * 16)), [], Refusal.DUPLICATE, "--port"),
     (hello_of(LOW), [GHOST], Refusal.DUPLICATE, "--port"),
-    (hello_of(LOW, Guid.of("10.0.0.9", 9)), [], Refusal.WRONG_PEER, "two machines"),
+    (hello_of(LOW, Guid.of("10.0.0.9", 9)), [], Refusal.WRONG_PEER, "changed hands"),
     (replace(hello_of(LOW), lane=2), [], Refusal.LANE, "same release"),
 ]
 

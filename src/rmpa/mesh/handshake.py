@@ -266,7 +266,8 @@ def judge_welcome(welcome: Hello, ours: Identity, expected: Guid | None) -> Verd
     if refuse := _stranger(welcome, ours):
         return refuse
     if expected is not None and not same_place(expected, welcome.guid):
-        text = f"we called {expected}, but {welcome.name} ({welcome.guid}) answers: the address changed hands, or two have it"
+        who = f"{welcome.name} ({welcome.guid})"
+        text = f"we called {expected}, but {who} answers: the address changed hands, or two have it"
         return Refuse(Refusal.WRONG_PEER, text)
     if welcome.expected != ours.guid:
         return Refuse(Refusal.MALFORMED, f"the welcome is for {welcome.expected}, but we are {ours.guid}")
