@@ -176,7 +176,8 @@ class Screen:
         if self._json:
             print(table.json_summary(view), flush=True)
         else:
-            self._console.print(*table.summary(view), sep="\n")
+            # A pipe or a file takes lines of any length: nothing is wrapped there.
+            self._console.print(*table.summary(view), sep="\n", soft_wrap=not self._console.is_terminal)
 
 
 if __name__ == "__main__":
