@@ -40,6 +40,21 @@ def test_one_line_a_kind_and_interval(caplog: pytest.LogCaptureFixture) -> None:
     assert counters.as_dict() == {"beacon.malformed": 5, "beacon.version": 1}
 
 
+def test_forged_addresses_do_not_flood_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    counters = Counters()
+    log = RefusalLog(logging.getLogger("rmpa.test"), counters)
+    for number in range(5000):
+        log.refuse(number * 1e-4, "beacon.malformed", f"10.0.{number >> 8}.{number & 255}", "text")
+    assert len(caplog.records) == limits.LOG_LINES_MAX
+    log.refuse(0.5, "beacon.version", "10.0.0.1", "another name has lines of its own")
+    log.refuse(limits.LOG_INTERVAL, "beacon.malformed", "10.9.9.9", "later")
+    assert [record.getMessage() for record in caplog.records[-2:]] == [
+        "! another name has lines of its own",
+        f"! later ({5000 - limits.LOG_LINES_MAX} more like this since the last line)",
+    ]
+    assert counters["beacon.malformed"] == 5001
+
+
 def test_memory_is_bounded() -> None:
     log = RefusalLog(logging.getLogger("rmpa.silent"), Counters())
     logging.getLogger("rmpa.silent").setLevel(logging.CRITICAL)

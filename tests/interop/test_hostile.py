@@ -24,8 +24,8 @@ pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
 _MEMORY = 120 * 1024 * 1024
 """Above an agent's own 45 MB and its largest buffers, far below what one believed length would take."""
-_LINES = 80
-"""Warnings and errors that one attack may leave in a log: some for each kind and sender, each five seconds."""
+_LINES = 60
+"""Warnings and errors that one attack may leave in a log: at most 20 a kind of refusal, each five seconds."""
 
 
 def listening(module: Module) -> dict[str, str]:

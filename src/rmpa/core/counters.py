@@ -32,6 +32,8 @@ class Counters:
 class RefusalLog:
     """Counts each refusal and logs each kind at most once in ``limits.LOG_INTERVAL``.
 
+    Of one name, at most ``limits.LOG_LINES_MAX`` lines are written in that time, whatever the addresses.
+
     Args:
         logger: Where the lines go, at WARNING.
         counters: Where every refusal is counted, logged or not.
@@ -41,6 +43,8 @@ class RefusalLog:
         self._logger = logger
         self._counters = counters
         self._last: OrderedDict[tuple[str, str], tuple[float, int]] = OrderedDict()
+        # For each name: since when its lines are counted, how many there were, and how many more there would be.
+        self._lines: dict[str, tuple[float, int, int]] = {}
 
     def refuse(self, now: float, name: str, who: str, text: str) -> None:
         """Count ``name`` and perhaps log ``text``.
@@ -57,6 +61,14 @@ class RefusalLog:
         if now - last < limits.LOG_INTERVAL:
             self._last[kind] = (last, suppressed + 1)
             return
+        since, lines, hidden = self._lines.get(name, (now, 0, 0))
+        if now - since >= limits.LOG_INTERVAL:
+            since, lines = now, 0
+        if lines >= limits.LOG_LINES_MAX:
+            self._lines[name] = (since, lines, hidden + 1)
+            return
+        self._lines[name] = (since, lines + 1, 0)
+        suppressed += hidden
         self._last[kind] = (now, 0)
         self._last.move_to_end(kind)
         if len(self._last) > limits.LOG_KINDS_MAX:

@@ -304,5 +304,7 @@ CONTROL_PATH_MAX: Final = 107
 # --- logging --------------------------------------------------------------------------------------------------
 LOG_INTERVAL: Final = 5.0
 """A refusal of one kind from one address is logged at most once in this time; the rest are counted."""
+LOG_LINES_MAX: Final = 20
+"""Lines about one kind of refusal in this time, whatever the addresses: those of packets can be forged."""
 LOG_KINDS_MAX: Final = 1024
 """Kinds of refusal remembered for that; the oldest is forgotten first."""
