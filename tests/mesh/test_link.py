@@ -348,3 +348,31 @@ def test_identity_of_the_other_side_comes_with_the_hello() -> None:
     dialler, _ = pair(time)
     assert dialler.link.remote is not None
     assert dialler.link.remote.identity == Identity(HIGH.guid, HIGH.instance, "high", 0)
+
+
+@pytest.mark.parametrize("one_way", [0.05, 0.6, 1.4])
+def test_a_link_with_a_long_round_trip_comes_up_and_stays(one_way: float) -> None:
+    """Where a foreign flow fills a slow radio's queue: each side hears the other steadily, only late."""
+    time = Time()
+    dialler = side(Role.DIALLER, LOW, time, expected=HIGH.guid)
+    acceptor = side(Role.ACCEPTOR, HIGH, time)
+    on_the_way: list[tuple[float, Side, bytes]] = []
+    ends: list[float] = []
+    begin = time.now
+    while time.now < begin + 30.0 and not ends:
+        for one, other in ((dialler, acceptor), (acceptor, dialler)):
+            if one.link.has_output:
+                on_the_way.append((time.now + one_way, other, one.link.take_output()))
+        dues = [due for s in (dialler, acceptor) if (due := s.link.next_timer()) is not None]
+        time.now = max(time.now, min([*dues, *(when for when, _, _ in on_the_way)]))
+        arrived = [packet for packet in on_the_way if packet[0] <= time.now]
+        on_the_way = [packet for packet in on_the_way if packet[0] > time.now]
+        for _, to, data in arrived:
+            deliver(data, to.link, time.now)
+            if isinstance(to.last(), HelloReceived):
+                to.link.accept(time.now)
+        for s in (dialler, acceptor):
+            s.link.handle_timer(time.now)
+            ends += [time.now - begin for event in s.events if isinstance(event, Closed)]
+    assert ends == []
+    assert dialler.link.state is acceptor.link.state is State.UP

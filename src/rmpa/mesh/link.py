@@ -199,6 +199,7 @@ class Link:
         self._deadline = now + limits.HANDSHAKE_TIMEOUT
         self._reason = ""
         self._heard = now
+        self._welcomed = now
         self._sent = now
         self._pinged = now
         self._output = bytearray()
@@ -327,7 +328,7 @@ class Link:
             return None
         if self._state is State.UP:
             ping = min(self._sent + self._keepalive, self._pinged + limits.CLOCK_INTERVAL)
-            return earliest(self._heard + self._remote_lease, ping)
+            return earliest(self._lease_over, ping)
         return self._deadline
 
     def handle_timer(self, now: float) -> None:
@@ -339,8 +340,8 @@ class Link:
             self._end(self._reason, orderly=True)
         elif self._state is State.HANDSHAKING:
             self._end(f"{self._name} did not finish the handshake within {limits.HANDSHAKE_TIMEOUT:g} s")
-        elif now >= self._heard + self._remote_lease:
-            self._end(f"{self._name} was silent for its lease of {self._remote_lease:g} s")
+        elif now >= self._lease_over:
+            self._end(f"{self._name} was silent for its lease of {self._lease_over - self._heard:g} s")
         else:
             self._ping(now)
 
@@ -353,6 +354,16 @@ class Link:
     @property
     def _remote_lease(self) -> float:
         return self.remote.lease if self.remote is not None else limits.LINK_LEASE
+
+    @property
+    def _lease_over(self) -> float:
+        """When the other side's silence ends the link.
+
+        Behind our welcome a whole round trip goes by before the dialler's first word, which is still a part of the
+        handshake's time: with the lease alone, no link with a round trip above it would ever come up for good.
+        """
+        awaited = self.role is Role.ACCEPTOR and self._heard <= self._welcomed
+        return self._heard + (max(self._remote_lease, limits.HANDSHAKE_TIMEOUT) if awaited else self._remote_lease)
 
     def _admit(self, kind: int) -> bool:
         """Whether a frame of this kind is read now; ``False`` when we are leaving and read nothing more."""
@@ -408,7 +419,7 @@ class Link:
     def _raise_up(self, hello: Hello, now: float) -> None:
         self._state = _NEXT[self._state, _Act.WELCOMED]
         self.remote = hello
-        self._heard = now
+        self._heard = self._welcomed = now
         _log.debug("= %s: up", self._name)
         self._ping(now)
         self._on_event(Up(hello))

@@ -246,6 +246,9 @@ async def test_a_stopped_peer_is_down_after_its_lease_and_its_memory_is_bounded(
         assert answer.kind is Kind.WELCOME
         await until(lambda: bool(one.ups), "a link")
         link = one.ups[0]
+        got = link.bytes_in
+        await asyncio.get_running_loop().sock_sendall(sock, Frame(Kind.PING, stamp_ns=1).serialize())
+        await until(lambda: link.bytes_in > got, "its first word, from which on the lease counts")
         began = asyncio.get_running_loop().time()
         block = bytes(limits.MIB)
         for i in range(64):
