@@ -76,6 +76,11 @@ class Guid:
         return str(self.address), self.port
 
     @property
+    def place(self) -> int:
+        """Address and port as one number, in GUID order: all incarnations of one peer share it."""
+        return self.value >> 16
+
+    @property
     def dialable(self) -> bool:
         """Whether one peer can be reached there; see ``dialable``."""
         return dialable(self.address, self.port)

@@ -87,7 +87,7 @@ class Roster:
     def start(self, now: float) -> None:
         """Announce ourselves: a burst, then silence but for the heartbeat."""
         own = Voice(self._own, now, now, limits.ROSTER_LEASE, Heard.LINK, Heard.LINK, linked=True)
-        self._seats[_key(self._own.guid)] = Seat(own, own=True)
+        self._seats[self._own.guid.place] = Seat(own, own=True)
         self._burst = self._burst_times(now, limits.BURST_OFFSETS)
         self._heartbeat_at = self._next_heartbeat(now)
         self.handle_timer(now)
@@ -105,7 +105,7 @@ class Roster:
         if self._closed or identity.instance == self._own.instance:
             self.counters.add("beacon.echo")
             return
-        key = _key(identity.guid)
+        key = identity.guid.place
         seat = self._seats.get(key)
         if seat is None:
             if len(self._seats) >= limits.ROSTER_PEERS_MAX:
@@ -133,7 +133,7 @@ class Roster:
             now: Monotonic seconds.
             source: Where its beacons can be sent to, if that is known to differ from its GUID's endpoint.
         """
-        key = _key(identity.guid)
+        key = identity.guid.place
         seat = self._seats.get(key)
         if seat is None:
             if len(self._seats) >= limits.ROSTER_PEERS_MAX and not self._evict():
@@ -160,7 +160,7 @@ class Roster:
             now: Monotonic seconds.
             instance: Which run's; a link of a run that was replaced meanwhile changes nothing.
         """
-        key = _key(guid)
+        key = guid.place
         seat = self._seats.get(key)
         if seat is None or seat.own or seat.current is None:
             return
@@ -341,7 +341,7 @@ class Roster:
                 and ghost.identity.name == voice.identity.name
                 and ghost.identity.guid.address == voice.identity.guid.address
             ):
-                key = _key(ghost.identity.guid)
+                key = ghost.identity.guid.place
                 self._lost(other, LossReason.MOVED)
                 other.vacate()
                 self._drop_if_empty(key)
@@ -482,7 +482,7 @@ class Roster:
     def _hearsay(self, beacon: Beacon, now: float) -> None:
         """Greet those whom the sender knows and we do not; only their own word puts them into the roster."""
         for guid in beacon.gossip:
-            if _key(guid) in self._seats or (guid.address.is_loopback and not self._own.guid.address.is_loopback):
+            if guid.place in self._seats or (guid.address.is_loopback and not self._own.guid.address.is_loopback):
                 continue
             if not self._greetings.learn(guid.endpoint, now):
                 self.counters.add("gossip.full")
@@ -540,11 +540,6 @@ class Roster:
             tuple(conflicts),
             seat.present and voice is seat.current,
         )
-
-
-def _key(guid: Guid) -> int:
-    """Address and port: all incarnations of one peer share them; in GUID order."""
-    return guid.value >> 16
 
 
 def _addresses(voice: Voice) -> tuple[Address, ...]:

@@ -207,7 +207,7 @@ class Hello:
 
 def same_place(one: Guid, other: Guid) -> bool:
     """Whether two GUIDs are one address and port: incarnations of one peer, or two peers in conflict."""
-    return one.value >> 16 == other.value >> 16
+    return one.place == other.place
 
 
 @dataclass(frozen=True, slots=True)

@@ -165,9 +165,9 @@ class Peering:
             now: Monotonic seconds.
             source: The address that its beacon came from, if it was the peer's own beacon.
         """
-        if identity.instance == self._ours.instance or _place(identity.guid) == _place(self._ours.guid):
+        if identity.instance == self._ours.instance or identity.guid.place == self._ours.guid.place:
             return
-        peer = self._peers.get(_place(identity.guid))
+        peer = self._peers.get(identity.guid.place)
         if peer is None:
             peer = self._add(identity)
         restarted = peer.identity.instance != identity.instance
@@ -186,7 +186,7 @@ class Peering:
 
     def peer_gone(self, guid: Guid, now: float) -> None:  # noqa: ARG002 - all machines are told the time
         """Discovery gave a peer up: dial it no more. A link that is up stays until it falls by itself."""
-        peer = self._peers.get(_place(guid))
+        peer = self._peers.get(guid.place)
         if peer is None or peer.identity.guid != guid:
             return
         peer.announced, peer.gone, peer.next_attempt = False, True, None
@@ -196,7 +196,7 @@ class Peering:
 
     def judge(self, hello: Hello) -> Verdict:
         """Decide on a hello that came in; ``None`` is a welcome, and ``link_up`` follows."""
-        peer = self._peers.get(_place(hello.guid))
+        peer = self._peers.get(hello.guid.place)
         known = []
         if peer is not None and peer.link is not None:
             link = peer.link
@@ -215,7 +215,7 @@ class Peering:
             dialled: Whether we dialled.
             endpoint: Where we dialled.
         """
-        peer = self._peers.get(_place(identity.guid)) or self._add(identity)
+        peer = self._peers.get(identity.guid.place) or self._add(identity)
         if dialled:
             peer.dialling = None
             peer.good = endpoint
@@ -320,14 +320,14 @@ class Peering:
     def _add(self, identity: Identity) -> _Peer:
         backoff = Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng)
         peer = _Peer(identity, self._ours.guid < identity.guid, backoff)
-        self._peers[_place(identity.guid)] = peer
+        self._peers[identity.guid.place] = peer
         return peer
 
     def _forget_if_idle(self, peer: _Peer) -> None:
         """Forget a peer that is gone; one that we are dialling only when the dial was answered."""
         peer.next_attempt = peer.forget_at = None
         if peer.link is None and peer.dialling is None:
-            self._peers.pop(_place(peer.identity.guid), None)
+            self._peers.pop(peer.identity.guid.place, None)
 
     def _restart(self, peer: _Peer, now: float) -> None:
         """A new instance announced itself: nothing that its ghost did counts."""
@@ -356,7 +356,7 @@ class Peering:
         self._outputs.append(LinkDown(link.id, link.identity, reason))
 
     def _answered(self, guid: Guid) -> _Peer | None:
-        peer = self._peers.get(_place(guid))
+        peer = self._peers.get(guid.place)
         if peer is None or peer.dialling is None:
             return None
         peer.tried.add(peer.dialling)
@@ -389,10 +389,6 @@ class Peering:
         peer.next_attempt = None
         peer.attempts += 1
         self._outputs.append(Dial(peer.identity.guid, left[0]))
-
-
-def _place(guid: Guid) -> int:
-    return guid.value >> 16
 
 
 def _status(peer: _Peer) -> PeerStatus:
