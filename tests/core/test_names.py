@@ -62,11 +62,6 @@ def test_an_illegal_name_is_not_resolved() -> None:
         names.resolve_name("a b")
 
 
-@pytest.mark.parametrize(("name", "namespace"), [("/a/b", "/a/"), ("/a", "/"), ("/a/b/", "/a/"), ("/", "/")])
-def test_namespaces(name: str, namespace: str) -> None:
-    assert names.namespace_of(name) == namespace
-
-
 @pytest.mark.parametrize(
     ("pattern", "name", "fits"),
     [

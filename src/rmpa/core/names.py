@@ -32,12 +32,6 @@ def join_names(namespace: str, name: str) -> str:
     return f"{namespace.rstrip('/')}/{name}" if namespace else name
 
 
-def namespace_of(name: str) -> str:
-    """The namespace of a global name, with its trailing slash: ``/a/b`` gives ``/a/``, ``/a`` gives ``/``."""
-    stripped = name.rstrip("/")
-    return stripped[: stripped.rfind("/") + 1] or "/"
-
-
 def resolve_name(name: str, namespace: str = "/", node: str = "") -> str:
     """Resolve a graph name as a client library does.
 

@@ -128,14 +128,6 @@ async def test_demand_ends_when_all_held_subscribers_are_refused(held: Owner) ->
     link.close()
 
 
-async def test_held_subscribers_can_be_refused_for_good(held: Owner) -> None:
-    link = await held.subscriber()
-    held.publication.refuse_held("no such thing")
-    assert await link.header() == {"error": "no such thing"}
-    assert held.said == ["first", "refused /s: no such thing", "last"]
-    link.close()
-
-
 async def test_a_mismatch_is_no_demand(known: Owner) -> None:
     link = await RawSubscriber.connect(known.server.address, md5sum="0" * 32)
     assert "error" in await link.header()

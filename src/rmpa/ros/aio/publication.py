@@ -181,14 +181,6 @@ class Publication:
         """Keep no message for later subscribers: its source is gone, or will send it again."""
         self._latched = None
 
-    def refuse_held(self, text: str) -> None:
-        """Refuse all held subscribers, for good: the type will not be known."""
-        held, self._held = self._held, ()
-        for link in held:
-            self._refuse(link, text)
-        if held and not self.subscribers:
-            self._on_last()
-
     async def drained(self, timeout: float = limits.DRAIN_TIMEOUT) -> None:  # noqa: ASYNC109 - for all together
         """Wait until all that was published has left, or ``timeout`` seconds are over."""
         if self._open:
