@@ -266,6 +266,7 @@ async def test_an_agent_that_does_not_answer(place: Path) -> None:
         ("http://127.0.0.1:11311/", "http://localhost:11312", False),
         ("http://10.0.0.1:1", "http://10.0.0.1:1/", True),
         ("http://10.0.0.1:1", "http://localhost:1/", False),
+        ("http://127.0.0.1:1/", f"http://{socket.gethostname()}:1", True),
         ("http://localhost", "http://localhost", False),
         ("http://localhost:x", "http://localhost:1", False),
     ],

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from rmpa.core.errors import StartError
+from rmpa.monitor.aio import runtime_dir as module
 from rmpa.monitor.aio.runtime_dir import NameLock, make_runtime_dir, runtime_dir, runtime_dirs
 
 HOLD = """
@@ -60,6 +61,15 @@ def test_somebody_elses_directory_is_refused(place: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(os, "geteuid", lambda: 4321)
     with pytest.raises(StartError, match=r"belongs to user \d+"):
         make_runtime_dir(place)
+
+
+def test_root_finds_the_agent_of_a_service_with_its_own_user(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if os.geteuid() == 0:
+        os.chown(place, 1234, -1)
+    monkeypatch.setattr(os, "geteuid", lambda: 4321)  # and so the directory is somebody else's
+    assert place not in runtime_dirs({})
+    monkeypatch.setattr(module, "_SYSTEM", place)
+    assert place in runtime_dirs({})
 
 
 def test_a_client_with_rmpa_runtime_dir_looks_only_there(place: Path) -> None:

@@ -165,10 +165,14 @@ def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAg
 
 
 def same_core(one: str, other: str) -> bool:
-    """Whether two URIs of ROS cores on this machine are one: the port decides, all local hosts are the same."""
+    """Whether two URIs of ROS cores on this machine are one: the port decides, all names of this machine are one."""
     try:
         first, second = urlsplit(one), urlsplit(other)
-        hosts = {"localhost" if (u.hostname or "").startswith("127.") else u.hostname for u in (first, second)}
+        hosts = {_local(u.hostname or "") for u in (first, second)}
         return first.port is not None and first.port == second.port and len(hosts) == 1
     except ValueError:
         return False
+
+
+def _local(host: str) -> str:
+    return "localhost" if host.startswith("127.") or host == socket.gethostname().lower() else host

@@ -46,12 +46,16 @@ def runtime_dirs(environ: Mapping[str, str]) -> list[Path]:
 
 
 def _usable(place: Path) -> bool:
-    """Whether we may read it and nobody else could have put a socket there to fool us."""
+    """Whether we may read it and nobody else could have put a socket there to fool us.
+
+    ``/run/rmpa`` may belong to anybody: only root makes it, or systemd for a unit's own user.
+    """
     try:
         info = place.lstat()
     except OSError:
         return False
-    return stat.S_ISDIR(info.st_mode) and info.st_uid in {0, os.geteuid()} and os.access(place, os.R_OK | os.X_OK)
+    trusted = place == _SYSTEM or info.st_uid in {0, os.geteuid()}
+    return stat.S_ISDIR(info.st_mode) and trusted and os.access(place, os.R_OK | os.X_OK)
 
 
 def make_runtime_dir(place: Path) -> None:
