@@ -2,9 +2,9 @@
 
 ::
 
-    HANDSHAKING ──welcome sent or received──► UP ──bye sent──► CLOSING ──drained──► CLOSED
-         │  refuse sent: CLOSING                │  bye received, lease over, protocol error: CLOSED
-         └─ refused, time out, error: CLOSED    └
+    HANDSHAKING ──welcome sent or received──► UP ──bye sent──► CLOSING ──drained, 1 s──► CLOSED
+         ├─ refuse or bye sent: CLOSING         └─ bye received, lease over, protocol error: CLOSED
+         └─ refused, time out, error: CLOSED
 
 The driver feeds ``receive``, sends what ``take_output`` gives, calls ``handle_timer`` when ``next_timer`` is due
 and closes the socket at ``Closed``. Events and data come in the order of the bytes, from within ``receive``.
