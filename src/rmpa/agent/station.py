@@ -23,6 +23,7 @@ from rmpa.mesh.aio.mesh import Mesh
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from ipaddress import IPv4Address
 
     from rmpa.bridge.aio.bridge import Bridge
     from rmpa.core.config import Settings
@@ -118,14 +119,26 @@ class Station:
         self._bridge.link_down(link)
         self.discovery.link_down(link.identity.guid, link.identity.instance)
 
-    def _interfaces(self, usable: tuple[Interface, ...]) -> bool:
+    def _interfaces(self, everything: tuple[Interface, ...]) -> bool:
         """Whether we stay where we are."""
-        ours = self.identity.guid.address
-        there = {address for interface in usable for address in interface.addresses}
-        better = ours.is_loopback and not pick_address(usable).is_loopback
-        # An address that is only gone (a cable pulled, a lease renewed) may come back; one that has been replaced
-        # will not, and until then those who know us by the old one are not confused.
-        displaced = better or (ours not in there and not pick_address(usable).is_loopback)
+        displaced = is_displaced(self.identity.guid.address, everything, self._settings.interfaces)
         if displaced:
             self._on_displaced()
         return not displaced
+
+
+def is_displaced(ours: IPv4Address, everything: tuple[Interface, ...], wanted: tuple[str, ...]) -> bool:
+    """Whether another address must stand for us.
+
+    An interface without its cable keeps its address, which comes back with it; until then links by other interfaces
+    go on. An address that is gone altogether may come back too (a lease renewed), but not one that was replaced.
+
+    Args:
+        ours: The address in our GUID.
+        everything: All interfaces, up or not.
+        wanted: The names of those that the user chose; empty means all.
+    """
+    if pick_address(choose(everything, wanted)).is_loopback:
+        return False
+    kept = {address for i in everything if not wanted or i.name in wanted for address in i.addresses}
+    return ours.is_loopback or ours not in kept

@@ -50,7 +50,7 @@ class Discovery:
         settings: Group, port, domain, interfaces, seeds, and whether to use multicast.
         udp_socket: Bound to the mesh's port, non-blocking; lent, not closed here.
         on_event: Called in the loop with each event of the roster, in order.
-        on_interfaces: Called in the loop with the interfaces that are used now, after they changed; says whether our
+        on_interfaces: Called in the loop with all interfaces, used or not, after they changed; says whether our
             identity still fits them. If not we are about to be closed, and announce nothing more.
         clock: Tells monotonic seconds.
         look: How interfaces are listed.
@@ -206,7 +206,7 @@ class Discovery:
 
     def _interfaces_changed(self, everything: tuple[Interface, ...]) -> None:
         self._use(everything)
-        if not self._on_interfaces(self._interfaces):
+        if not self._on_interfaces(everything):
             return
         self._roster.interfaces_changed(self._clock.now(), self._further_addresses(everything))
         self._flush()
