@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import socket
 from typing import TYPE_CHECKING
 
@@ -151,3 +152,15 @@ async def test_a_name_that_does_not_resolve(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", fails)
     with pytest.raises(UnreachableError, match="does not resolve here"):
         await call("http://robot-7:11311/", "m")
+
+
+async def test_a_socket_that_is_hung_up_on_at_once_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    class HungUp(socket.socket):
+        def getpeername(self) -> tuple[str, int]:
+            raise OSError(errno.ENOTCONN, "Transport endpoint is not connected")
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = server.getsockname()
+        monkeypatch.setattr("rmpa.ros.aio.http_client.socket.socket", HungUp)
+        with pytest.raises(OSError, match="not connected"):
+            await connect(*address)

@@ -79,13 +79,13 @@ async def _connect_one(address: tuple[str, int]) -> socket.socket:
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         await asyncio.get_running_loop().sock_connect(sock, address)
+        # This raises too, where the other side hung up at once.
+        if sock.getsockname() == sock.getpeername():
+            # A port of the ephemeral range that nobody listens at can connect to itself.
+            raise ConnectionRefusedError(errno.ECONNREFUSED, "connected to itself")  # noqa: TRY301 - see below
     except BaseException:
         sock.close()
         raise
-    if sock.getsockname() == sock.getpeername():
-        # A port of the ephemeral range that nobody listens at can connect to itself.
-        sock.close()
-        raise ConnectionRefusedError(errno.ECONNREFUSED, "connected to itself")
     return sock
 
 
