@@ -202,7 +202,7 @@ class View:
             at = attached[peer]
             flow = at.inbound.flows.get(entry.route)
             publication = at.inbound.publication(source)
-            if entry.hidden and "its type is" in entry.hidden:
+            if entry.conflict:
                 mismatches.setdefault(source.topic, []).append(f"{at.link.name}: {entry.hidden}")
             for text in self._bridge.mismatches(source):
                 mismatches.setdefault(source.topic, []).append(text)

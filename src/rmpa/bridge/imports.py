@@ -65,6 +65,7 @@ class Import:
         backoff: Delays between attempts.
         shown: Whether it is in the local graph.
         hidden: Why it is not, or empty.
+        conflict: Whether that is because a local node publishes the topic with another type.
         state: Where its route stands.
         route: The route's id while it is asked for or open, else 0.
         timer: When the state is looked at again, monotonic seconds.
@@ -77,6 +78,7 @@ class Import:
     backoff: Backoff
     shown: bool = False
     hidden: str = ""
+    conflict: bool = False
     state: RouteState = RouteState.IDLE
     route: int = 0
     timer: float | None = None
@@ -264,7 +266,7 @@ class Imports:
         return actions + self._report_conflict(peer, source, entry)
 
     def _show_or_hide(self, peer: int, source: Source, entry: Import) -> list[Action]:
-        entry.hidden = self._why_hidden(source, entry.type)
+        entry.hidden, entry.conflict = self._why_hidden(source, entry.type)
         if entry.shown is not bool(entry.hidden):
             return []
         if not entry.hidden:
@@ -276,24 +278,22 @@ class Imports:
 
     def _report_conflict(self, peer: int, source: Source, entry: Import) -> list[Action]:
         """Say loudly, on both sides, that a local topic of another type is in the way."""
-        if entry.shown or not self._policy.judge(source.topic, entry.type, source.node).allowed:
+        if not entry.conflict:
             return []
         return [
             Warn("mismatch.type", str(source), f"{source}: {entry.hidden}"),
             Send(peer, Mismatch(source.topic, source.node, "", entry.hidden)),
         ]
 
-    def _why_hidden(self, source: Source, type_name: str) -> str:
+    def _why_hidden(self, source: Source, type_name: str) -> tuple[str, bool]:
         decision = self._policy.judge(source.topic, type_name, source.node)
         if not decision.allowed:
-            return decision.rule
+            return decision.rule, False
         local = self._local_types.get(source.topic, type_name)
-        if local != type_name:
-            return (
-                f"its type is {type_name}, but a local node publishes {source.topic} as {local}; "
-                "rename one of the topics or use one type"
-            )
-        return ""
+        if local == type_name:
+            return "", False
+        why = f"its type is {type_name}, but a local node publishes {source.topic} as {local}; "
+        return why + "rename one of the topics or use one type", True
 
     def _forget(self, peer: int, source: Source) -> list[Action]:
         entry = self._peers[peer].get(source)

@@ -27,7 +27,7 @@ class RmpaError(Exception):
     """Root of every error that this package raises on purpose."""
 
 
-@dataclass
+@dataclass(eq=False)
 class ConfigError(RmpaError):
     """A setting cannot be used.
 
@@ -53,7 +53,7 @@ class ConfigError(RmpaError):
         return _advised(f"{where}{self.source}: {self.problem}", self.remedy)
 
 
-@dataclass
+@dataclass(eq=False)
 class StartError(RmpaError):
     """The agent, or a part of it, cannot start on this machine as asked."""
 
@@ -74,7 +74,7 @@ class RemoteProtocolError(RmpaError):
     """The other side sent bytes that its protocol does not allow."""
 
 
-@dataclass
+@dataclass(eq=False)
 class LimitExceeded(RemoteProtocolError):  # noqa: N818 - the name says what happened, as in websockets
     """The other side claimed a size beyond a limit; nothing of it was stored."""
 
@@ -87,7 +87,7 @@ class LimitExceeded(RemoteProtocolError):  # noqa: N818 - the name says what hap
         return f"{self.what} of {self.claimed} bytes exceeds the limit of {self.limit}"
 
 
-@dataclass
+@dataclass(eq=False)
 class PeerRefused(RmpaError):  # noqa: N818 - an event's name
     """A peer answered, and the answer was no."""
 
@@ -100,7 +100,7 @@ class PeerRefused(RmpaError):  # noqa: N818 - an event's name
         return _advised(f"{self.peer} refused: {self.reason}", self.remedy)
 
 
-@dataclass
+@dataclass(eq=False)
 class UnreachableError(RmpaError):
     """Nobody answers at an address where somebody should."""
 

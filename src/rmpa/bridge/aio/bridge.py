@@ -179,12 +179,9 @@ class Bridge:
         peer, now = attached.peer, self._loop.time()
         match message:
             case Advertise():
-                _log.info(
-                    "< %s publishes %d more topics, %d less",
-                    attached.link.name,
-                    len(message.added),
-                    len(message.removed),
-                )
+                if message.added or message.removed:
+                    changes = (len(message.added), len(message.removed))
+                    _log.info("< %s publishes %d more topics, %d less", attached.link.name, *changes)
                 self._act(self._imports.advertised(peer, message))
             case Open():
                 self._act(self._exports.opened(peer, message))
