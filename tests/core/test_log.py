@@ -6,6 +6,8 @@ import io
 import json
 import logging
 import re
+import subprocess
+import sys
 from typing import TYPE_CHECKING
 
 import pytest
@@ -53,3 +55,16 @@ def test_json_with_a_traceback(stream: io.StringIO) -> None:
     }
     assert "ValueError: invalid literal" in record["traceback"]
     assert record["time"].endswith("+00:00")
+
+
+def test_a_line_to_escape_is_written_without_file_descriptors() -> None:
+    """The codec's module was loaded at its first use: asyncio's line about too many open files never came."""
+    script = (
+        "import logging, resource, sys\n"
+        "from rmpa.core.log import configure_logging\n"
+        "configure_logging('info', sys.stderr, as_json=False)\n"
+        "resource.setrlimit(resource.RLIMIT_NOFILE, (3, 3))\n"
+        "logging.error('too many\\nopen files')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=30)
+    assert r"too many\nopen files" in done.stderr

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import logging
 from datetime import UTC, datetime
-from typing import TextIO
+from typing import Final, TextIO
+
+# Looked up now: its module is a file, and a line about having no file descriptors left was lost for want of one.
+_ESCAPE: Final = codecs.getencoder("unicode_escape")
 
 
 def room_of(logger: str) -> str:
@@ -16,7 +20,7 @@ def room_of(logger: str) -> str:
 
 def _one_line(text: str) -> str:
     """Text from outside must not forge lines or move the terminal's cursor."""
-    return "".join(c if c.isprintable() or c == "\t" else c.encode("unicode_escape").decode("ascii") for c in text)
+    return "".join(c if c.isprintable() or c == "\t" else _ESCAPE(c)[0].decode("ascii") for c in text)
 
 
 class TextFormatter(logging.Formatter):
