@@ -1,41 +1,76 @@
-"""``python -m bench [path|startup|idle|throughput] [--quick] [--json FILE]``; without a name: all of them."""
+"""``python -m bench [NAME ...] [--quick] [--json FILE]``; without a name: all of them, in the order of the table."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 from rich.console import Console
 
 from bench import bed, idle, path, startup, throughput
 from tests.interop import namespaces
 
-_NAMES = ("path", "startup", "idle", "throughput")
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    Measure = Callable[[bool, Console, Path | None], object]
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """One name of the command line.
+
+    Args:
+        about: What it finds out, in a few words.
+        measure: Takes whether few samples will do, where to print, and a file for the result.
+        needs: Each says why it cannot run here, or an empty string.
+    """
+
+    about: str
+    measure: Measure
+    needs: tuple[Callable[[], str], ...] = (bed.why_no_ros, bed.why_no_hosts)
+
+
+MEASUREMENTS: Final[dict[str, Measurement]] = {
+    "path": Measurement(
+        "how late a message is, on every path", path.run, needs=()
+    ),  # leaves out what it cannot start
+    "throughput": Measurement("how much goes through", throughput.measure),
+    "startup": Measurement("how soon the first message arrives", startup.measure),
+    "idle": Measurement("what an agent costs while nothing happens", idle.measure),
+}
 
 
 def main() -> int:
     """Run what the command line asks for."""
-    parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
-    parser.add_argument("measurement", nargs="*", choices=[*_NAMES, []], help="which; default: all")
+    parser = argparse.ArgumentParser(
+        prog="python -m bench",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="\n".join(f"  {name:12} {row.about}" for name, row in MEASUREMENTS.items()),
+    )
+    parser.add_argument("measurement", nargs="*", metavar="NAME", help="which of those below; default: all")
     parser.add_argument("--quick", action="store_true", help="few samples: to see whether it works, not to quote")
     parser.add_argument("--json", type=Path, help="write the result there too (with one measurement)")
     parser.add_argument("--only", default="", help="path: these contenders, comma-separated")
     args = parser.parse_args()
+    if unknown := [name for name in args.measurement if name not in MEASUREMENTS]:
+        parser.error(f"no such measurement: {', '.join(unknown)}; there are {', '.join(MEASUREMENTS)}")
     console = Console(width=130 if not sys.stdout.isatty() else None)
     if not bed.why_no_hosts():
         namespaces.remove_stale()
-    for name in args.measurement or _NAMES:
-        if name == "path":
-            plan = path.QUICK if args.quick else path.FULL
-            path.measure(replace(plan, only=tuple(filter(None, args.only.split(",")))), console, args.json)
-            continue
-        if reason := bed.why_no_ros() or bed.why_no_hosts():
+    for name in args.measurement or MEASUREMENTS:
+        row = MEASUREMENTS[name]
+        if reason := next(filter(None, (why() for why in row.needs)), ""):
             console.print(f"{name} is left out: {reason}", style="yellow")
-            continue
-        measure = {"startup": startup.measure, "idle": idle.measure, "throughput": throughput.measure}[name]
-        measure(args.quick, console, args.json)
+        elif name == "path" and args.only:
+            plan = path.QUICK if args.quick else path.FULL
+            path.measure(replace(plan, only=tuple(args.only.split(","))), console, args.json)
+        else:
+            row.measure(args.quick, console, args.json)
     return 0
 
 

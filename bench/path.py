@@ -58,6 +58,11 @@ class _Score:
 Scores = dict[tuple[str, int], _Score]
 
 
+def run(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
+    """Measure every contender."""
+    return measure(QUICK if quick else FULL, console, json)
+
+
 def measure(plan: Plan, console: Console, json: Path | None = None) -> dict[str, object]:
     """Run the plan, print the tables, write the files; return the result."""
     if not machine.facts()["python_optimised"]:
