@@ -25,6 +25,20 @@ DOMAIN_MAX: Final = 232
 # --- settings -------------------------------------------------------------------------------------------------
 CONFIG_FILE_MAX: Final = 256 * KIB
 """A settings file; ours is some 4 KB, and finding a line in a huge one takes long."""
+CONTRACTS_REMEMBERED: Final = 4096
+"""(topic, type) pairs whose contract is remembered; the oldest is forgotten first, and found again by the rules."""
+CONTRACT_DEPTH_MAX: Final = 100_000
+"""Messages that a contract may let wait: 100 s of a 1 kHz topic. ``LINK_QUEUE_BYTES`` bounds their bytes."""
+CONTRACT_TIME_MIN: Final = 0.001
+"""Shortest deadline, lifespan and lease: a timer that is due more often would hold up what it watches."""
+CONTRACT_TIME_MAX: Final = 86_400.0
+"""Longest deadline, lifespan and lease, a day: more is a mistake in the unit."""
+CONTRACT_RATE_MIN: Final = 0.001
+"""Lowest ``max_rate`` in messages a second: one in a quarter of an hour."""
+CONTRACT_RATE_MAX: Final = 1_000_000.0
+"""Highest ``max_rate`` in messages a second: more than any topic reaches."""
+CPU_MAX: Final = 1023
+"""Highest number of a CPU that an affinity can name: CPU_SETSIZE less one."""
 
 # --- discovery ------------------------------------------------------------------------------------------------
 MULTICAST_GROUP: Final = "239.255.82.77"
