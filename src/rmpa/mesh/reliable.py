@@ -240,17 +240,16 @@ DUPLICATE: Final = Verdict(deliver=False)
 class ReliableReceiver:
     """The receiving half: each message once, in order, with the exact number of those that never come.
 
-    It outlives links. Tell it by ``begin`` what the sender says of itself; it also takes a new epoch from the
-    messages alone, without claiming a gap before the first.
+    It outlives links. Only ``begin`` changes its epoch: what still comes of another one, over a link that is about to
+    be closed, is a duplicate. Without the sender's first sequence no gap is claimed before the first message.
 
     Args:
-        epoch: The sender's, if known.
+        epoch: The sender's, if known; else the first message's is taken.
         first: The sender's first sequence, if known.
     """
 
     def __init__(self, epoch: int | None = None, first: int | None = None) -> None:
         self._epoch = epoch
-        self._retired: int | None = None
         self._next = first
         self._owed = 0
         self._owed_bytes = 0
@@ -279,7 +278,7 @@ class ReliableReceiver:
                 self._next = first
             return True
         known = self._epoch is not None
-        self._retired, self._epoch, self._next = self._epoch, epoch, first
+        self._epoch, self._next = epoch, first
         self._owed = self._owed_bytes = 0
         self.breaks += known
         return not known
@@ -287,7 +286,7 @@ class ReliableReceiver:
     def judge(self, sequence: int, epoch: int) -> Verdict:
         """What ``accept`` would say, at a message's first fragment; nothing changes until its last one has come."""
         if epoch != self._epoch:
-            return DUPLICATE if epoch == self._retired else DELIVER
+            return DELIVER if self._epoch is None else DUPLICATE
         gap = 0 if self._next is None else (sequence - self._next) & _MASK
         if not gap:
             return DELIVER
@@ -296,10 +295,10 @@ class ReliableReceiver:
     def accept(self, sequence: int, epoch: int, now: float, size: int = 0) -> Verdict:
         """A whole message of ``size`` bytes has come at ``now``, in monotonic seconds."""
         if epoch != self._epoch:
-            if epoch == self._retired:
+            if self._epoch is not None:
                 self.duplicates += 1
                 return DUPLICATE
-            self.begin(epoch)
+            self._epoch = epoch
         gap = 0 if self._next is None else (sequence - self._next) & _MASK
         if not self._owed:
             self._owed_since = now
