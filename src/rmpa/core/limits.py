@@ -324,6 +324,11 @@ CALL_BACK_DELAYS: Final = (0.05, 1.0)
 """When a proxy is registered again whose subscribers were hung up on: at once, and for those that noticed late."""
 RECONCILE_INTERVAL: Final = 5.0
 """The plan is compared with what is really open this often, so that nothing stays stuck."""
+QUALITY_WINDOW: Final = 512
+"""Messages of a remote source that its figures are made of, a power of two: 10 KB a route, and a 99th percentile that
+five of them exceed."""
+QUALITY_SPAN: Final = 60.0
+"""Older messages tell nothing of how a source is now, and the clocks have drifted since by a millisecond."""
 
 # --- monitor --------------------------------------------------------------------------------------------------
 CONTROL_REQUEST_MAX: Final = 1 * MIB
