@@ -115,12 +115,33 @@ def test_rounding_neither_stops_nor_spins_the_timer(deadline: float, start: floa
             due = watch.next_timer()
             assert due is not None
             now = max(now, due)
-            assert len(watch.handle_timer(now)) == 1
+            (event,) = watch.handle_timer(now)
+            assert event.count >= 1
             following = watch.next_timer()
             assert following is not None
             assert now < following <= now + deadline * (1 + 1e-6) + 1e-6
     elapsed = (now - start) / deadline
     assert abs(watch.counts[Kind.DEADLINE_MISSED] - elapsed) <= 1 + elapsed * 1e-6 + 1
+
+
+def test_a_period_that_rounding_hides_is_told_next() -> None:
+    watch = Watch(Contract(deadline=0.1), 1e6)
+    now = 1e6 + 2 * 0.1  # less 1e6, this is less than twice 0.1
+    assert [event.count for event in watch.handle_timer(now)] == [1]
+    due = watch.next_timer()
+    assert due is not None
+    assert now < due < now + 1e-6
+    assert [event.count for event in watch.handle_timer(due)] == [1]
+    assert watch.next_timer() == 1e6 + 3 * 0.1
+
+
+def test_of_many_gaps_the_last_are_remembered() -> None:
+    watch = Watch(Contract(deadline=0.5), 0.0)
+    for second in range(100):
+        watch.last = float(second)
+        watch.handle_timer(second + 0.5)
+    assert watch.counts == {Kind.DEADLINE_MISSED: 100}
+    assert [event.now for event in watch.recent] == [second + 0.5 for second in range(100 - limits.WATCH_RECENT, 100)]
 
 
 def test_a_sleep_of_years_costs_one_event() -> None:
