@@ -270,8 +270,8 @@ RECEIVED_QUEUE: Final = 1000
 HTTP_BODY_MAX: Final = 8 * MIB
 """An XML-RPC call: parameters with maps and URDFs reach a few MB."""
 HTTP_BODY_INLINE: Final = 64 * KIB
-"""Bodies above this are read and written over several turns of the loop: 8 MiB of numbers would hold up keepalives for
-seconds. Shorter ones take some 5 ms, in which only data goes first."""
+"""Bodies above this are read and written over several turns of the loop: 8 MiB of numbers would hold up keepalives
+for seconds. Shorter ones take some 5 ms, in which only data goes first."""
 XMLRPC_SLICE: Final = 2 * KIB
 """What is parsed at once of a body, some 100 microseconds; then data goes first."""
 HTTP_ACCEPTS: Final = 4
