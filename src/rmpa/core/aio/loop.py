@@ -20,10 +20,10 @@ import math
 import select
 import selectors
 from collections import deque
-from typing import TYPE_CHECKING, Any, Final, TypeVarTuple, cast
+from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple, cast
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from _typeshed import FileDescriptorLike
 
@@ -31,6 +31,9 @@ _log = logging.getLogger(__name__)
 
 _EPOLL_RESOLUTION: Final = 1e-3
 _LOOK: Final = 64
+_ITEMS: Final = 64
+"""Steps of some work between two breaths, of a microsecond or less each."""
+_T = TypeVar("_T")
 _Ts = TypeVarTuple("_Ts")
 _READ: Final = ~select.EPOLLOUT
 _WRITE: Final = ~select.EPOLLIN
@@ -241,6 +244,14 @@ def breathe() -> None:
     loop = asyncio._get_running_loop()  # noqa: SLF001 - the public one raises where there is none
     if isinstance(loop, AgentLoop):
         loop.poll_data()
+
+
+def breathing(items: Iterable[_T], /) -> Iterator[_T]:
+    """Pass on items one after the other, and breathe now and then (``core.breathing.Breathing``)."""
+    for number, item in enumerate(items):
+        if number % _ITEMS == 0:
+            breathe()
+        yield item
 
 
 class _Turnstile(deque[asyncio.Handle]):
