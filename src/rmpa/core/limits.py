@@ -316,6 +316,12 @@ ROUTE_LINGER: Final = 1.0
 """A route stays open this long after its last local subscriber left: reconnecting nodes flap."""
 ROUTES_PER_LINK_MAX: Final = 8192
 """Open routes that one peer may hold with us."""
+ADVERTISED_AT_ONCE: Final = 64
+"""Sources in one advertisement of ours; more follow in the next turn of the loop."""
+LEARNT_AT_ONCE: Final = 16
+"""Sources of an advertisement that are dealt with at once, some 100 microseconds; then data goes first."""
+RESCANNED_AT_ONCE: Final = 16
+"""Topics of the local graph that are looked at in one turn of the loop, after a change or to reconcile."""
 TOPICS_PER_PEER_MAX: Final = 16384
 """(topic, node) pairs that one peer may advertise."""
 NODES_PER_PEER_MAX: Final = 256
