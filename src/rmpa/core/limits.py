@@ -369,6 +369,12 @@ CONTROL_HANDLER_TIMEOUT: Final = 30.0
 """For the agent's own part of a call."""
 CONTROL_PATH_MAX: Final = 107
 """Bytes in a UNIX socket's path: Linux's sun_path less its final zero."""
+DIAGNOSTICS_INTERVAL: Final = 1.0
+"""Between two messages on /diagnostics, as ROS's own publishers have it; the clocks of links are followed as often."""
+DIAGNOSTICS_STALE: Final = 60.0
+"""For this long a peer that is gone, and what came from it, is shown as stale on /diagnostics."""
+DIAGNOSTICS_QUEUE: Final = 10
+"""Messages waiting for a slow reader of /diagnostics: each holds everything that the one before it did."""
 
 # --- logging --------------------------------------------------------------------------------------------------
 LOG_INTERVAL: Final = 5.0
