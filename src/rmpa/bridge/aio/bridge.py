@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -29,6 +30,7 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.policy import OWN_NODE, is_own
 from rmpa.bridge.proxy_names import LOOPBACK, proxy_prefix
 from rmpa.core import limits
+from rmpa.core.aio.loop import breathe
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.names import is_type_name
@@ -81,6 +83,12 @@ class Bridge:
         self._rescan: asyncio.Handle | None = None
         self._closed = False
         self._types: dict[Source, str] = {}
+        # Topics of the local graph to look at, advertisements to learn, and what is to be done: each is worked off a
+        # little at a time, so that a graph of thousands delays no message.
+        self._changed: dict[str, None] = {}
+        self._learning: deque[tuple[int, Iterator[Advertise]]] = deque()
+        self._actions: deque[act.Action] = deque()
+        self._acting = False
         self._mismatches: dict[Source, dict[str, str]] = {}
         self._refusals = RefusalLog(_log, self.counters)
 
@@ -112,7 +120,7 @@ class Bridge:
         self._loop = asyncio.get_running_loop()
         await self._node.start()
         self._core.on_change(self._graph_changed)
-        self._scan()
+        self._scan_all()
         self._reconciler = self._loop.call_later(limits.RECONCILE_INTERVAL, self._reconcile)
 
     async def close(self) -> None:
@@ -145,6 +153,7 @@ class Bridge:
         self._by_number[peer] = self._by_link[link] = attached
         self._act(self._imports.link_up(peer))
         self._act(self._exports.link_up(peer))
+        self._schedule()
 
     def link_down(self, link: MeshLink) -> None:
         """A link is gone: retract what came over it."""
@@ -182,7 +191,8 @@ class Bridge:
                 if message.added or message.removed:
                     changes = (len(message.added), len(message.removed))
                     _log.info("< %s publishes %d more topics, %d less", attached.link.name, *changes)
-                self._act(self._imports.advertised(peer, message))
+                self._learning.append((peer, self._imports.portions(peer, message)))
+                self._schedule()
             case Open():
                 self._act(self._exports.opened(peer, message))
             case Opened():
@@ -206,7 +216,7 @@ class Bridge:
             if isinstance(action, act.RemoveRoute):
                 self._outbound.remove_route(action, attached.link)
             else:
-                self._do(action)
+                self._act([action])
         self._imports.link_down(attached.peer)  # its actions are what closing the inbound side does at once
         task = asyncio.create_task(attached.inbound.close(), name=f"retract {attached.inbound.prefix}")
         self._closing.add(task)
@@ -223,29 +233,53 @@ class Bridge:
                 self._types.pop(source, None)
             elif is_type_name(change.type):
                 self._types[source] = change.type
+        if change.kind is not Kind.SERVICE:
+            self._changed[change.name] = None
+            self._schedule()
+
+    def _schedule(self) -> None:
         if self._rescan is None and not self._closed:
             self._rescan = self._loop.call_soon(self._scan)
 
+    def _scan_all(self) -> None:
+        self._changed |= dict.fromkeys((*self._exports.topics, *self._core.state().publishers))
+        self._schedule()
+
     def _scan(self) -> None:
+        """Do a part of what has to be done since graphs have changed, the local one or a peer's."""
         self._rescan = None
-        state = self._core.state()
-        sources = {
-            source: LocalSource(self._types.get(source) or state.types.get(source.topic, "*"), uri)
-            for topic, nodes in state.publishers.items()
-            for node, uri in nodes.items()
-            if not is_own((source := Source(topic, node)).node)
-        }
-        self._act(self._exports.graph(sources))
-        self._act(self._imports.local_types({source.topic: local.type for source, local in sources.items()}))
-        known = {*self._exports.offered, *(source for _, source, _ in self._imports)}
-        for source in [source for source in self._mismatches if source not in known]:
-            del self._mismatches[source]
+        for _ in range(min(len(self._changed), limits.RESCANNED_AT_ONCE)):
+            topic = next(iter(self._changed))
+            del self._changed[topic]
+            self._look_at(topic)
+        self._act(self._exports.tell())
+        if self._learning:
+            peer, portions = self._learning[0]
+            portion = next(portions, None) if peer in self._by_number else None
+            if portion is None:
+                self._learning.popleft()
+            else:
+                self._act(self._imports.advertised(peer, portion))
+        if self._changed or self._learning or self._exports.untold:
+            self._schedule()
+        elif self._mismatches:
+            for source in [s for s in self._mismatches if s not in self._exports.offered]:
+                if not self._imports.knows(source):
+                    del self._mismatches[source]
+
+    def _look_at(self, topic: str) -> None:
+        nodes = {node: uri for node, uri in self._core.publishers(topic).items() if not is_own(node)}
+        said = self._core.type_of(topic) if nodes else ""
+        local = {node: LocalSource(self._types.get(Source(topic, node)) or said, uri) for node, uri in nodes.items()}
+        self._act(self._exports.graph(topic, local))
+        self._act(self._imports.local_type(topic, next((one.type for one in reversed(local.values())), None)))
 
     def _reconcile(self) -> None:
         self._reconciler = self._loop.call_later(limits.RECONCILE_INTERVAL, self._reconcile)
-        self._scan()
+        self._scan_all()
         publishers = self._core.state().publishers
-        for attached in self._by_number.values():
+        for attached in list(self._by_number.values()):
+            breathe()
             if again := attached.inbound.reconcile(publishers):
                 self.counters.add("proxy.registered_again", again)
 
@@ -270,8 +304,21 @@ class Bridge:
     # --- carrying out ------------------------------------------------------------------------------------------
 
     def _act(self, actions: list[act.Action]) -> None:
+        """Do these behind those that are being done: in between data may come first, and bring more of them."""
         for action in actions:
-            self._do(action)
+            if isinstance(action, act.Describe):
+                self._do(action)  # now: data may be right behind it, and nothing that waits belongs before it
+            else:
+                self._actions.append(action)
+        if self._acting:
+            return
+        self._acting = True
+        try:
+            while self._actions:
+                self._do(self._actions.popleft())
+                breathe()
+        finally:
+            self._acting = False
         self._set_timer()
 
     def _do(self, action: act.Action) -> None:
