@@ -93,6 +93,11 @@ class Bridge:
         self._refusals = RefusalLog(_log, self.counters)
 
     @property
+    def node(self) -> SlaveNode:
+        """The agent's own node in the local graph."""
+        return self._node
+
+    @property
     def exports(self) -> Exports:
         """The outbound plan, for the monitor."""
         return self._exports
