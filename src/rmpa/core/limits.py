@@ -14,19 +14,15 @@ MIB: Final = 1024 * KIB
 OPEN_FILES: Final = 65_536
 """File descriptors that an agent asks for, as far as the hard limit allows: the usual 1024 are 500 proxies."""
 THREAD_SWITCH: Final = 1e-4
-"""Seconds that a thread keeps the interpreter from one that waits for it. Beside a large XML-RPC call in a thread the
-loop is 3 ms late (p50) with Python's own 5 ms, and 0.16 ms with this."""
+"""Seconds that a thread keeps the interpreter from one that waits for it. Beside a thread that parses XML the loop is
+3 ms late (p50) with Python's own 5 ms, and 0.16 ms with this."""
 COLLECT_LOOK: Final = 0.25
 """Between two looks how much cyclic garbage there may be."""
-COLLECT_LOOK_AGAIN: Final = 0.05
+COLLECT_LOOK_AGAIN: Final = 0.02
 """The same after a look that found enough: messages on their way are gone by then, and many small portions hold the
 loop for less than a large one."""
-COLLECT_YOUNG: Final = 1000
-"""Objects that came to stay since the last collection, for the next: some 70 µs, and what 140 XML-RPC calls leave."""
-COLLECT_YOUNG_MAX: Final = 20_000
-"""The same where the loop never rests: 1.5 ms, and a few MB."""
-COLLECT_LOAD: Final = 0.5
-"""The share of the time that the loop may work and still count as rested."""
+COLLECT_YOUNG: Final = 300
+"""Objects that came to stay since the last collection, for the next: what 40 XML-RPC calls leave, some 0.1 ms."""
 COLLECT_GROWTH: Final = 50_000
 """Memory blocks by which the heap grew, some 5 MB, for a full collection while no data flows."""
 COLLECT_GROWTH_MAX: Final = 500_000
@@ -120,7 +116,7 @@ GREETING_FORGET: Final = 20.0
 SPREAD_INTERVAL: Final = 0.5
 """News of found peers are gathered this long for those that hear no multicast; the first goes out at once."""
 BEACONS_PER_WAKE: Final = 64
-"""Packets handled before the loop gets its turn again: a flood must not delay data."""
+"""Packets handled, 100 microseconds each with data between them, before the loop gets its turn again."""
 BEACONS_PER_SOURCE: Final = 200
 """Packets a second from one address; a host with twenty agents that all start at once stays below."""
 BEACON_SOURCES_MAX: Final = 1024
