@@ -68,7 +68,7 @@ class Description(msgspec.Struct, frozen=True):
             return f"its publisher names no message type (but {self.type!r})"
         if not _MD5.fullmatch(self.md5):
             return f"its publisher names no md5 sum (but {self.md5!r})"
-        if any(character > "\xff" for character in self.definition):
+        if not self.definition.isascii() and max(self.definition) > "\xff":
             return "its definition has characters that are no bytes"
         return ""
 

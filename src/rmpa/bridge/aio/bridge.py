@@ -7,7 +7,7 @@ import itertools
 import logging
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import actions as act
 from rmpa.bridge.aio.inbound import Inbound
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from rmpa.ros.aio.core import RosCore
 
 _log = logging.getLogger(__name__)
+_ADVERTISE: Final = b'{"op":"advertise"'
 
 
 @dataclass(slots=True)
@@ -86,7 +87,8 @@ class Bridge:
         # Topics of the local graph to look at, advertisements to learn, and what is to be done: each is worked off a
         # little at a time, so that a graph of thousands delays no message.
         self._changed: dict[str, None] = {}
-        self._learning: deque[tuple[int, Iterator[Advertise]]] = deque()
+        self._learning: deque[tuple[Attached, bytes | Iterator[Advertise]]] = deque()
+        self._learning_bytes = 0
         self._actions: deque[act.Action] = deque()
         self._acting = False
         self._mismatches: dict[Source, dict[str, str]] = {}
@@ -173,8 +175,17 @@ class Bridge:
             RemoteProtocolError: It is not a message that belongs here; the link is to be closed.
         """
         attached = self._by_link.get(link)
-        if attached is not None:
+        if attached is None:
+            return
+        if payload[: len(_ADVERTISE)] != _ADVERTISE:
             self._dispatch(attached, decode(payload))
+            return
+        # It takes long to read, and no data waits for it: this is a reader of data, so not now.
+        self._learning.append((attached, bytes(payload)))
+        self._learning_bytes += len(payload)
+        self._schedule()
+        while self._learning_bytes > limits.ADVERTISED_WAITING_BYTES:
+            self._learn(*self._learning.popleft())
 
     def data(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
         """A data frame came: the hot path. One for a route that was closed meanwhile is dropped."""
@@ -193,11 +204,8 @@ class Bridge:
         peer, now = attached.peer, self._loop.time()
         match message:
             case Advertise():
-                if message.added or message.removed:
-                    changes = (len(message.added), len(message.removed))
-                    _log.info("< %s publishes %d more topics, %d less", attached.link.name, *changes)
-                self._learning.append((peer, self._imports.portions(peer, message)))
-                self._schedule()
+                for portion in self._portions(attached, message):
+                    self._act(self._imports.advertised(peer, portion))
             case Open():
                 self._act(self._exports.opened(peer, message))
             case Opened():
@@ -259,18 +267,39 @@ class Bridge:
             self._look_at(topic)
         self._act(self._exports.tell())
         if self._learning:
-            peer, portions = self._learning[0]
-            portion = next(portions, None) if peer in self._by_number else None
-            if portion is None:
-                self._learning.popleft()
-            else:
-                self._act(self._imports.advertised(peer, portion))
+            self._learn(*self._learning.popleft())
         if self._changed or self._learning or self._exports.untold:
             self._schedule()
         elif self._mismatches:
             for source in [s for s in self._mismatches if s not in self._exports.offered]:
                 if not self._imports.knows(source):
                     del self._mismatches[source]
+
+    def _learn(self, attached: Attached, lesson: bytes | Iterator[Advertise]) -> None:
+        """Read an advertisement, or take in the next portion of one that was read."""
+        if isinstance(lesson, bytes):
+            self._learning_bytes -= len(lesson)
+        if attached.peer not in self._by_number:
+            return
+        if isinstance(lesson, bytes):
+            try:
+                message = decode(lesson)
+            except RemoteProtocolError as error:
+                text = f"{attached.link.name} broke the protocol: {error}"
+                self._warn("link.malformed", attached.link.remote_endpoint[0], text)
+                attached.link.abort(text)
+                return
+            if isinstance(message, Advertise):
+                self._learning.appendleft((attached, self._portions(attached, message)))
+        elif (portion := next(lesson, None)) is not None:
+            self._learning.appendleft((attached, lesson))
+            self._act(self._imports.advertised(attached.peer, portion))
+
+    def _portions(self, attached: Attached, message: Advertise) -> Iterator[Advertise]:
+        if message.added or message.removed:
+            changes = (len(message.added), len(message.removed))
+            _log.info("< %s publishes %d more topics, %d less", attached.link.name, *changes)
+        return self._imports.portions(attached.peer, message)
 
     def _look_at(self, topic: str) -> None:
         nodes = {node: uri for node, uri in self._core.publishers(topic).items() if not is_own(node)}
