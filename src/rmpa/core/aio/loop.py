@@ -15,11 +15,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import heapq
 import logging
 import math
 import select
 import selectors
 from collections import deque
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple, cast
 
 if TYPE_CHECKING:
@@ -33,6 +35,8 @@ _EPOLL_RESOLUTION: Final = 1e-3
 _LOOK: Final = 64
 _ITEMS: Final = 64
 """Steps of some work between two breaths, of a microsecond or less each."""
+_RUN: Final = 256
+"""Items that are sorted at once, some 50 microseconds."""
 _T = TypeVar("_T")
 _Ts = TypeVarTuple("_Ts")
 _READ: Final = ~select.EPOLLOUT
@@ -252,6 +256,16 @@ def breathing(items: Iterable[_T], /, every: int = _ITEMS) -> Iterator[_T]:
         if number % every == 0:
             breathe()
         yield item
+
+
+def breathing_sorted(items: Iterable[str]) -> Iterator[str]:
+    """The same as ``sorted`` would give, without its milliseconds for thousands."""
+    rest = iter(items)
+    runs = []
+    while run := sorted(islice(rest, _RUN)):
+        runs.append(run)
+        breathe()
+    return heapq.merge(*runs)
 
 
 class _Turnstile(deque[asyncio.Handle]):
