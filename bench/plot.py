@@ -69,7 +69,8 @@ def lines(image: Path, panels: Mapping[str, Mapping[str, Sequence[tuple[float, f
         panel.plot(samples[::2], samples[1::2], marker="o", label=title, linewidth=1.2)
         panel.set_xscale("log")
         panel.set_xticks(samples[::2], [f"{step:g}" for step in samples[::2]])
-        panel.set_ylim(bottom=0.0)
+        panel.minorticks_off()
+        panel.set_ylim(bottom=0.0, auto=True)  # the next line may be higher
 
     flat = {
         name: {title: [*itertools.chain(*points)] for title, points in series.items()}
