@@ -50,9 +50,10 @@ def tails(image: Path, panels: Mapping[str, Series], unit: str, limit: float | N
     def draw(panel: Panel, title: str, samples: Sequence[float]) -> None:
         values = sorted(samples)
         ranks = [100 - 100 * 10 ** (-step / 20) for step in range(1, 101) if len(values) * 10 ** (-step / 20) >= 10]
-        panel.plot(
-            [1 / (1 - rank / 100) for rank in ranks], [percentile(values, rank) for rank in ranks], label=title
-        )
+        if not ranks:  # too few
+            return
+        rarity = [1 / (1 - rank / 100) for rank in ranks]
+        panel.plot(rarity, [percentile(values, rank) for rank in ranks], label=title, linewidth=1.2)
         panel.set_xscale("log")
         panel.set_yscale("log")
         panel.set_xticks([1 / (1 - tick / 100) for tick in _TICKS], [f"p{tick:g}" for tick in _TICKS])
@@ -99,7 +100,9 @@ def _draw(
         panel.set_title(name)
         panel.grid(visible=True, which="both", alpha=0.2)
     axes[0][0].set_ylabel(unit)
-    axes[0][-1].legend(fontsize=7)
+    drawn = [panel for panel in axes[0] if panel.get_legend_handles_labels()[0]]
+    for panel in drawn[-1:]:
+        panel.legend(fontsize=7)
     figure.tight_layout()
     figure.savefig(image, dpi=110)
     plt.close(figure)
