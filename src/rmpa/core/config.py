@@ -10,6 +10,8 @@ from rmpa.core import limits
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from rmpa.core.contract import Rule
+
 
 @dataclass(frozen=True, slots=True)
 class HostPort:
@@ -41,6 +43,40 @@ class PolicySettings:
 
 
 @dataclass(frozen=True, slots=True)
+class LaneSettings:
+    """How the packets of each lane are marked.
+
+    Args:
+        express_dscp: DSCP of the express lane (RFC 2474), 0 to 63. 48 is CS6: Wi-Fi's voice queue, where EF is video.
+        express_priority: SO_PRIORITY of the express lane, 0 to 6; 6 is the first band of pfifo_fast.
+        bulk_dscp: DSCP of the bulk lane.
+        bulk_priority: SO_PRIORITY of the bulk lane.
+    """
+
+    express_dscp: int = 48
+    express_priority: int = 6
+    bulk_dscp: int = 0
+    bulk_priority: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class RealtimeSettings:
+    """What the agent asks the kernel for; what it does not get, it says.
+
+    Args:
+        enabled: Whether it asks at all (``--realtime``).
+        priority: Of SCHED_FIFO, 1 to 99.
+        cpus: The CPUs to run on; empty: any.
+        lock_memory: Whether its memory stays in RAM (mlockall).
+    """
+
+    enabled: bool = False
+    priority: int = 50
+    cpus: tuple[int, ...] = ()
+    lock_memory: bool = True
+
+
+@dataclass(frozen=True, slots=True)
 class Settings:
     """All settings of one agent.
 
@@ -56,6 +92,9 @@ class Settings:
         group_port: Its port before the domain is added.
         multicast: Whether beacons are sent to the group at all (``ROS_AUTOMATIC_DISCOVERY_RANGE=OFF`` says no).
         policy: What may cross.
+        contracts: What the topics need, in the order of the file (``core.contract.Contracts``).
+        lanes: How the lanes are marked.
+        realtime: What is asked of the kernel.
         log_level: ``debug``, ``info``, ``warning`` or ``error``.
         log_json: One JSON object a line instead of text.
         config_file: Where the file's part came from, if there was a file.
@@ -73,6 +112,9 @@ class Settings:
     group_port: int = limits.MULTICAST_PORT
     multicast: bool = True
     policy: PolicySettings = field(default_factory=PolicySettings)
+    contracts: tuple[Rule, ...] = ()
+    lanes: LaneSettings = field(default_factory=LaneSettings)
+    realtime: RealtimeSettings = field(default_factory=RealtimeSettings)
     log_level: str = "info"
     log_json: bool = False
     config_file: Path | None = None

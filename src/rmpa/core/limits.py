@@ -37,6 +37,8 @@ CONTRACT_RATE_MIN: Final = 0.001
 """Lowest ``max_rate`` in messages a second: one in a quarter of an hour."""
 CONTRACT_RATE_MAX: Final = 1_000_000.0
 """Highest ``max_rate`` in messages a second: more than any topic reaches."""
+CPU_MAX: Final = 1023
+"""Highest number of a CPU that an affinity can name: CPU_SETSIZE less one."""
 
 # --- discovery ------------------------------------------------------------------------------------------------
 MULTICAST_GROUP: Final = "239.255.82.77"
@@ -219,6 +221,19 @@ JOIN_RETRY: Final = 1.0
 """Before an agent whose addresses have changed tries again to take a new place."""
 ACCEPT_PAUSE: Final = 0.5
 """Before accepting again when the process has no file descriptors left."""
+ACK_MESSAGES: Final = 32
+"""Messages of a reliable route that one acknowledgement covers: it costs as much as a message of 64 bytes."""
+ACK_BYTES: Final = 1 * MIB
+"""The same in bytes: with large messages the sender's window is soon full."""
+ACK_DELAY: Final = 0.010
+"""After the first message that was not acknowledged: what a route of few messages keeps in memory for longer."""
+RESUME_WINDOW: Final = 30.0
+"""How long a reliable route's messages are kept after its link fell: a robot drives through a shadow, an access point
+restarts. Whoever is away for longer begins anew."""
+RESUMES_MAX: Final = 1024
+"""Reliable routes that wait for their links: all of one peer with a thousand topics."""
+RESUME_BYTES_MAX: Final = 256 * MIB
+"""Messages kept for them, over all; the route that waited longest is given up first."""
 
 # --- ROS ------------------------------------------------------------------------------------------------------
 TCPROS_HEADER_MAX: Final = 4 * MIB

@@ -10,6 +10,8 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
+from rmpa.bridge.quality import Quality
+
 if TYPE_CHECKING:
     from rmpa.core.aio.stream import Buffer
 
@@ -80,7 +82,7 @@ class ExportFlow:
 class ImportFlow:
     """From one peer's route to the local subscribers of its proxy."""
 
-    __slots__ = ("_expected", "_outlet", "bytes", "last_stamp_ns", "last_wall_ns", "lost", "messages")
+    __slots__ = ("_expected", "_outlet", "bytes", "last_stamp_ns", "last_wall_ns", "lost", "messages", "quality")
 
     def __init__(self, outlet: Outlet) -> None:
         self._outlet = outlet
@@ -90,6 +92,7 @@ class ImportFlow:
         self.lost = 0
         self.last_stamp_ns = 0
         self.last_wall_ns = 0
+        self.quality = Quality()
 
     def message(self, sequence: int, stamp_ns: int, framed: memoryview) -> None:
         """Hand one message on; a gap in the sequence is what the sender's queue dropped."""
@@ -101,3 +104,4 @@ class ImportFlow:
         self.bytes += len(framed)
         self.last_stamp_ns = stamp_ns
         self.last_wall_ns = time.time_ns()
+        self.quality.arrived(time.monotonic(), self.last_wall_ns, stamp_ns, len(framed))

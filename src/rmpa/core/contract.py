@@ -1,0 +1,186 @@
+"""What a topic's messages need, in ROS 2's words, and the rules that say so; written in ``rmpa.toml``.
+
+Both ends of a route have rules. What holds for the route is ``combine`` of the two: see docs/contracts.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from rmpa.core import limits
+from rmpa.core.names import matches
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+_Word = TypeVar("_Word", bound=StrEnum)
+
+
+class Reliability(StrEnum):
+    """Whether messages survive the loss of a link."""
+
+    BEST_EFFORT = "best_effort"
+    RELIABLE = "reliable"
+
+
+class Durability(StrEnum):
+    """Whether a late subscriber gets the last message of each source."""
+
+    VOLATILE = "volatile"
+    TRANSIENT_LOCAL = "transient_local"
+
+
+class History(StrEnum):
+    """Which messages a queue keeps when it is full: the last ``depth``, or all that fit its bytes."""
+
+    KEEP_LAST = "keep_last"
+    KEEP_ALL = "keep_all"
+
+
+class Liveliness(StrEnum):
+    """Who says that a source lives: its link, or its own messages."""
+
+    AUTOMATIC = "automatic"
+    MANUAL_BY_TOPIC = "manual_by_topic"
+
+
+class Priority(StrEnum):
+    """The lane: express, bulk, or (normal) by the size of the messages."""
+
+    HIGH = "high"
+    NORMAL = "normal"
+    LOW = "low"
+
+
+@dataclass(frozen=True, slots=True)
+class Contract:
+    """What one topic's messages need; the defaults are what a topic without any rule gets.
+
+    Args:
+        reliability: Whether messages survive the loss of a link.
+        durability: Whether a late subscriber gets the last message.
+        history: What a full queue keeps.
+        depth: Messages that wait for one slow receiver, at least 1.
+        deadline: Seconds from one message to the next at the most; ``None``: no bound.
+        lifespan: Seconds after which a message is worth nothing and is dropped; ``None``: never.
+        liveliness: Who says that a source lives.
+        liveliness_lease: Seconds without a sign of life after which it does not; ``None``: for ever.
+        priority: The lane.
+        max_rate: Messages a second at the most, of which the newest are kept; ``None``: as they come.
+    """
+
+    reliability: Reliability = Reliability.BEST_EFFORT
+    durability: Durability = Durability.VOLATILE
+    history: History = History.KEEP_LAST
+    depth: int = limits.ROUTE_QUEUE_MESSAGES
+    deadline: float | None = None
+    lifespan: float | None = None
+    liveliness: Liveliness = Liveliness.AUTOMATIC
+    liveliness_lease: float | None = None
+    priority: Priority = Priority.NORMAL
+    max_rate: float | None = None
+
+
+KEYS: Final = tuple(item.name for item in fields(Contract))
+"""The names of a contract's fields, in order."""
+_DEFAULT: Final = Contract()
+_URGENCY: Final = {Priority.NORMAL: 0, Priority.LOW: 1, Priority.HIGH: 2}
+"""Normal says nothing, so that either other word outweighs it."""
+
+
+def combine(offered: Contract, requested: Contract) -> Contract:
+    """What holds for a route: the stronger of the sender's and the receiver's word, key by key.
+
+    Args:
+        offered: The sender's contract for the topic.
+        requested: The receiver's. Its deadline and its liveliness (kind and lease together) hold where it has them:
+            the receiver is who waits.
+    """
+    watched = requested if requested.liveliness_lease is not None else offered
+    return Contract(
+        reliability=_either(offered.reliability, requested.reliability, Reliability.RELIABLE),
+        durability=_either(offered.durability, requested.durability, Durability.TRANSIENT_LOCAL),
+        history=_either(offered.history, requested.history, History.KEEP_ALL),
+        depth=max(offered.depth, requested.depth),
+        deadline=offered.deadline if requested.deadline is None else requested.deadline,
+        lifespan=_smaller(offered.lifespan, requested.lifespan),
+        liveliness=watched.liveliness,
+        liveliness_lease=watched.liveliness_lease,
+        priority=max(offered.priority, requested.priority, key=_URGENCY.__getitem__),
+        max_rate=_smaller(offered.max_rate, requested.max_rate),
+    )
+
+
+def _either(one: _Word, other: _Word, stronger: _Word) -> _Word:
+    return stronger if stronger in (one, other) else one
+
+
+def _smaller(one: float | None, other: float | None) -> float | None:
+    given = [value for value in (one, other) if value is not None]
+    return min(given) if given else None
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """One ``[[contract]]``: what it sets, and for which topics.
+
+    Args:
+        topics: Globs over topics (``core.names.matches``), one of which must fit; empty: any topic.
+        types: Globs over message types, likewise. A rule with both needs both to fit.
+        values: The keys that it sets, named and typed as the fields of ``Contract``.
+    """
+
+    topics: tuple[str, ...]
+    types: tuple[str, ...]
+    values: Mapping[str, object] = field(hash=False)
+
+    def fitting(self, topic: str, type_name: str) -> str | None:
+        """The globs that fit, ready to show (``topics /cmd/**``), or ``None`` where the rule does not apply."""
+        shown = []
+        for key, globs, name in (("topics", self.topics, topic), ("types", self.types, type_name)):
+            if globs:
+                glob = _first(globs, name)
+                if glob is None:
+                    return None
+                shown.append(f"{key} {glob}")
+        return ", ".join(shown) or "every topic"
+
+
+def _first(globs: Iterable[str], name: str) -> str | None:
+    return next((glob for glob in globs if matches(glob, name)), None)
+
+
+class Contracts:
+    """Finds a topic's contract: every rule that fits applies, in order; a later one outweighs key by key.
+
+    Args:
+        rules: In the order of the file.
+    """
+
+    def __init__(self, rules: tuple[Rule, ...] = ()) -> None:
+        self._rules = rules
+        self._known: dict[tuple[str, str], Contract] = {}
+
+    def of(self, topic: str, type_name: str) -> Contract:
+        """The contract of a topic. ``type_name`` may be empty or ``*`` while nobody knows it."""
+        if not self._rules:
+            return _DEFAULT
+        found = self._known.get((topic, type_name))
+        if found is None:
+            values = {key: value for key, (value, _) in self.explain(topic, type_name).items()}
+            found = Contract(**values)  # type: ignore[arg-type] # as Rule.values promises
+            if len(self._known) >= limits.CONTRACTS_REMEMBERED:
+                del self._known[next(iter(self._known))]
+            self._known[topic, type_name] = found
+        return found
+
+    def explain(self, topic: str, type_name: str) -> dict[str, tuple[object, str]]:
+        """Each key's value and where it comes from: ``rule 2: topics /cmd/**`` (counted from 1) or ``default``."""
+        found: dict[str, tuple[object, str]] = {key: (getattr(_DEFAULT, key), "default") for key in KEYS}
+        for number, rule in enumerate(self._rules, 1):
+            fitting = rule.fitting(topic, type_name)
+            if fitting is not None:
+                found |= {key: (value, f"rule {number}: {fitting}") for key, value in rule.values.items()}
+        return found
