@@ -174,6 +174,10 @@ RELIABLE_WINDOW_MESSAGES: Final = 512
 """Reliable messages of one route on their way to a peer and not yet acknowledged."""
 RELIABLE_WINDOW_BYTES: Final = 4 * MIB
 """The same in bytes; one message always fits."""
+KEEP_ALL_MESSAGES: Final = 1_000_000
+"""What "all" means for a contract's history: bytes bound it first."""
+BULK_STALE_AGE: Final = 1.0
+"""The same on the bulk lane: of a topic that a slow link cannot carry, the newest goes."""
 REPLAY_BYTES: Final = 64 * MIB
 """Reliable messages of one route that are kept for a peer, at the most; the oldest is given up beyond it."""
 PING_TIMEOUT: Final = 2.0
