@@ -11,9 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.core import limits
-from rmpa.core.config import HostPort, PolicySettings, Settings
+from rmpa.core.config import HostPort, LaneSettings, PolicySettings, RealtimeSettings, Settings
 from rmpa.core.config_file import known_keys, line_of, parse_config
 from rmpa.core.config_sources import Flags, Loaded, find_config_file, load_settings
+from rmpa.core.contract import Rule
 from rmpa.core.errors import ConfigError
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "rmpa.toml"
@@ -57,7 +58,7 @@ def test_the_example_says_the_defaults(load: Load) -> None:
 
 
 def test_the_example_shows_every_key_and_its_commented_lines_load() -> None:
-    lines = EXAMPLE.read_text().split("\n")
+    lines = EXAMPLE.read_text().partition("# [[contract]]")[0].split("\n")
     shown = [line.removeprefix("# ") if line.startswith("# ") and " = " in line else line for line in lines]
     # A commented alternative takes the place of the default above it.
     kept: dict[tuple[str, str], str] = {}
@@ -69,7 +70,7 @@ def test_the_example_shows_every_key_and_its_commented_lines_load() -> None:
     text = ""
     for name in dict.fromkeys(t for t, _ in kept):
         text += name + "\n" + "\n".join(line for (t, _), line in kept.items() if t == name) + "\n"
-    assert set(parse_config(text.encode(), None)) == set(known_keys())
+    assert set(parse_config(text.encode(), None)) == set(known_keys()) - {("contract",)}
 
 
 def test_each_source_outweighs_the_one_before(load: Load) -> None:
@@ -103,6 +104,19 @@ allow = ["/cmd/**"]
 deny = ["/cmd/secret"]
 allow_types = ["sensor_msgs/*"]
 deny_types = ["sensor_msgs/Image"]
+[[contract]]
+topics = ["/cmd/**"]
+depth = 1
+[lanes]
+express_dscp = 46
+express_priority = 5
+bulk_dscp = 8
+bulk_priority = 1
+[realtime]
+enabled = true
+priority = 80
+cpus = [1, 3]
+lock_memory = false
 [log]
 level = "debug"
 json = true
@@ -119,6 +133,9 @@ json = true
         group="239.1.2.3",
         group_port=5000,
         policy=PolicySettings(("/cmd/**",), ("/cmd/secret",), ("sensor_msgs/*",), ("sensor_msgs/Image",)),
+        contracts=(Rule(("/cmd/**",), (), {"depth": 1}),),
+        lanes=LaneSettings(46, 5, 8, 1),
+        realtime=RealtimeSettings(True, 80, (1, 3), False),
         log_level="debug",
         log_json=True,
         config_file=settings.config_file,
@@ -126,7 +143,7 @@ json = true
 
 
 def test_every_flag(load: Load) -> None:
-    flags = Flags("a", "localhost", "1", "2", "3", ("lo", "eth0"), ("h:1",), "off", None, "error", True)
+    flags = Flags("a", "localhost", "1", "2", "3", ("lo", "eth0"), ("h:1",), "off", None, "error", True, True)
     settings = load(flags=flags).settings
     assert settings == Settings(
         name="a",
@@ -139,6 +156,7 @@ def test_every_flag(load: Load) -> None:
         multicast=False,
         log_level="error",
         log_json=True,
+        realtime=RealtimeSettings(True),
     )
 
 
@@ -156,6 +174,14 @@ def test_every_variable(load: Load) -> None:
         "RMPA_DENY": "/c",
         "RMPA_ALLOW_TYPES": "std_msgs/*",
         "RMPA_DENY_TYPES": "std_msgs/Header",
+        "RMPA_EXPRESS_DSCP": "46",
+        "RMPA_EXPRESS_PRIORITY": "5",
+        "RMPA_BULK_DSCP": "8",
+        "RMPA_BULK_PRIORITY": "1",
+        "RMPA_REALTIME": "1",
+        "RMPA_REALTIME_PRIORITY": "80",
+        "RMPA_REALTIME_CPUS": "1, 3",
+        "RMPA_REALTIME_LOCK_MEMORY": "no",
         "RMPA_LOG_LEVEL": "WARNING",
         "RMPA_LOG_JSON": "yes",
         "RMPA_RUNTIME_DIR": "/run/x",
@@ -173,6 +199,8 @@ def test_every_variable(load: Load) -> None:
         seeds=(HostPort("h", 1), HostPort("10.0.0.1")),
         group="239.0.0.1",
         policy=PolicySettings(("/a", "/b/**"), ("/c",), ("std_msgs/*",), ("std_msgs/Header",)),
+        lanes=LaneSettings(46, 5, 8, 1),
+        realtime=RealtimeSettings(True, 80, (1, 3), False),
         log_level="warning",
         log_json=True,
         runtime_dir="/run/x",
@@ -248,7 +276,7 @@ def test_what_is_ignored_is_noted(load: Load, environ: dict[str, str], note: str
             ),
         ),
         ('[discovery]\nseeds = ["a",\n1]', "rmpa.toml:3: discovery.seeds: 1 is not a text in quotes"),
-        ('[discovery]\nseeds = ["a:1", "a:1"]', "rmpa.toml:2: discovery.seeds: 'a:1' stands there twice; delete one"),
+        ('[discovery]\nseeds = ["a:1", "a:1"]', "rmpa.toml:2: discovery.seeds: 'a:1' stands there twice; delete on"),
         ('[discovery]\nseeds = ["fe80::1"]', "rmpa.toml:2: discovery.seeds: 'fe80::1' is not HOST:PORT"),
         (
             '[discovery]\nmulticast = "10.0.0.1:5"',
@@ -280,6 +308,29 @@ def test_what_is_ignored_is_noted(load: Load, environ: dict[str, str], note: str
             ),
         ),
         ('[log]\nlevel = "wran"', "rmpa.toml:2: log.level: 'wran' is not a log level; the levels are debug, info, "),
+        (
+            "[lanes]\nexpress_priority = 7",
+            "rmpa.toml:2: lanes.express_priority: 7 is out of range; SO_PRIORITY without CAP_NET_ADMIN is between 0",
+        ),
+        (
+            "[lanes]\nbulk_dscp = 64",
+            "rmpa.toml:2: lanes.bulk_dscp: 64 is out of range; a DSCP (the TOS byte / 4; CS6 is",
+        ),
+        (
+            "[lanes]\nexpres_dscp = 1",
+            "rmpa.toml:2: lanes.expres_dscp: an unknown key; did you mean lanes.express_dscp?",
+        ),
+        (
+            "[realtime]\npriority = 0",
+            "rmpa.toml:2: realtime.priority: 0 is out of range; a priority of SCHED_FIFO is be",
+        ),
+        (
+            "[realtime]\ncpus = [0,\n-1]",
+            "rmpa.toml:3: realtime.cpus: -1 is out of range; the number of a CPU is betwee",
+        ),
+        ("[realtime]\ncpus = [1, 1]", "rmpa.toml:2: realtime.cpus: 1 stands there twice; delete one of them"),
+        ("[realtime]\nenable = true", "rmpa.toml:2: realtime.enable: an unknown key; did you mean realtime.enabled"),
+        ('[bridge]\nallow = "/a"', "rmpa.toml:2: bridge.allow: '/a' is not a list; did you mean [\"/a\"]?"),
         ("name = robot", 'rmpa.toml:1: the file: not TOML: Invalid value; texts need quotes: "robot"'),
         ("a = 1\na = 2", "rmpa.toml:2: the file: not TOML: Cannot overwrite a value"),
         ("name: robot", "rmpa.toml:1: the file: not TOML"),
@@ -290,6 +341,14 @@ def test_what_is_ignored_is_noted(load: Load, environ: dict[str, str], note: str
 )
 def test_each_mistake_in_the_file_names_file_line_and_key(refuse: Refuse, text: str, message: str) -> None:
     assert refuse(text).startswith(message)
+
+
+def test_a_flag_outweighs_realtime_of_the_variable_and_of_the_file(load: Load) -> None:
+    text = "[realtime]\nenabled = true\npriority = 7"
+    assert load(text).settings.realtime == RealtimeSettings(True, 7)
+    assert load(text, environ={"RMPA_REALTIME": "0"}).settings.realtime == RealtimeSettings(False, 7)
+    flags = Flags(realtime=False)
+    assert load(text, environ={"RMPA_REALTIME": "1"}, flags=flags).settings.realtime == RealtimeSettings(False, 7)
 
 
 def test_a_mistake_in_the_file_is_told_even_where_a_flag_outweighs_it(refuse: Refuse) -> None:
@@ -316,7 +375,7 @@ def test_a_mistake_in_the_file_is_told_even_where_a_flag_outweighs_it(refuse: Re
         (Flags(seeds=("a:0",)), "--seed: 'a:0' is not HOST:PORT: 0 is out of range"),
         (Flags(seeds=("a b",)), "--seed: 'a b' is not a host name"),
         (Flags(interfaces=("wlan 0",)), "--interface: 'wlan 0' is not the name of a network interface"),
-        (Flags(multicast="239.0.0.1:65500", domain="100"), "--multicast: port 65500 plus domain 100 is beyond 65535"),
+        (Flags(multicast="239.0.0.1:65500", domain="100"), "--multicast: port 65500 plus domain 100 is beyond 6553"),
         (Flags(log_level="loud"), "--log-level: 'loud' is not a log level"),
         (Flags(config="/no/such.toml"), "--config: /no/such.toml: no such file"),
         (Flags(config="/"), "--config: /: is a directory"),

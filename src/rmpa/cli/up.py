@@ -26,6 +26,7 @@ Examples:
   rmpa up --name base --interface wlan0   on one interface only
   rmpa up --seed 10.8.0.5:40001           greet an agent that multicast does not reach
   rmpa up --name b2 --core-port 11312     a second agent on this machine
+  rmpa up --realtime                      punctual on a busy machine; the log says what was not granted
 """
 
 
@@ -45,6 +46,11 @@ Examples:
 @click.option("--config", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")
 @click.option("--log-level", metavar="LEVEL", help=f"{', '.join(LOG_LEVELS)}. [default: info]")
 @click.option("--log-json", is_flag=True, default=None, help="Log one JSON object a line.")
+@click.option(
+    "--realtime/--no-realtime",
+    default=None,
+    help="Ask for SCHED_FIFO, locked memory and the CPUs of [realtime] in rmpa.toml. [default: no]",
+)
 def up(
     name: str | None,
     core_port: str | None,
@@ -57,9 +63,23 @@ def up(
     config: str | None,
     log_level: str | None,
     log_json: bool | None,
+    realtime: bool | None,
 ) -> int:
     """Run this machine's agent: ROS core, discovery, mesh and bridge."""
-    flags = Flags(name, core_host, core_port, port, domain, interfaces, seeds, multicast, config, log_level, log_json)
+    flags = Flags(
+        name,
+        core_host,
+        core_port,
+        port,
+        domain,
+        interfaces,
+        seeds,
+        multicast,
+        config,
+        log_level,
+        log_json,
+        realtime,
+    )
     loaded = load_settings(flags, os.environ, host_name=socket.gethostname())
     configure_logging(loaded.settings.log_level, sys.stderr, as_json=loaded.settings.log_json)
     for note in loaded.notes:

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 Key = tuple[str, ...]
+"""A key of the file: ``("core", "port")``."""
+Place = tuple[str | int, ...]
+"""A key, or what is below it: ``("contract", 1, "topics", 0)``."""
 _AT_LINE: Final = re.compile(r" \(at line (\d+), column \d+\)$")
 _AT_PATH: Final = re.compile(r" - at `\$\.?([^`]*)`$")
 _TYPES: Final = {
@@ -64,6 +67,41 @@ class BridgeTable(_Table, kw_only=True):
     deny_types: list[str] | UnsetType = UNSET
 
 
+class ContractTable(_Table, kw_only=True):
+    """``[[contract]]``: what the topics of one rule need; ``core.config_contract`` reads the values."""
+
+    topics: list[str] | UnsetType = UNSET
+    types: list[str] | UnsetType = UNSET
+    reliability: str | UnsetType = UNSET
+    durability: str | UnsetType = UNSET
+    history: str | UnsetType = UNSET
+    depth: int | UnsetType = UNSET
+    deadline: object | UnsetType = UNSET
+    lifespan: object | UnsetType = UNSET
+    liveliness: str | UnsetType = UNSET
+    liveliness_lease_duration: object | UnsetType = UNSET
+    priority: str | UnsetType = UNSET
+    max_rate: object | UnsetType = UNSET
+
+
+class LanesTable(_Table, kw_only=True):
+    """``[lanes]``: how the packets of each lane are marked."""
+
+    express_dscp: int | UnsetType = UNSET
+    express_priority: int | UnsetType = UNSET
+    bulk_dscp: int | UnsetType = UNSET
+    bulk_priority: int | UnsetType = UNSET
+
+
+class RealtimeTable(_Table, kw_only=True):
+    """``[realtime]``: what is asked of the kernel."""
+
+    enabled: bool | UnsetType = UNSET
+    priority: int | UnsetType = UNSET
+    cpus: list[int] | UnsetType = UNSET
+    lock_memory: bool | UnsetType = UNSET
+
+
 class LogTable(_Table, kw_only=True):
     """``[log]``: what is written about it."""
 
@@ -80,6 +118,9 @@ class ConfigFile(_Table, kw_only=True):
     mesh: MeshTable = msgspec.field(default_factory=MeshTable)
     discovery: DiscoveryTable = msgspec.field(default_factory=DiscoveryTable)
     bridge: BridgeTable = msgspec.field(default_factory=BridgeTable)
+    contract: list[ContractTable] | UnsetType = UNSET
+    lanes: LanesTable = msgspec.field(default_factory=LanesTable)
+    realtime: RealtimeTable = msgspec.field(default_factory=RealtimeTable)
     log: LogTable = msgspec.field(default_factory=LogTable)
 
 
@@ -93,11 +134,18 @@ def _keys(table: type[msgspec.Struct]) -> dict[str, type[msgspec.Struct] | None]
 
 
 def known_keys() -> list[Key]:
-    """Every key that a file may have: ``("name",)``, ``("core", "port")`` and so on."""
+    """Every key that a file may have: ``("name",)``, ``("core", "port")`` and so on.
+
+    ``("contract",)`` is one: its value is the list of all ``[[contract]]``, each a dict of ``CONTRACT_KEYS``.
+    """
     found: list[Key] = []
     for name, table in _keys(ConfigFile).items():
         found += [(name,)] if table is None else [(name, inner) for inner in _keys(table)]
     return found
+
+
+CONTRACT_KEYS: Final = tuple(_keys(ContractTable))
+"""What a ``[[contract]]`` may have."""
 
 
 def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
@@ -123,9 +171,9 @@ def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
         line = data.count(b"\n", 0, error.start) + 1
         raise ConfigError("the file", "not UTF-8 text", "save it as UTF-8", path, line) from None
     table = _parse_toml(text, path)
-    for key, suggestion in _unknown(table):
-        what = "an unknown table" if isinstance(_at(table, key), dict) else "an unknown key"
-        raise ConfigError(".".join(key), what, suggestion, path, line_of(text, key))
+    for place, suggestion in _unknown(table):
+        what = "an unknown table" if isinstance(_at(table, place), dict) else "an unknown key"
+        raise ConfigError(dotted(place), what, suggestion, path, line_of(text, place))
     try:
         parsed = msgspec.convert(table, ConfigFile)
     except msgspec.ValidationError as error:
@@ -137,7 +185,14 @@ def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
             value = getattr(value, part)
         if value is not UNSET:
             found[key] = value
+    if parsed.contract is not UNSET:
+        found["contract",] = [_written(table) for table in parsed.contract]
     return found
+
+
+def _written(contract: ContractTable) -> dict[str, object]:
+    values = {key: getattr(contract, key) for key in CONTRACT_KEYS}
+    return {key: value for key, value in values.items() if value is not UNSET}
 
 
 def _parse_toml(text: str, path: Path | None) -> dict[str, Any]:
@@ -164,30 +219,42 @@ def _toml_remedy(text: str, line: int) -> str:
     return ""
 
 
-def _unknown(table: dict[str, Any]) -> Iterator[tuple[Key, str]]:
+def dotted(place: Place) -> str:
+    """A place as a user reads it, without the indices: the line says which one."""
+    return ".".join(part for part in place if isinstance(part, str))
+
+
+def _unknown(table: dict[str, Any]) -> Iterator[tuple[Place, str]]:
     """Unknown keys, each with what was probably meant."""
-    everywhere = known_keys()
+    everywhere = [key for key in known_keys() if key != ("contract",)]
+    everywhere += [("contract", key) for key in CONTRACT_KEYS]
     tables = _keys(ConfigFile)
     for name, value in table.items():
         if name not in tables:
             yield (name,), _meant(name, (), everywhere, list(tables))
-        struct = tables.get(name)
-        if struct is None or not isinstance(value, dict):
-            continue
-        inner = list(_keys(struct))
-        for key in value:
-            if key not in inner:
-                yield (name, key), _meant(key, (name,), everywhere, inner)
+        for place, inside, inner in _inside(name, value, tables.get(name)):
+            for key in inside:
+                if key not in inner:
+                    yield (*place, key), _meant(key, (name,), everywhere, inner)
+
+
+def _inside(name: str, value: object, struct: type[msgspec.Struct] | None) -> Iterator[tuple[Place, Any, list[str]]]:
+    """The tables below one key of the file, each with its place and the keys that it may have."""
+    if struct is not None and isinstance(value, dict):
+        yield (name,), value, list(_keys(struct))
+    if name == "contract":
+        for index, element in enumerate(value if isinstance(value, list) else ()):
+            if isinstance(element, dict):
+                yield (name, index), element, list(CONTRACT_KEYS)
 
 
 def _meant(word: str, table: Key, everywhere: list[Key], here: list[str]) -> str:
+    homes = [key for key in everywhere if key[-1] == word]
     near = did_you_mean(word, here)
-    if near is not None:
+    if near is not None and (table or not homes):
         return f"did you mean {'.'.join((*table, near))}?"
-    for key in everywhere:
-        if key[-1] == word:
-            home = f"in [{key[0]}]" if len(key) > 1 else "above the first table"
-            return f"{word} belongs {home}"
+    if homes:
+        return f"{word} belongs {_home(homes[0])}"
     near = did_you_mean(word, [key[-1] for key in everywhere])
     if near is not None:
         key = next(key for key in everywhere if key[-1] == near)
@@ -195,18 +262,28 @@ def _meant(word: str, table: Key, everywhere: list[Key], here: list[str]) -> str
     return f"known here: {', '.join(here)}"
 
 
+def _home(key: Key) -> str:
+    if len(key) == 1:
+        return "above the first table"
+    return "in a [[contract]]" if key[0] == "contract" else f"in [{key[0]}]"
+
+
 def _wrong_type(error: msgspec.ValidationError, table: dict[str, Any], text: str, path: Path | None) -> ConfigError:
     message = str(error)
     match = _AT_PATH.search(message)
-    key: tuple[str | int, ...] = ()
+    place: Place = ()
     if match:
-        key = tuple(int(part) if part.isdecimal() else part for part in re.findall(r"[^.\[\]]+", match[1]))
-    value = _at(table, key)
+        place = tuple(int(part) if part.isdecimal() else part for part in re.findall(r"[^.\[\]]+", match[1]))
+    value = _at(table, place)
     expected = re.search(r"Expected `([^`]*)`", message)
     wanted = " or ".join(_TYPES.get(t, t) for t in (expected[1].split(" | ") if expected else []))
-    source = ".".join(part for part in key if isinstance(part, str))
     problem = f"{_shown(value)} is not {wanted}" if wanted else message
-    return ConfigError(source or "the file", problem, "", path, line_of(text, key))
+    remedy = ""
+    if place == ("contract",) and isinstance(value, dict):
+        problem, remedy = "one table, where a list of them is expected", "write [[contract]], in two brackets"
+    elif expected and expected[1] == "array" and isinstance(value, str):
+        remedy = f'did you mean ["{value}"]?'
+    return ConfigError(dotted(place) or "the file", problem, remedy, path, line_of(text, place))
 
 
 def _shown(value: object) -> str:
@@ -224,14 +301,13 @@ def _at(table: object, key: Sequence[str | int]) -> object:
     return table
 
 
-def line_of(text: str, key: Sequence[str | int]) -> int | None:
-    """The line, from 1, on which a key's statement begins in a valid TOML text.
+def line_of(text: str, place: Place) -> int | None:
+    """The line, from 1, on which what is at a place begins in a valid TOML text.
 
     ``tomllib`` does not tell. A prefix of whole lines parses exactly where no statement is open, so the first
-    prefix that has the key ends with its statement, and the one before that shows where it begins. Where the
-    last part of ``key`` is an index, the line of that element of a list.
+    prefix that has the place ends with its statement, and the one before that shows where it begins. An element of
+    a list is looked for within its statement.
     """
-    names = [part for part in key if isinstance(part, str)]
     lines = text.split("\n")
     begin = 0
     for end in range(1, len(lines) + 1):
@@ -239,15 +315,20 @@ def line_of(text: str, key: Sequence[str | int]) -> int | None:
             table = tomllib.loads("\n".join(lines[:end]))
         except (ValueError, RecursionError):
             continue
-        if _at(table, names) is not None:
-            last = key[-1] if key else None
-            return _element_line(lines, begin, end, last) if isinstance(last, int) else begin + 1
+        if _at(table, place) is not None:
+            return _element_line(lines, begin, end, place)
         begin = end
     return None
 
 
-def _element_line(lines: list[str], begin: int, end: int, index: int) -> int:
-    """The line of one element of the list that is written between two lines."""
+def _element_line(lines: list[str], begin: int, end: int, place: Place) -> int:
+    """The line of a place in the statement between two lines: not its first only for an element of a list."""
+    if begin + 1 == end:
+        return end
+    inline = _at(tomllib.loads("\n".join(lines[begin:end])), place) is not None
+    indices = [part for part in (place if inline else place[-1:]) if isinstance(part, int)]
+    if not indices:
+        return begin + 1
     for stop in range(begin + 1, end):
         try:
             value: object = tomllib.loads("\n".join(lines[begin:stop]) + "\n]")
@@ -255,6 +336,6 @@ def _element_line(lines: list[str], begin: int, end: int, index: int) -> int:
             continue
         while isinstance(value, dict) and value:
             value = next(iter(value.values()))
-        if isinstance(value, list) and len(value) > index:
+        if isinstance(value, list) and len(value) > indices[0]:
             return stop
     return end

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
 from rmpa.core import config_values as values
-from rmpa.core.config import PolicySettings, Settings
-from rmpa.core.config_file import Key, line_of, parse_config
+from rmpa.core.config import LaneSettings, PolicySettings, RealtimeSettings, Settings
+from rmpa.core.config_contract import ContractRules, read_contracts
+from rmpa.core.config_file import Key, Place, dotted, line_of, parse_config
 from rmpa.core.config_values import BadValue, Multicast
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import peer_name_from
@@ -44,6 +45,7 @@ class Flags:
     config: str | None = None
     log_level: str | None = None
     log_json: bool | None = None
+    realtime: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,11 +88,20 @@ _OPTIONS: Final[Mapping[str, _Option]] = {
     "deny": _Option(_list_of(values.read_topic_glob), ("bridge", "deny"), "RMPA_DENY"),
     "allow_types": _Option(_list_of(values.read_type_glob), ("bridge", "allow_types"), "RMPA_ALLOW_TYPES"),
     "deny_types": _Option(_list_of(values.read_type_glob), ("bridge", "deny_types"), "RMPA_DENY_TYPES"),
+    "contracts": _Option(read_contracts, ("contract",)),
+    "express_dscp": _Option(values.read_dscp, ("lanes", "express_dscp"), "RMPA_EXPRESS_DSCP"),
+    "express_priority": _Option(values.read_packet_priority, ("lanes", "express_priority"), "RMPA_EXPRESS_PRIORITY"),
+    "bulk_dscp": _Option(values.read_dscp, ("lanes", "bulk_dscp"), "RMPA_BULK_DSCP"),
+    "bulk_priority": _Option(values.read_packet_priority, ("lanes", "bulk_priority"), "RMPA_BULK_PRIORITY"),
+    "realtime": _Option(values.read_bool, ("realtime", "enabled"), "RMPA_REALTIME", "--realtime", "realtime"),
+    "realtime_priority": _Option(values.read_realtime_priority, ("realtime", "priority"), "RMPA_REALTIME_PRIORITY"),
+    "realtime_cpus": _Option(_list_of(values.read_cpu), ("realtime", "cpus"), "RMPA_REALTIME_CPUS"),
+    "lock_memory": _Option(values.read_bool, ("realtime", "lock_memory"), "RMPA_REALTIME_LOCK_MEMORY"),
     "log_level": _Option(values.read_level, ("log", "level"), "RMPA_LOG_LEVEL", "--log-level", "log_level"),
     "log_json": _Option(values.read_bool, ("log", "json"), "RMPA_LOG_JSON", "--log-json", "log_json"),
     "runtime_dir": _Option(values.read_text, variable="RMPA_RUNTIME_DIR"),
 }
-VARIABLES: Final = ("RMPA_CONFIG", "RMPA_AGENT", *(o.variable for o in _OPTIONS.values()))
+VARIABLES: Final = ("RMPA_CONFIG", "RMPA_AGENT", *(o.variable for o in _OPTIONS.values() if o.variable))
 """Every variable of ours."""
 
 
@@ -113,10 +124,14 @@ class _Given:
             if error.better is not None:
                 remedy = f"{remedy}; " if remedy else ""
                 remedy += f"did you mean {self._written(error.better)}?"
-            line = None
-            if self.path is not None:
-                line = line_of(self.text, self.key if error.index is None else (*self.key, error.index))
-            raise ConfigError(self.source, error.problem, remedy, self.path, line) from None
+            raise self.error(error.problem, remedy, error.at) from None
+
+    def error(self, problem: str, remedy: str, at: Place) -> ConfigError:
+        """The error that says where it was written; ``at`` is the place inside of the value."""
+        if self.path is None:
+            return ConfigError(self.source, problem, remedy)
+        place = (*self.key, *at)
+        return ConfigError(dotted(place), problem, remedy, self.path, line_of(self.text, place))
 
     def _written(self, value: str) -> str:
         if self.path is not None:
@@ -156,7 +171,10 @@ def load_settings(
         strongest |= layer
     chosen = {name: given.read(_OPTIONS[name]) for name, given in strongest.items()}
     chosen.setdefault("name", peer_name_from(host_name))
-    settings = _assemble(chosen, path)
+    rules = chosen.pop("contracts", ContractRules())
+    assert isinstance(rules, ContractRules)  # noqa: S101 - what its reader returns
+    notes += [str(strongest["contracts"].error(doubt.text, "", doubt.at)) for doubt in rules.doubts]
+    settings = _assemble(chosen, rules, path)
     if settings.discovery_port > 65535:
         source = strongest["multicast"].source if "multicast" in strongest else "domain"
         problem = f"port {settings.group_port} plus domain {settings.domain} is beyond 65535"
@@ -185,16 +203,39 @@ def find_config_file(flag: str | None, environ: Mapping[str, str], cwd: Path) ->
     return next((place for place in places if place.is_file()), None)
 
 
-def _assemble(chosen: dict[str, object], path: Path | None) -> Settings:
+_GROUPS: Final[Mapping[str, tuple[Callable[..., object], Mapping[str, str]]]] = {
+    "policy": (PolicySettings, {key: key for key in ("allow", "deny", "allow_types", "deny_types")}),
+    "lanes": (
+        LaneSettings,
+        {key: key for key in ("express_dscp", "express_priority", "bulk_dscp", "bulk_priority")},
+    ),
+    "realtime": (
+        RealtimeSettings,
+        {
+            "realtime": "enabled",
+            "realtime_priority": "priority",
+            "realtime_cpus": "cpus",
+            "lock_memory": "lock_memory",
+        },
+    ),
+}
+"""Settings within settings: their class, and their fields by the names of ``_OPTIONS``."""
+
+
+def _assemble(chosen: dict[str, object], rules: ContractRules, path: Path | None) -> Settings:
     multicast = chosen.pop("multicast", Multicast())
     assert isinstance(multicast, Multicast)  # noqa: S101 - what its reader returns
-    policy = {key: chosen.pop(key) for key in ("allow", "deny", "allow_types", "deny_types") if key in chosen}
+    groups = {
+        group: settings(**{name: chosen.pop(option) for option, name in names.items() if option in chosen})
+        for group, (settings, names) in _GROUPS.items()
+    }
     return Settings(
         **chosen,  # type: ignore[arg-type] # each value came from the reader that its name has in _OPTIONS
+        **groups,  # type: ignore[arg-type] # likewise
+        contracts=rules.rules,
         group=multicast.group,
         group_port=multicast.port,
         multicast=multicast.enabled,
-        policy=PolicySettings(**policy),  # type: ignore[arg-type] # likewise
         config_file=path,
     )
 

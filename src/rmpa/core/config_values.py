@@ -45,13 +45,13 @@ class BadValue(ValueError):  # noqa: N818 - it becomes a ConfigError, which is t
         problem: What is wrong with it.
         remedy: What to do, as a sentence part; may be empty.
         better: The value that was probably meant, if there is one.
-        index: Which element of a list it is about.
+        at: What inside of the setting it is about: the index of a list's element, a key of a table, both.
     """
 
     problem: str
     remedy: str = ""
     better: str | None = None
-    index: int | None = None
+    at: tuple[str | int, ...] = ()
 
     def __str__(self) -> str:
         """The problem alone."""
@@ -93,7 +93,8 @@ def read_bool(raw: object) -> bool:
     return value
 
 
-def _read_int(raw: object, low: int, high: int, what: str) -> int:
+def read_whole(raw: object, low: int, high: int, what: str) -> int:
+    """A whole number between two bounds; ``what`` names it with its article, for the text of errors."""
     text = str(raw).strip()
     # ASCII alone: int() would also take "1_0" and digits of other scripts; nine digits bound its cost.
     if isinstance(raw, bool) or not re.fullmatch(r"-?[0-9]{1,9}", text):
@@ -106,17 +107,37 @@ def _read_int(raw: object, low: int, high: int, what: str) -> int:
 
 def read_domain(raw: object) -> int:
     """A domain id."""
-    return _read_int(raw, 0, limits.DOMAIN_MAX, "a domain id")
+    return read_whole(raw, 0, limits.DOMAIN_MAX, "a domain id")
 
 
 def read_port(raw: object) -> int:
     """A TCP or UDP port that can be named."""
-    return _read_int(raw, 1, 65535, "a port")
+    return read_whole(raw, 1, 65535, "a port")
 
 
 def read_port_or_any(raw: object) -> int:
     """A port, or 0: the system chooses one."""
-    return _read_int(raw, 0, 65535, "a port (0: any)")
+    return read_whole(raw, 0, 65535, "a port (0: any)")
+
+
+def read_dscp(raw: object) -> int:
+    """A DSCP, the upper six bits of IP's TOS."""
+    return read_whole(raw, 0, 63, "a DSCP (the TOS byte / 4; CS6 is 48)")
+
+
+def read_packet_priority(raw: object) -> int:
+    """An SO_PRIORITY that a user may set."""
+    return read_whole(raw, 0, 6, "SO_PRIORITY without CAP_NET_ADMIN")
+
+
+def read_realtime_priority(raw: object) -> int:
+    """A priority of SCHED_FIFO."""
+    return read_whole(raw, 1, 99, "a priority of SCHED_FIFO")
+
+
+def read_cpu(raw: object) -> int:
+    """The number of a CPU; whether it is there is only known while running."""
+    return read_whole(raw, 0, limits.CPU_MAX, "the number of a CPU")
 
 
 def read_level(raw: object) -> str:
@@ -236,9 +257,9 @@ def read_list(raw: object, item: Callable[[object], _T]) -> tuple[_T, ...]:
         try:
             value = item(element)
         except BadValue as error:
-            error.index = index
+            error.at = (index, *error.at)
             raise
         if value in found:
-            raise BadValue(f"{element!r} stands there twice", "delete one of them", index=index)
+            raise BadValue(f"{element!r} stands there twice", "delete one of them", at=(index,))
         found.append(value)
     return tuple(found)

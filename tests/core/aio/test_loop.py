@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core.aio.loop import AgentLoop, DirectSelector
+from rmpa.core.aio.loop import AgentLoop, DirectSelector, breathe
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Iterator
@@ -195,3 +195,119 @@ def test_a_peer_that_hangs_up_is_a_read(pair: tuple[socket.socket, socket.socket
         loop.remove_reader(one.fileno())
 
     run(main())
+
+
+def test_data_goes_before_every_ordinary_callback(pair: tuple[socket.socket, socket.socket]) -> None:
+    one, other = pair
+
+    async def main() -> None:
+        loop = agent_loop()
+        order: list[str] = []
+        loop.add_direct_reader(one.fileno(), lambda: order.append(one.recv(100).decode()))
+
+        def work(index: int) -> None:
+            order.append(f"work {index}")
+            other.send(f"data {index}".encode())
+
+        ended = asyncio.Event()
+        for index in range(3):
+            loop.call_soon(work, index)
+        loop.call_soon(ended.set)
+        await ended.wait()
+        assert order == ["work 0", "data 0", "work 1", "data 1", "work 2", "data 2"]
+        loop.remove_reader(one.fileno())
+
+    run(main())
+
+
+def test_work_that_breathes_lets_data_go_first(pair: tuple[socket.socket, socket.socket]) -> None:
+    one, other = pair
+
+    async def main() -> None:
+        loop = agent_loop()
+        got: list[bytes] = []
+        loop.add_direct_reader(one.fileno(), lambda: got.append(one.recv(100)))
+        for index in range(3):
+            other.send(b"a")
+            assert len(got) == index
+            breathe()
+            assert len(got) == index + 1
+        loop.remove_reader(one.fileno())
+        other.send(b"a")
+        breathe()
+        assert len(got) == 3
+
+    run(main())
+
+
+def test_a_reader_that_breathes_is_not_called_within_itself(pair: tuple[socket.socket, socket.socket]) -> None:
+    one, other = pair
+
+    async def main() -> None:
+        loop = agent_loop()
+        inside: list[int] = []
+        ended = asyncio.Event()
+
+        def read() -> None:
+            one.recv(1)
+            inside.append(1)
+            breathe()
+            assert len(inside) == 1
+            inside.pop()
+            if one.recv(1, socket.MSG_PEEK) == b"z":
+                ended.set()
+                loop.remove_reader(one.fileno())
+
+        loop.add_direct_reader(one.fileno(), read)
+        other.send(b"abz")
+        await ended.wait()
+
+    run(main())
+
+
+def test_a_writer_of_a_direct_reader_is_called_in_between_too(pair: tuple[socket.socket, socket.socket]) -> None:
+    one, _ = pair
+
+    async def main() -> None:
+        loop = agent_loop()
+        written: list[str] = []
+        loop.add_direct_reader(one.fileno(), lambda: written.append("read"))
+        loop.add_writer(one.fileno(), written.append, "a")
+        breathe()
+        breathe()
+        assert written == ["a", "a"]
+        loop.remove_writer(one.fileno())
+        breathe()
+        assert written == ["a", "a"]
+        loop.add_writer(one.fileno(), written.append, "b")
+        loop.remove_reader(one.fileno())
+        breathe()
+        assert written == ["a", "a"]
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        assert "b" in written
+        loop.remove_writer(one.fileno())
+
+    run(main())
+
+
+def test_a_socket_that_was_closed_first_is_forgotten(pair: tuple[socket.socket, socket.socket]) -> None:
+    one, _ = pair
+
+    async def main() -> None:
+        loop = agent_loop()
+        number = one.fileno()
+        loop.add_direct_reader(number, lambda: None)
+        one.close()
+        loop.remove_reader(number)
+        breathe()
+
+    run(main())
+
+
+def test_breathing_elsewhere_does_nothing() -> None:
+    async def main() -> None:
+        breathe()
+
+    breathe()
+    asyncio.run(main())

@@ -2,46 +2,73 @@
 
 asyncio takes an event from the selector, finds its handle, queues it, looks at its timers, and runs the handle in
 its context. For a message that is to be handed on at once this is a fifth of what the interpreter does. Here the
-selector itself calls the readers of the data path as soon as ``epoll`` names them, and reports everything else to
-asyncio as usual. Nothing else changes: the call is in the loop's thread, between two rounds of callbacks.
+selector itself calls the readers (and writers) of the data path as soon as ``epoll`` names them, and reports
+everything else to asyncio as usual.
+
+Data also goes before control work that has begun: the loop looks at the data path's sockets before each ordinary
+callback, and work that takes long calls ``breathe()`` between its slices. A look costs a quarter of a microsecond.
+What such a reader calls may therefore run in the middle of whatever breathes: at a breath nothing may be half done.
+docs/design/isolation.md says what was measured.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import math
 import select
 import selectors
-from typing import TYPE_CHECKING, Final, cast
+from collections import deque
+from typing import TYPE_CHECKING, Any, Final, TypeVarTuple, cast
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
-    from typing import Any
 
     from _typeshed import FileDescriptorLike
 
 _log = logging.getLogger(__name__)
 
 _EPOLL_RESOLUTION: Final = 1e-3
+_LOOK: Final = 64
+_Ts = TypeVarTuple("_Ts")
 _READ: Final = ~select.EPOLLOUT
 _WRITE: Final = ~select.EPOLLIN
 
 
 class DirectSelector(selectors.BaseSelector):
-    """An epoll selector that calls some readers itself."""
+    """An epoll selector that calls some readers and writers itself: those of the data path."""
 
     def __init__(self) -> None:
         self._epoll = select.epoll()
+        # The direct ones once more, so that a look at them alone costs the same however many others there are.
+        self._data = select.epoll()
+        self._look = self._data.poll
         self._keys: dict[int, selectors.SelectorKey] = {}
-        self._direct: dict[int, Callable[[], None]] = {}
+        self._readers: dict[int, Callable[[], None]] = {}
+        self._writers: dict[int, Callable[[], None]] = {}
+        self._calling = False
 
-    def call_directly(self, fd: int, callback: Callable[[], None] | None) -> None:
-        """Call ``callback`` when ``fd``, which is registered for reading, is readable; ``None``: as usual again."""
-        if callback is None:
-            self._direct.pop(fd, None)
+    def call_directly(self, fd: int, reader: Callable[[], None] | None) -> None:
+        """Call ``reader`` when ``fd``, which is registered for reading, is readable; ``None``: as usual again."""
+        if reader is None:
+            self._forget(fd)
+            return
+        if fd not in self._readers:
+            self._data.register(fd, _epoll_events(self._keys[fd].events))
+        self._readers[fd] = reader
+
+    def write_directly(self, fd: int, writer: Callable[[], None] | None) -> None:
+        """Likewise when it is writable, as long as it has a direct reader too."""
+        if writer is not None and fd in self._readers:
+            self._writers[fd] = writer
         else:
-            self._direct[fd] = callback
+            self._writers.pop(fd, None)
+
+    def poll_data(self) -> None:
+        """Call the direct readers and writers that are ready now; does nothing when called by one of them."""
+        if not self._calling and (happened := self._look(0, _LOOK)):
+            self._call(happened)
 
     def register(
         self,
@@ -68,7 +95,7 @@ class DirectSelector(selectors.BaseSelector):
             KeyError: It is not followed.
         """
         key = self._keys.pop(_fd(fileobj))
-        self._direct.pop(key.fd, None)
+        self._forget(key.fd)
         try:
             self._epoll.unregister(key.fd)
         except OSError:
@@ -89,11 +116,15 @@ class DirectSelector(selectors.BaseSelector):
         key = self._keys[_fd(fileobj)]
         if events != key.events:
             self._epoll.modify(key.fd, _epoll_events(events))
+            if not events & selectors.EVENT_READ:
+                self._forget(key.fd)
+            elif key.fd in self._readers:
+                self._data.modify(key.fd, _epoll_events(events))
         key = self._keys[key.fd] = selectors.SelectorKey(fileobj, key.fd, events, data)
         return key
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """Wait; call the direct readers that are ready, and return the rest."""
+        """Wait; call the direct readers and writers that are ready, and return the rest."""
         if timeout is None:
             wait = -1.0
         elif timeout <= 0:
@@ -106,13 +137,7 @@ class DirectSelector(selectors.BaseSelector):
         except InterruptedError:
             return []
         ready = []
-        for fd, event in happened:
-            direct = self._direct.get(fd)
-            if direct is not None and event & _READ:
-                direct()
-                event &= select.EPOLLOUT  # noqa: PLW2901 - what is left for asyncio
-                if not event:
-                    continue
+        for fd, event in self._call(happened):
             key = self._keys.get(fd)
             if key is not None:
                 events = (selectors.EVENT_WRITE if event & _WRITE else 0) | (
@@ -120,6 +145,31 @@ class DirectSelector(selectors.BaseSelector):
                 )
                 ready.append((key, events & key.events))
         return ready
+
+    def _call(self, happened: list[tuple[int, int]]) -> list[tuple[int, int]]:
+        """Call those that are direct; return what is left for asyncio."""
+        rest = []
+        self._calling = True
+        try:
+            for fd, event in happened:
+                if (reader := self._readers.get(fd)) is not None and event & _READ:
+                    reader()
+                    event &= select.EPOLLOUT  # noqa: PLW2901 - what is left of it
+                    if not event:
+                        continue
+                if (writer := self._writers.get(fd)) is not None and event & select.EPOLLOUT:
+                    writer()
+                    continue
+                rest.append((fd, event))
+        finally:
+            self._calling = False
+        return rest
+
+    def _forget(self, fd: int) -> None:
+        self._writers.pop(fd, None)
+        if self._readers.pop(fd, None) is not None:
+            with contextlib.suppress(OSError):  # closed before
+                self._data.unregister(fd)
 
     def get_map(self) -> Mapping[FileDescriptorLike, selectors.SelectorKey]:
         """What is followed, by file descriptor."""
@@ -136,31 +186,74 @@ class DirectSelector(selectors.BaseSelector):
     def close(self) -> None:
         """Follow nothing any more."""
         self._epoll.close()
+        self._data.close()
         self._keys.clear()
-        self._direct.clear()
+        self._readers.clear()
+        self._writers.clear()
 
 
 class AgentLoop(asyncio.SelectorEventLoop):
-    """asyncio's selector loop with ``add_direct_reader``."""
+    """asyncio's selector loop with ``add_direct_reader``; data goes before every ordinary callback."""
 
     def __init__(self) -> None:
         self._direct_selector = DirectSelector()
         super().__init__(self._direct_selector)
+        # asyncio takes each callback of a round from here, and from nowhere else.
+        self._ready: deque[asyncio.Handle] = _Turnstile(self._direct_selector)
+        self.poll_data: Final = self._direct_selector.poll_data
+        """Let data that has come go first, now; see ``breathe()``."""
 
     def add_direct_reader(self, fd: int, callback: Callable[[], None]) -> None:
         """Like ``add_reader``, on the short way; ``remove_reader`` ends it.
 
-        ``callback`` must be quick. What it raises goes to the loop's exception handler.
+        ``callback`` must be quick. It is called between the slices of any other work: see the module's text. What it
+        raises goes to the loop's exception handler. A writer that is added afterwards is called in the same way.
         """
+        self.add_reader(fd, callback)
+        self._direct_selector.call_directly(fd, self._guarded(fd, "reader", callback))
 
+    def add_writer(self, fd: FileDescriptorLike, callback: Callable[[*_Ts], Any], *args: *_Ts) -> None:
+        """As asyncio's; on the short way where ``fd`` has a direct reader."""
+        super().add_writer(fd, callback, *args)
+        number = _fd(fd)
+        self._direct_selector.write_directly(number, self._guarded(number, "writer", lambda: callback(*args)))
+
+    def remove_writer(self, fd: FileDescriptorLike) -> bool:
+        """As asyncio's."""
+        self._direct_selector.write_directly(_fd(fd), None)
+        return super().remove_writer(fd)
+
+    def _guarded(self, fd: int, what: str, callback: Callable[[], None]) -> Callable[[], None]:
         def call() -> None:
             try:
                 callback()
             except Exception as error:  # noqa: BLE001 - the top of the call: the loop must go on
-                self.call_exception_handler({"message": f"reader of FD {fd} failed", "exception": error})
+                self.call_exception_handler({"message": f"{what} of FD {fd} failed", "exception": error})
 
-        self.add_reader(fd, callback)
-        self._direct_selector.call_directly(fd, call)
+        return call
+
+
+def breathe() -> None:
+    """Between two slices of long work in a loop: let data that has come go first.
+
+    Nothing happens on other loops than ``AgentLoop``, nor outside of one.
+    """
+    loop = asyncio._get_running_loop()  # noqa: SLF001 - the public one raises where there is none
+    if isinstance(loop, AgentLoop):
+        loop.poll_data()
+
+
+class _Turnstile(deque[asyncio.Handle]):
+    """The callbacks that are ready; data goes before each of them."""
+
+    def __init__(self, selector: DirectSelector) -> None:
+        super().__init__()
+        self._poll_data = selector.poll_data
+
+    def popleft(self) -> asyncio.Handle:
+        """The next one to run."""
+        self._poll_data()
+        return super().popleft()
 
 
 def _fd(fileobj: FileDescriptorLike) -> int:

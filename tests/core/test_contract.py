@@ -1,0 +1,195 @@
+"""Contracts: which rules apply to a topic, who outweighs whom, and what two ends agree on."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rmpa.core import limits
+from rmpa.core.contract import (
+    KEYS,
+    Contract,
+    Contracts,
+    Durability,
+    History,
+    Liveliness,
+    Priority,
+    Reliability,
+    Rule,
+    combine,
+)
+from rmpa.core.names import matches
+
+SECONDS = st.one_of(st.none(), st.sampled_from([0.1, 0.5, 2.0]))
+VALUES: dict[str, st.SearchStrategy[object]] = {
+    "reliability": st.sampled_from(Reliability),
+    "durability": st.sampled_from(Durability),
+    "history": st.sampled_from(History),
+    "depth": st.integers(1, 10),
+    "deadline": SECONDS,
+    "lifespan": SECONDS,
+    "liveliness": st.sampled_from(Liveliness),
+    "liveliness_lease": SECONDS,
+    "priority": st.sampled_from(Priority),
+    "max_rate": st.one_of(st.none(), st.sampled_from([1.0, 10.0])),
+}
+CONTRACTS = st.builds(Contract, **VALUES)  # type: ignore[arg-type]
+GLOBS = st.lists(st.sampled_from(["/a", "/a/**", "/*", "/**", "/b/?"]), max_size=2, unique=True).map(tuple)
+TYPE_GLOBS = st.lists(st.sampled_from(["m/A", "m/*", "**", "n/B"]), max_size=2, unique=True).map(tuple)
+RULES = st.lists(st.builds(Rule, GLOBS, TYPE_GLOBS, st.fixed_dictionaries({}, optional=VALUES)), max_size=5).map(
+    tuple
+)
+TOPICS = st.sampled_from(["/a", "/a/x", "/b", "/b/c", "/c/d/e"])
+TYPES = st.sampled_from(["m/A", "m/B", "n/B", ""])
+
+
+def rule(*topics: str, types: tuple[str, ...] = (), **values: object) -> Rule:
+    return Rule(topics, types, values)
+
+
+def test_no_rules_ask_for_nothing() -> None:
+    assert Contracts().of("/cmd", "a/B") == Contract()
+    assert Contract() == Contract(
+        Reliability.BEST_EFFORT,
+        Durability.VOLATILE,
+        History.KEEP_LAST,
+        limits.ROUTE_QUEUE_MESSAGES,
+        None,
+        None,
+        Liveliness.AUTOMATIC,
+        None,
+        Priority.NORMAL,
+        None,
+    )
+
+
+def test_the_words_are_those_of_ros_2() -> None:
+    assert [*Reliability, *Durability, *History, *Liveliness, *Priority] == [
+        *("best_effort", "reliable", "volatile", "transient_local", "keep_last", "keep_all"),
+        *("automatic", "manual_by_topic", "high", "normal", "low"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("rules", "topic", "type_name", "changed"),
+    [
+        ((rule("/cmd/**", depth=1),), "/cmd", "a/B", {"depth": 1}),
+        ((rule("/cmd/**", depth=1),), "/cmdr", "a/B", {}),
+        ((rule("/cmd/**", depth=1), rule("/**", depth=2)), "/cmd/a", "a/B", {"depth": 2}),
+        ((rule("/**", depth=2), rule("/cmd/**", depth=1)), "/cmd/a", "a/B", {"depth": 1}),
+        ((rule("/**", depth=2, deadline=1.0), rule("/cmd", depth=1)), "/cmd", "a/B", {"depth": 1, "deadline": 1.0}),
+        ((rule("/**", deadline=1.0), rule("/cmd", deadline=None)), "/cmd", "a/B", {}),
+        ((rule(types=("a/*",), depth=1),), "/cmd", "a/B", {"depth": 1}),
+        ((rule(types=("a/*",), depth=1),), "/cmd", "", {}),
+        ((rule("/cmd", types=("a/*",), depth=1),), "/cmd", "a/B", {"depth": 1}),
+        ((rule("/cmd", types=("a/*",), depth=1),), "/cmd", "b/B", {}),
+        ((rule("/cmd", types=("a/*",), depth=1),), "/odom", "a/B", {}),
+        ((rule("/x", "/cmd", depth=1),), "/cmd", "a/B", {"depth": 1}),
+    ],
+)
+def test_every_fitting_rule_applies_and_a_later_one_outweighs(
+    rules: tuple[Rule, ...], topic: str, type_name: str, changed: dict[str, object]
+) -> None:
+    assert Contracts(rules).of(topic, type_name) == dataclasses.replace(Contract(), **changed)  # type: ignore[arg-type]
+
+
+def test_what_decided_is_explained() -> None:
+    contracts = Contracts(
+        (rule("/**", depth=2, priority=Priority.LOW), rule("/x", "/cmd/*", types=("a/*",), depth=1))
+    )
+    explained = contracts.explain("/cmd/vel", "a/B")
+    assert tuple(explained) == KEYS
+    assert explained["depth"] == (1, "rule 2: topics /cmd/*, types a/*")
+    assert explained["priority"] == (Priority.LOW, "rule 1: topics /**")
+    assert explained["deadline"] == (None, "default")
+    assert contracts.explain("/cmd/vel", "b/B")["depth"] == (2, "rule 1: topics /**")
+
+
+@given(RULES, TOPICS, TYPES)
+def test_the_contract_is_what_is_explained(rules: tuple[Rule, ...], topic: str, type_name: str) -> None:
+    contracts = Contracts(rules)
+    contract = contracts.of(topic, type_name)
+    assert contracts.of(topic, type_name) is contract or contract == Contract()
+    for key, (value, why) in contracts.explain(topic, type_name).items():
+        assert getattr(contract, key) == value
+        setting = [
+            number
+            for number, rule in enumerate(rules, 1)
+            if key in rule.values
+            and (not rule.topics or any(matches(glob, topic) for glob in rule.topics))
+            and (not rule.types or any(matches(glob, type_name) for glob in rule.types))
+        ]
+        assert why.startswith(f"rule {setting[-1]}: " if setting else "default")
+        assert value == (rules[setting[-1] - 1].values[key] if setting else getattr(Contract(), key))
+
+
+def test_invented_topics_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "CONTRACTS_REMEMBERED", 3)
+    contracts = Contracts((rule("/1", depth=1),))
+    for number in range(10):
+        assert contracts.of(f"/{number}", "a/B").depth == (1 if number == 1 else limits.ROUTE_QUEUE_MESSAGES)
+    assert list(contracts._known) == [("/7", "a/B"), ("/8", "a/B"), ("/9", "a/B")]
+    assert contracts.of("/1", "a/B").depth == 1
+
+
+@pytest.mark.parametrize(
+    ("offered", "requested", "agreed"),
+    [
+        (Contract(), Contract(), Contract()),
+        (Contract(reliability=Reliability.RELIABLE), Contract(), Contract(reliability=Reliability.RELIABLE)),
+        (Contract(), Contract(reliability=Reliability.RELIABLE), Contract(reliability=Reliability.RELIABLE)),
+        (
+            Contract(),
+            Contract(durability=Durability.TRANSIENT_LOCAL),
+            Contract(durability=Durability.TRANSIENT_LOCAL),
+        ),
+        (Contract(history=History.KEEP_ALL), Contract(), Contract(history=History.KEEP_ALL)),
+        (Contract(depth=5), Contract(depth=9), Contract(depth=9)),
+        (Contract(deadline=1.0), Contract(), Contract(deadline=1.0)),
+        (Contract(deadline=1.0), Contract(deadline=2.0), Contract(deadline=2.0)),
+        (Contract(lifespan=1.0), Contract(lifespan=2.0), Contract(lifespan=1.0)),
+        (Contract(), Contract(lifespan=2.0), Contract(lifespan=2.0)),
+        (Contract(max_rate=5.0), Contract(max_rate=9.0), Contract(max_rate=5.0)),
+        (Contract(priority=Priority.LOW), Contract(), Contract(priority=Priority.LOW)),
+        (Contract(), Contract(priority=Priority.LOW), Contract(priority=Priority.LOW)),
+        (Contract(priority=Priority.LOW), Contract(priority=Priority.HIGH), Contract(priority=Priority.HIGH)),
+        (Contract(priority=Priority.HIGH), Contract(priority=Priority.LOW), Contract(priority=Priority.HIGH)),
+        (
+            Contract(liveliness=Liveliness.MANUAL_BY_TOPIC, liveliness_lease=1.0),
+            Contract(),
+            Contract(liveliness=Liveliness.MANUAL_BY_TOPIC, liveliness_lease=1.0),
+        ),
+        (
+            Contract(liveliness=Liveliness.MANUAL_BY_TOPIC, liveliness_lease=1.0),
+            Contract(liveliness_lease=3.0),
+            Contract(liveliness_lease=3.0),
+        ),
+    ],
+)
+def test_two_ends_agree(offered: Contract, requested: Contract, agreed: Contract) -> None:
+    assert combine(offered, requested) == agreed
+
+
+@given(CONTRACTS, CONTRACTS)
+def test_neither_end_gets_less_than_it_asked_for(offered: Contract, requested: Contract) -> None:
+    agreed = combine(offered, requested)
+    for side in (offered, requested):
+        assert agreed.reliability is Reliability.RELIABLE or side.reliability is Reliability.BEST_EFFORT
+        assert agreed.durability is Durability.TRANSIENT_LOCAL or side.durability is Durability.VOLATILE
+        assert agreed.history is History.KEEP_ALL or side.history is History.KEEP_LAST
+        assert agreed.depth >= side.depth
+        assert side.lifespan is None or (agreed.lifespan is not None and agreed.lifespan <= side.lifespan)
+        assert side.max_rate is None or (agreed.max_rate is not None and agreed.max_rate <= side.max_rate)
+    assert agreed.priority in (offered.priority, requested.priority)
+    assert agreed.deadline == (requested.deadline or offered.deadline)
+
+
+@given(CONTRACTS, CONTRACTS)
+def test_what_is_agreed_needs_no_second_agreement(offered: Contract, requested: Contract) -> None:
+    agreed = combine(offered, requested)
+    assert combine(agreed, agreed) == agreed
+    assert combine(agreed, requested) == agreed
+    assert combine(offered, agreed) == agreed

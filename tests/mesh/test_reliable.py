@@ -1,0 +1,523 @@
+"""Reliable delivery: each message once, in order, or counted; whatever becomes of the links."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from rmpa.core import limits
+from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
+from rmpa.mesh.reliable import DELIVER, DUPLICATE, ReliableReceiver, ReliableSender, ResumeTable, Verdict
+from tests.mesh.reliable_pair import MASK, Bounds, Pair, number_of, payload
+
+FIRSTS = (1, 0, MASK, MASK - 5, (1 << 31) - 3)
+"""Where the numbering begins: also such that it wraps, or crosses the half, within a test."""
+ROOMY = Bounds(depth=1000, max_bytes=1 << 20, window_messages=64, window_bytes=1 << 16)
+
+
+def sender(depth: int = 100, max_bytes: int = 10_000, window: int = 10, window_bytes: int = 10_000) -> ReliableSender:
+    return ReliableSender(depth, max_bytes, window, window_bytes, epoch=7)
+
+
+def fill(machine: ReliableSender, count: int, size: int = 0) -> None:
+    for number in range(count):
+        machine.offer(payload(number, size), number)
+
+
+def numbers(machine: ReliableSender, most: int | None = None) -> list[int]:
+    return [number_of(message.payload) for message in machine.take(most)]
+
+
+# --- the sender -----------------------------------------------------------------------------------------------
+
+
+def test_messages_are_numbered_from_one_and_sent_in_order() -> None:
+    machine = sender()
+    machine.offer(b"a", 5)
+    machine.offer(b"b", 6)
+    assert machine.take() == [(1, 5, b"a"), (2, 6, b"b")]
+    assert machine.take() == []
+    assert (machine.epoch, machine.first, machine.next_sequence) == (7, 1, 3)
+    assert (machine.pending, machine.pending_bytes, machine.under_way) == (2, 2, 2)
+
+
+def test_the_window_bounds_what_is_under_way() -> None:
+    machine = sender(window=3)
+    fill(machine, 5)
+    assert numbers(machine) == [0, 1, 2]
+    machine.acknowledged(2)
+    assert numbers(machine, 1) == [3]
+    assert numbers(machine) == [4]
+    assert machine.under_way == 3
+
+
+def test_the_window_counts_bytes_and_lets_one_large_message_through() -> None:
+    machine = sender(window_bytes=100)
+    fill(machine, 3, size=36)
+    machine.offer(payload(3, 500), 0)
+    assert numbers(machine) == [0, 1]
+    machine.acknowledged(2)
+    assert numbers(machine) == [2]
+    machine.acknowledged(3)
+    assert numbers(machine) == [3]
+    machine.offer(b"", 0)
+    assert machine.take() == []
+    machine.acknowledged(4)
+    assert len(machine.take()) == 1
+
+
+def test_acknowledged_messages_are_let_go() -> None:
+    machine = sender()
+    fill(machine, 5)
+    machine.take()
+    machine.acknowledged(3)
+    assert (machine.pending, machine.pending_bytes, machine.under_way) == (2, 8, 2)
+    machine.acknowledged(3)
+    machine.acknowledged(1)
+    assert (machine.pending, machine.idle) == (2, False)
+    machine.acknowledged(5)
+    assert (machine.pending, machine.idle) == (0, True)
+    assert machine.pending_bytes == machine.overflowed == 0
+
+
+@pytest.mark.parametrize("sequence", [3, 4, 1000, (1 << 31) - 1])
+def test_what_was_never_sent_cannot_be_acknowledged(sequence: int) -> None:
+    machine = sender()
+    fill(machine, 5)
+    machine.take(2)
+    with pytest.raises(RemoteProtocolError, match="sent up to 2"):
+        machine.acknowledged(sequence)
+    assert machine.pending == 5
+
+
+def test_a_suspended_sender_keeps_all_and_sends_nothing() -> None:
+    machine = sender()
+    fill(machine, 3)
+    machine.take(2)
+    machine.suspend()
+    machine.suspend()
+    machine.acknowledged(2)
+    assert machine.take() == []
+    assert (machine.pending, machine.under_way) == (3, 0)
+
+
+@pytest.mark.parametrize(("after", "again"), [(0, [0, 1, 2, 3]), (2, [2, 3]), (3, [3])])
+def test_a_new_link_begins_behind_what_the_receiver_has(after: int, again: list[int]) -> None:
+    machine = sender()
+    fill(machine, 4)
+    machine.take(3)
+    machine.suspend()
+    machine.resume(after)
+    assert numbers(machine) == again
+    assert machine.pending == len(again)
+
+
+def test_a_link_that_replaces_another_one_needs_no_suspend() -> None:
+    machine = sender()
+    fill(machine, 4)
+    machine.take()
+    machine.resume(1)
+    assert numbers(machine) == [1, 2, 3]
+
+
+@pytest.mark.parametrize("after", [0, 1, 4, 5, (1 << 31) + 2])
+def test_a_position_that_cannot_be_is_the_other_sides_fault_and_changes_nothing(after: int) -> None:
+    machine = sender()
+    fill(machine, 5)
+    machine.take(3)
+    machine.acknowledged(2)
+    machine.suspend()
+    with pytest.raises(RemoteProtocolError, match=f"resumes message {after}"):
+        machine.resume(after)
+    assert machine.pending == 3
+    machine.resume(3)
+    assert numbers(machine) == [3, 4]
+
+
+def test_beyond_the_depth_the_oldest_is_dropped_and_counted() -> None:
+    machine = sender(depth=3)
+    machine.suspend()
+    fill(machine, 10)
+    assert (machine.pending, machine.overflowed) == (3, 7)
+    machine.resume(0)
+    assert [m.sequence for m in machine.take()] == [8, 9, 10]
+
+
+def test_beyond_the_bytes_the_oldest_are_dropped_but_the_newest_always_fits() -> None:
+    machine = sender(max_bytes=20)
+    machine.suspend()
+    fill(machine, 5)
+    assert machine.overflowed == 0
+    machine.offer(bytes(12), 0)
+    assert (machine.overflowed, machine.pending_bytes) == (3, 20)
+    machine.offer(bytes(500), 0)
+    assert (machine.overflowed, machine.pending, machine.pending_bytes) == (6, 1, 500)
+    machine.offer(b"", 0)
+    assert (machine.overflowed, machine.pending, machine.pending_bytes) == (7, 1, 0)
+
+
+def test_a_message_dropped_under_way_is_lost_only_if_it_did_not_arrive() -> None:
+    machine = sender(depth=2, window=4)
+    fill(machine, 2)
+    machine.take()
+    machine.offer(payload(2), 0)
+    machine.offer(payload(3), 0)
+    assert (machine.pending, machine.under_way, machine.overflowed) == (2, 2, 0)
+    machine.take()
+    machine.acknowledged(1)
+    machine.suspend()
+    assert not machine.idle
+    machine.resume(1)
+    assert machine.overflowed == 1
+    assert numbers(machine) == [2, 3]
+
+
+def test_what_is_dropped_under_way_still_fills_the_window() -> None:
+    machine = sender(depth=1, window=2, window_bytes=10)
+    for number in range(10):
+        machine.offer(payload(number, 1), 0)
+        machine.take()
+    assert machine.under_way == 2
+    assert machine.pending_bytes == 5
+    machine.acknowledged(2)
+    assert numbers(machine) == [9]
+    assert machine.overflowed == 7
+
+
+def test_an_acknowledgement_may_be_ahead_of_what_the_new_link_has_sent() -> None:
+    machine = sender()
+    fill(machine, 5)
+    machine.take()
+    machine.resume(1)
+    assert numbers(machine, 1) == [1]
+    machine.acknowledged(4)  # the old link brought three more behind the position that it was opened with
+    assert numbers(machine) == [4]
+    assert machine.pending == 1
+
+
+@pytest.mark.parametrize(("depth", "window"), [(0, 1), (1, 0), (-1, 1), (1 << 31, 1), (1, 1 << 31)])
+def test_bounds_that_cannot_be_are_our_own_fault(depth: int, window: int) -> None:
+    with pytest.raises(LocalProtocolError):
+        sender(depth=depth, window=window)
+
+
+def test_a_message_costs_the_same_however_many_wait() -> None:
+    def cost(waiting: int) -> float:
+        machine = sender(depth=waiting + 10, max_bytes=1 << 30, window=waiting + 10, window_bytes=1 << 30)
+        fill(machine, waiting)
+        machine.take(waiting // 2)
+        started = time.perf_counter()
+        for number in range(2000):
+            machine.offer(b"x", 0)
+            machine.take(1)
+            machine.acknowledged(number + 1)
+        return time.perf_counter() - started
+
+    assert min(cost(100_000) for _ in range(3)) < 10 * min(cost(10) for _ in range(3)) + 0.01
+
+
+def test_a_drop_costs_the_same_however_many_wait() -> None:
+    def cost(waiting: int) -> float:
+        machine = sender(depth=waiting, max_bytes=1 << 30, window=waiting, window_bytes=1 << 30)
+        fill(machine, waiting)
+        machine.take(waiting // 2)
+        started = time.perf_counter()
+        for _ in range(2000):
+            machine.offer(b"x", 0)
+        return time.perf_counter() - started
+
+    assert min(cost(100_000) for _ in range(3)) < 10 * min(cost(10) for _ in range(3)) + 0.01
+
+
+# --- the receiver ---------------------------------------------------------------------------------------------
+
+
+def test_each_message_is_delivered_once() -> None:
+    receiver = ReliableReceiver(7, first=1)
+    assert receiver.position() == (7, 0)
+    assert receiver.accept(1, 7, 0.0) is DELIVER
+    assert receiver.accept(2, 7, 0.0) is DELIVER
+    assert receiver.accept(1, 7, 0.0) is DUPLICATE
+    assert receiver.accept(2, 7, 0.0) is DUPLICATE
+    assert receiver.accept(3, 7, 0.0) is DELIVER
+    assert receiver.position() == (7, 3)
+    assert (receiver.gap_total, receiver.duplicates) == (0, 2)
+
+
+def test_a_gap_is_counted_exactly() -> None:
+    receiver = ReliableReceiver(7, first=1)
+    assert receiver.accept(4, 7, 0.0) == Verdict(deliver=True, gap=3)
+    assert receiver.accept(5, 7, 0.0) is DELIVER
+    assert receiver.accept(1000, 7, 0.0) == Verdict(deliver=True, gap=994)
+    assert receiver.accept(999, 7, 0.0) is DUPLICATE
+    assert receiver.gap_total == 997
+
+
+def test_without_a_first_sequence_no_gap_is_claimed() -> None:
+    receiver = ReliableReceiver()
+    assert receiver.judge(500, 7) is DELIVER
+    assert receiver.position() is None
+    assert receiver.accept(500, 7, 0.0) is DELIVER
+    assert receiver.accept(502, 7, 0.0) == Verdict(deliver=True, gap=1)
+    assert receiver.position() == (7, 502)
+
+
+def test_another_epoch_begins_where_its_sender_says() -> None:
+    receiver = ReliableReceiver(7, first=1)
+    receiver.accept(1, 7, 0.0)
+    assert not receiver.begin(8, 1)
+    assert receiver.position() == (8, 0)
+    assert receiver.next_timer() is None, "nobody waits for the old epoch's acknowledgement"
+    assert receiver.accept(2, 7, 0.0) is DUPLICATE
+    assert receiver.judge(2, 7) is DUPLICATE
+    assert receiver.next_timer() is None
+    assert receiver.accept(2, 8, 0.0) == Verdict(deliver=True, gap=1)
+    assert (receiver.breaks, receiver.duplicates) == (1, 1)
+
+
+def test_the_same_epoch_goes_on() -> None:
+    receiver = ReliableReceiver()
+    assert receiver.begin(7)
+    assert receiver.position() is None
+    assert receiver.begin(7, 1)
+    receiver.accept(1, 7, 0.0)
+    assert receiver.begin(7, 1)
+    assert receiver.position() == (7, 1)
+    assert receiver.breaks == 0
+
+
+def test_a_first_fragment_is_judged_and_counts_only_with_its_last() -> None:
+    receiver = ReliableReceiver(7, first=1)
+    assert receiver.judge(1, 7) is DELIVER
+    assert receiver.judge(3, 7) == Verdict(deliver=True, gap=2)
+    assert receiver.position() == (7, 0)
+    assert receiver.gap_total == 0
+    receiver.accept(1, 7, 0.0)
+    assert receiver.judge(1, 7) is DUPLICATE
+    assert receiver.duplicates == 0
+
+
+def test_it_acknowledges_after_a_delay() -> None:
+    receiver = ReliableReceiver(7, first=1)
+    assert receiver.next_timer() is None
+    assert receiver.due_ack(1e9) is None
+    receiver.accept(1, 7, 50.0)
+    receiver.accept(2, 7, 50.005)
+    assert receiver.next_timer() == 50.0 + limits.ACK_DELAY
+    assert receiver.due_ack(50.009) is None
+    assert receiver.due_ack(50.0 + limits.ACK_DELAY) == 2
+    assert receiver.due_ack(60.0) is None
+    receiver.accept(3, 7, 60.0)
+    assert receiver.next_timer() == 60.0 + limits.ACK_DELAY
+
+
+def test_it_acknowledges_at_once_when_many_messages_or_bytes_came() -> None:
+    receiver = ReliableReceiver(7, first=1)
+    for sequence in range(1, limits.ACK_MESSAGES + 1):
+        assert receiver.due_ack(0.0) is None
+        receiver.accept(sequence, 7, 0.0)
+    assert receiver.due_ack(0.0) == limits.ACK_MESSAGES
+    receiver.accept(33, 7, 0.0, limits.ACK_BYTES - 1)
+    assert receiver.due_ack(0.0) is None
+    receiver.accept(34, 7, 0.0, 1)
+    assert receiver.due_ack(0.0) == 34
+    receiver.accept(35, 7, 0.0, 1)
+    assert receiver.due_ack(0.0) is None
+
+
+def test_a_duplicate_is_acknowledged_again() -> None:
+    receiver = ReliableReceiver(7, first=1)
+    receiver.accept(1, 7, 0.0)
+    assert receiver.due_ack(1.0) == 1
+    receiver.accept(1, 7, 2.0)
+    assert receiver.due_ack(3.0) == 1
+
+
+@pytest.mark.parametrize("first", FIRSTS)
+def test_sequences_wrap(first: int) -> None:
+    pair = Pair(Bounds(depth=4, max_bytes=1 << 20, window_messages=3, first=first))
+    for turn in range(12):
+        for _ in range(turn % 7):
+            pair.offer(0)
+        pair.send(None, 1)
+        if turn % 3 == 2:
+            pair.cut(0)
+            pair.resume()
+        else:
+            while pair.data:
+                pair.arrive()
+            pair.tick(limits.ACK_DELAY)
+            pair.hear() if pair.acks else None
+        pair.check()
+    pair.drain()
+
+
+# --- parked senders -------------------------------------------------------------------------------------------
+
+
+def parked(
+    table: ResumeTable[str], key: str, *, count: int = 2, now: float = 0.0
+) -> tuple[ReliableSender, list[str]]:
+    machine = sender()
+    fill(machine, count)
+    machine.take()
+    return machine, table.park(key, machine, now)
+
+
+def test_a_parked_sender_is_suspended_and_given_back() -> None:
+    table: ResumeTable[str] = ResumeTable()
+    machine, gone = parked(table, "a")
+    assert gone == []
+    assert (len(table), table.pending_bytes, machine.under_way) == (1, 8, 0)
+    assert table.claim("b", 7, 1.0) is None
+    assert table.claim("a", 7, 1.0) is machine
+    assert table.claim("a", 7, 1.0) is None
+    assert (len(table), table.pending_bytes, table.given_up, table.next_timer()) == (0, 0, 0, None)
+
+
+@pytest.mark.parametrize("epoch", [None, 6, 8])
+def test_another_epoch_has_no_use_for_it(epoch: int | None) -> None:
+    table: ResumeTable[str] = ResumeTable()
+    parked(table, "a")
+    assert table.claim("a", epoch, 1.0) is None
+    assert (len(table), table.given_up) == (0, 2)
+
+
+def test_its_time_is_bounded() -> None:
+    table: ResumeTable[str] = ResumeTable()
+    parked(table, "a", now=10.0)
+    parked(table, "b", now=11.0)
+    due = 10.0 + limits.RESUME_WINDOW
+    assert table.next_timer() == due
+    assert table.expire(due - 0.001) == []
+    assert table.expire(due) == ["a"]
+    assert table.claim("b", 7, due + 1.0) is None, "too late, though nobody has called expire yet"
+    assert (len(table), table.given_up, table.next_timer()) == (0, 4, None)
+
+
+def test_parking_again_begins_a_new_time() -> None:
+    table: ResumeTable[str] = ResumeTable()
+    parked(table, "a", now=10.0)
+    parked(table, "b", now=11.0)
+    machine, gone = parked(table, "a", now=12.0)
+    assert gone == []
+    assert (len(table), table.pending_bytes) == (2, 16)
+    assert table.expire(11.5 + limits.RESUME_WINDOW) == ["b"]
+    assert table.claim("a", 7, 12.0) is machine
+
+
+def test_its_number_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "RESUMES_MAX", 2)
+    table: ResumeTable[str] = ResumeTable()
+    assert [parked(table, key)[1] for key in "abcd"] == [[], [], ["a"], ["b"]]
+    assert (len(table), table.given_up, table.pending_bytes) == (2, 4, 16)
+
+
+def test_its_bytes_are_bounded_and_the_oldest_is_given_up_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "RESUME_BYTES_MAX", 100)
+    table: ResumeTable[str] = ResumeTable()
+    parked(table, "a")
+    parked(table, "b")
+    parked(table, "c")
+    assert table.offer("c", bytes(76), 0) == []
+    assert table.pending_bytes == 100
+    assert table.offer("c", bytes(1), 0) == ["a"]
+    assert table.offer("a", bytes(1000), 0) == []
+    assert table.offer("c", bytes(1000), 0) == ["b", "c"]
+    assert (len(table), table.pending_bytes, table.given_up) == (0, 0, 2 + 2 + 5)
+    assert parked(table, "d", count=26)[1] == ["d"]
+
+
+def test_what_is_offered_while_parked_is_kept_within_the_senders_own_bounds() -> None:
+    table: ResumeTable[str] = ResumeTable()
+    machine = sender(depth=3)
+    table.park("a", machine, 0.0)
+    for number in range(10):
+        assert table.offer("a", payload(number), 0) == []
+    assert table.pending_bytes == machine.pending_bytes == 12
+    assert table.claim("a", 7, 1.0) is machine
+    machine.resume(0)
+    assert numbers(machine) == [7, 8, 9]
+
+
+# --- every interleaving ---------------------------------------------------------------------------------------
+
+
+class EveryInterleaving(RuleBasedStateMachine):
+    """Anything may happen at any time; ``Pair`` compares it with what must be."""
+
+    @initialize(
+        depth=st.sampled_from([1, 2, 5, 12, 1000]),
+        max_bytes=st.sampled_from([30, 120, 1 << 20]),
+        window=st.sampled_from([1, 3, 100]),
+        window_bytes=st.sampled_from([20, 100, 1 << 20]),
+        first=st.sampled_from(FIRSTS),
+        says_first=st.booleans(),
+    )
+    def begin(self, depth: int, max_bytes: int, window: int, window_bytes: int, first: int, says_first: bool) -> None:
+        self.pair = Pair(Bounds(depth, max_bytes, window, window_bytes, first), says_first=says_first)
+
+    @rule(sizes=st.lists(st.integers(0, 60), min_size=1, max_size=6))
+    def offer(self, sizes: list[int]) -> None:
+        for size in sizes:
+            self.pair.offer(size)
+
+    @rule(most=st.sampled_from([None, None, 1, 2]), pieces=st.sampled_from([1, 1, 2, 3]))
+    def send(self, most: int | None, pieces: int) -> None:
+        self.pair.send(most, pieces)
+
+    @precondition(lambda self: self.pair.data)
+    @rule(count=st.integers(1, 8))
+    def arrive(self, count: int) -> None:
+        for _ in range(min(count, len(self.pair.data))):
+            self.pair.arrive()
+
+    @precondition(lambda self: self.pair.ghosts)
+    @rule()
+    def haunt(self) -> None:
+        self.pair.haunt()
+
+    @rule(seconds=st.sampled_from([0.0, 0.004, 0.01, 0.02]))
+    def tick(self, seconds: float) -> None:
+        self.pair.tick(seconds)
+
+    @precondition(lambda self: self.pair.acks)
+    @rule()
+    def hear(self) -> None:
+        self.pair.hear()
+
+    @precondition(lambda self: self.pair.linked)
+    @rule(ghosts=st.sampled_from([0, 0, 1, 3]))
+    def cut(self, ghosts: int) -> None:
+        self.pair.cut(ghosts)
+
+    @precondition(lambda self: not self.pair.linked)
+    @rule()
+    def resume(self) -> None:
+        self.pair.resume()
+
+    @rule(what=st.sampled_from(["drain", "drain", "sender", "receiver"]))
+    def begin_anew(self, what: str) -> None:
+        if what == "drain":
+            self.pair.drain()
+        elif what == "sender":
+            self.pair.fresh_sender()
+        else:
+            self.pair.fresh_receiver()
+
+    @invariant()
+    def agrees(self) -> None:
+        if hasattr(self, "pair"):
+            self.pair.check()
+
+    def teardown(self) -> None:
+        if hasattr(self, "pair"):
+            self.pair.drain()
+
+
+TestEveryInterleaving = EveryInterleaving.TestCase
+TestEveryInterleaving.settings = settings(max_examples=200, stateful_step_count=40, deadline=None)
