@@ -22,6 +22,7 @@ from rmpa.bridge.messages import Advertise, Close, Closed, Mismatch, Offer, Open
 from rmpa.core import limits
 from rmpa.core.backoff import Backoff
 from rmpa.core.clock import earliest
+from rmpa.core.contract import Contract, Contracts, Reliability
 from rmpa.core.errors import LocalProtocolError
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ class Import:
         description: What its messages are, once known.
         problem: Why the last attempt failed, or empty.
         wanted: Whether somebody local listens.
+        contract: What holds for its route, once it was open.
     """
 
     type: str
@@ -85,6 +87,11 @@ class Import:
     description: Description | None = None
     problem: str = ""
     wanted: bool = False
+    contract: Contract | None = None
+
+
+def _nothing(_peer: int, _source: Source) -> None:
+    """Nothing outlives its link."""
 
 
 class Imports:
@@ -93,12 +100,23 @@ class Imports:
     Args:
         policy: What may cross; the receiving side judges too.
         rng: Uniform numbers in [0, 1) for the back-off's jitter.
+        contracts: What our side asks for.
+        position: ``(peer, source)``: epoch and last message of a reliable route that outlived its link, or ``None``.
     """
 
-    def __init__(self, policy: Policy, rng: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        policy: Policy,
+        rng: Callable[[], float],
+        contracts: Contracts | None = None,
+        position: Callable[[int, Source], tuple[int, int] | None] = _nothing,
+    ) -> None:
         self._policy = policy
         self._rng = rng
+        self._contracts = contracts if contracts is not None else Contracts()
+        self._position = position
         self._peers: dict[int, dict[Source, Import]] = {}
+        self._away: set[int] = set()
         self._routes: dict[int, dict[int, Source]] = {}
         self._next_route: dict[int, int] = {}
         self._nodes: dict[int, Counter[str]] = {}
@@ -129,12 +147,41 @@ class Imports:
         return actions
 
     def link_up(self, peer: int) -> list[Action]:
-        """A link is up; its first message will be a full advertisement."""
-        self._peers[peer] = {}
+        """A link is up, perhaps of a peer that was away; its first message will be a full advertisement."""
+        self._away.discard(peer)
+        self._peers.setdefault(peer, {})
         self._routes[peer] = {}
         self._next_route[peer] = 1
-        self._nodes[peer] = Counter()
+        self._nodes.setdefault(peer, Counter())
         return []
+
+    def link_away(self, peer: int) -> tuple[list[Action], bool]:
+        """A link is gone, but its peer may come back: what does not need a reliable route leaves the local graph.
+
+        Returns:
+            What to do, and whether something waits for the peer: if nothing does, ``link_down`` it.
+        """
+        actions: list[Action] = []
+        self._away.add(peer)
+        self._routes[peer] = {}
+        for source, entry in list(self._peers[peer].items()):
+            reliable = entry.contract is not None and entry.contract.reliability is Reliability.RELIABLE
+            if reliable and entry.state in {RouteState.OPEN, RouteState.WAITING} and entry.wanted:
+                if entry.route:
+                    actions.append(Detach(peer, source, entry.route, keep=True))
+                entry.route = 0
+                entry.problem = "its peer is away"
+                if entry.state is RouteState.OPEN:
+                    self._move(peer, source, entry, RouteState.WAITING)
+                entry.timer = None
+                self._timed.discard((peer, source))
+                continue
+            self._timed.discard((peer, source))
+            if entry.route:
+                actions.append(Detach(peer, source, entry.route))
+            entry.route = 0
+            actions += self._drop(peer, source, entry)
+        return actions, bool(self._peers[peer])
 
     def link_down(self, peer: int) -> list[Action]:
         """A link is gone: all that came over it leaves the local graph."""
@@ -146,12 +193,13 @@ class Imports:
                 actions.append(Detach(peer, source, entry.route))
             if entry.shown:
                 actions.append(Retract(peer, source))
+        self._away.discard(peer)
         self._routes.pop(peer, None)
         self._next_route.pop(peer, None)
         self._nodes.pop(peer, None)
         return actions
 
-    def advertised(self, peer: int, message: Advertise) -> list[Action]:
+    def advertised(self, peer: int, message: Advertise, now: float = 0.0) -> list[Action]:
         """A peer says what it publishes."""
         known = self._peers[peer]
         removed = list(message.removed)
@@ -163,6 +211,16 @@ class Imports:
             actions += self._forget(peer, source)
         for offer in message.added:
             actions += self._learn(peer, offer)
+        if message.full:
+            actions += self._go_on(peer, now)
+        return actions
+
+    def _go_on(self, peer: int, now: float) -> list[Action]:
+        """A peer is back: ask again for what its link took away."""
+        actions: list[Action] = []
+        for source, entry in self._peers[peer].items():
+            if entry.state is RouteState.WAITING and entry.timer is None:
+                actions += self._open(peer, source, entry, now)
         return actions
 
     def opened(self, peer: int, message: Opened, now: float) -> list[Action]:
@@ -180,7 +238,9 @@ class Imports:
         entry.problem = ""
         entry.backoff.reset()
         entry.description = message.description
-        return [Describe(peer, source, message.route, message.description)]
+        entry.contract = message.contract
+        terms = (message.contract, message.epoch, message.first)
+        return [Describe(peer, source, message.route, message.description, *terms)]
 
     def closed(self, peer: int, message: Closed, now: float) -> list[Action]:
         """The other side has no such route, or no longer."""
@@ -299,9 +359,10 @@ class Imports:
         entry = self._peers[peer].get(source)
         if entry is None:
             return []
-        actions = self._close(peer, source, entry)
-        if entry.shown:
-            actions.append(Retract(peer, source))
+        return self._close(peer, source, entry) + self._drop(peer, source, entry)
+
+    def _drop(self, peer: int, source: Source, entry: Import) -> list[Action]:
+        actions: list[Action] = [Retract(peer, source)] if entry.shown else []
         del self._peers[peer][source]
         nodes = self._nodes[peer]
         nodes[source.node] -= 1
@@ -321,12 +382,18 @@ class Imports:
             self._timed.add((peer, source))
 
     def _open(self, peer: int, source: Source, entry: Import, now: float) -> list[Action]:
+        if peer in self._away:
+            self._move(peer, source, entry, RouteState.OPENING)
+            self._move(peer, source, entry, RouteState.WAITING)
+            return []
         route = self._next_route[peer]
         self._next_route[peer] = route + 1
         self._routes[peer][route] = source
         entry.route = route
         self._move(peer, source, entry, RouteState.OPENING, now + limits.ROUTE_OPEN_TIMEOUT)
-        return [Send(peer, Open(route, source.topic, source.node))]
+        contract = self._contracts.of(source.topic, entry.type)
+        epoch, after = self._position(peer, source) or (0, 0)
+        return [Send(peer, Open(route, source.topic, source.node, contract, epoch, after))]
 
     def _close(self, peer: int, source: Source, entry: Import) -> list[Action]:
         """Leave a source alone, whatever its state."""

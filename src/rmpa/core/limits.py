@@ -287,6 +287,8 @@ TCP_KEEPALIVE_COUNT: Final = 9
 """Unanswered questions before the connection is dead."""
 SUBSCRIBER_QUEUE_MESSAGES: Final = 1000
 """Messages that wait for one slow local subscriber; the oldest is dropped beyond it."""
+LATCHED_MAX: Final = 100
+"""Messages of one source that are kept for late subscribers (durability transient_local), whatever the depth."""
 SUBSCRIBER_QUEUE_BYTES: Final = 32 * MIB
 """The same in bytes; one message always fits."""
 DEFINITION_MAX: Final = 1 * MIB

@@ -17,7 +17,7 @@ from rmpa.bridge.aio.legs import Leg, ReliableLeg, make_leg
 from rmpa.bridge.quality import Quality
 from rmpa.bridge.watch import Watch
 from rmpa.core import limits
-from rmpa.core.contract import Contract, Durability, Reliability
+from rmpa.core.contract import Contract, Durability, Priority, Reliability
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.reliable import ReliableReceiver
@@ -227,7 +227,6 @@ class ImportFlow:
         self._ack_timer: asyncio.TimerHandle | None = None
         self.quality = Quality()
         self.watch = Watch(contract, now)
-        self.lane = "express"
         self.messages = 0
         self.bytes = 0
         self.lost = 0
@@ -240,6 +239,14 @@ class ImportFlow:
         """Messages that came after their lifespan."""
         self.last_stamp_ns = 0
         self.last_wall_ns = 0
+        self._last_size = 0
+
+    @property
+    def lane(self) -> str:
+        """The lane of its messages: ``express`` or ``bulk``; where size decides, that of the last one."""
+        if self.contract.priority is Priority.NORMAL:
+            return "bulk" if self._last_size > limits.EXPRESS_MESSAGE_MAX else "express"
+        return "express" if self.contract.priority is Priority.HIGH else "bulk"
 
     @property
     def position(self) -> tuple[int, int] | None:
@@ -252,9 +259,8 @@ class ImportFlow:
         self._drop_parts()
         return self._receiver.begin(epoch, first) if self._receiver is not None else True
 
-    def rebind(self, link_time: LinkTime, on_ack: Callable[[int], None]) -> None:
+    def rebind(self, on_ack: Callable[[int], None]) -> None:
         """Go on over another link."""
-        self._time = link_time
         self._on_ack = on_ack
 
     def message(self, sequence: int, stamp_ns: int, framed: memoryview) -> None:
@@ -320,6 +326,7 @@ class ImportFlow:
         self.bytes += size
         self.last_stamp_ns = stamp_ns
         self.last_wall_ns = now_ns
+        self._last_size = size
         self.watch.last = now
         self.quality.arrived(now, now_ns, stamp_ns, size)
 

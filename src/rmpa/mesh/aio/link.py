@@ -77,12 +77,14 @@ class Takers:
             call.
         part: ``(link, route, sequence, stamp_ns, flags, part)``: a part of one, likewise.
         mark: ``(link, kind, route, sequence)``: an acknowledgement, or the answer to a fence.
+        clock: ``(link)``: the peer's clock is known, or known better.
         lane_lost: ``(link)``: the bulk lane's connection is gone, and what was on its way; the link is not.
     """
 
     data: OnLinkData
     part: OnLinkPart
     mark: OnLinkMark
+    clock: Callable[[MeshLink], None]
     lane_lost: Callable[[MeshLink], None]
 
 
@@ -366,6 +368,8 @@ class MeshLink:
         elif isinstance(event, Ponged):
             if (answer := self._pings.get(event.stamp)) is not None and not answer.done():
                 answer.set_result(event.rtt)
+            if self._takers is not None:
+                self._takers.clock(self)
         elif isinstance(event, HelloReceived):
             verdict = self._owner.link_judge(self, event.hello)
             if verdict is None:
