@@ -13,11 +13,13 @@ import rmpa
 from rmpa.bridge.imports import RouteState
 from rmpa.bridge.policy import Policy, is_own
 from rmpa.core.aio.clock import SystemClock
+from rmpa.core.aio.realtime import refused
 from rmpa.monitor.snapshot import AgentInfo, LinkInfo, PeerInfo, RouteInfo, Snapshot, TopicInfo
 
 if TYPE_CHECKING:
     from rmpa.agent.station import Station
     from rmpa.bridge.aio.bridge import Attached, Bridge
+    from rmpa.core.aio.realtime import Wish
     from rmpa.core.config import Settings
     from rmpa.core.counters import Counters
     from rmpa.discovery.events import PeerView
@@ -35,16 +37,24 @@ class View:
         bridge: Its bridge.
         counters: Those of its other parts.
         started: Seconds since the epoch.
+        wishes: What came of ``--realtime``.
     """
 
     def __init__(
-        self, settings: Settings, core: RosCore, bridge: Bridge, *counters: Counters, started: float
+        self,
+        settings: Settings,
+        core: RosCore,
+        bridge: Bridge,
+        *counters: Counters,
+        started: float,
+        wishes: tuple[Wish, ...] = (),
     ) -> None:
         self._settings = settings
         self._core = core
         self._bridge = bridge
         self._counters = counters
         self._started = started
+        self._wishes = wishes
         self._process = psutil.Process()
         self._clock = SystemClock()
         self._policy = Policy(settings.policy)
@@ -64,8 +74,13 @@ class View:
             peers=self._peers(),
             topics=self._topics(),
             counters=dict(sorted(counters.items())),
-            notes=tuple(self.station.discovery.notes()) if self.station is not None else (),
+            notes=self._notes(),
         )
+
+    def _notes(self) -> tuple[str, ...]:
+        notes = tuple(self.station.discovery.notes()) if self.station is not None else ()
+        missing = refused(self._wishes)
+        return (*notes, missing) if missing else notes
 
     def _agent(self) -> AgentInfo:
         identity = self.station.identity if self.station is not None else None
@@ -84,6 +99,7 @@ class View:
             addresses=tuple(str(a) for a in (identity.guid.address, *identity.addresses)) if identity else (),
             interfaces=tuple(i.name for i in self.station.discovery.interfaces) if self.station else (),
             config_file=str(self._settings.config_file or ""),
+            realtime=tuple(map(str, self._wishes)),
         )
 
     def _peers(self) -> tuple[PeerInfo, ...]:

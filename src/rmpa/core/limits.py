@@ -361,6 +361,12 @@ CALL_BACK_DELAYS: Final = (0.05, 1.0)
 """When a proxy is registered again whose subscribers were hung up on: at once, and for those that noticed late."""
 RECONCILE_INTERVAL: Final = 5.0
 """The plan is compared with what is really open this often, so that nothing stays stuck."""
+WATCH_RECENT: Final = 16
+"""Last events of a topic's contract that are remembered for the user; the counts tell of the others."""
+WATCH_LOOK: Final = 0.25
+"""A source that is not alive is looked at this often: its messages leave their time behind, and wake nobody."""
+WATCH_RUN: Final = 1.0
+"""Losses of one kind that follow each other within this time are remembered as one event."""
 QUALITY_WINDOW: Final = 512
 """Messages of a remote source that its figures are made of, a power of two: 10 KB a route, and a 99th percentile that
 five of them exceed."""

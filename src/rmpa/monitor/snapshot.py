@@ -27,6 +27,7 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
         addresses: Its numeric IPv4 addresses, best first.
         interfaces: The interfaces that beacons go out on.
         config_file: Where its settings were read, or empty.
+        realtime: What came of each wish of ``--realtime``, ready to read; empty without it.
     """
 
     name: str
@@ -43,6 +44,7 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
     addresses: tuple[str, ...] = ()
     interfaces: tuple[str, ...] = ()
     config_file: str = ""
+    realtime: tuple[str, ...] = ()
 
 
 class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
