@@ -230,7 +230,9 @@ def test_durations(raw: object, seconds: float | None) -> None:
     assert read_duration(raw) == seconds
 
 
-@pytest.mark.parametrize(("raw", "rate"), [(10, 10.0), ("10 Hz", 10.0), ("0.5hz", 0.5), ("unlimited", None)])
+@pytest.mark.parametrize(
+    ("raw", "rate"), [(10, 10.0), ("10 Hz", 10.0), ("0.5hz", 0.5), ("unlimited", None), (math.inf, None)]
+)
 def test_rates(raw: object, rate: float | None) -> None:
     assert read_rate(raw) == rate
 

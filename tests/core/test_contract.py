@@ -36,7 +36,7 @@ VALUES: dict[str, st.SearchStrategy[object]] = {
     "priority": st.sampled_from(Priority),
     "max_rate": st.one_of(st.none(), st.sampled_from([1.0, 10.0])),
 }
-CONTRACTS = st.builds(Contract, **VALUES)  # type: ignore[arg-type]
+CONTRACTS = st.builds(Contract, **VALUES)
 GLOBS = st.lists(st.sampled_from(["/a", "/a/**", "/*", "/**", "/b/?"]), max_size=2, unique=True).map(tuple)
 TYPE_GLOBS = st.lists(st.sampled_from(["m/A", "m/*", "**", "n/B"]), max_size=2, unique=True).map(tuple)
 RULES = st.lists(st.builds(Rule, GLOBS, TYPE_GLOBS, st.fixed_dictionaries({}, optional=VALUES)), max_size=5).map(

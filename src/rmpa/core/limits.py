@@ -19,9 +19,10 @@ loop is 3 ms late (p50) with Python's own 5 ms, and 0.16 ms with this."""
 COLLECT_LOOK: Final = 0.25
 """Between two looks how much cyclic garbage there may be."""
 COLLECT_LOOK_AGAIN: Final = 0.05
-"""The same after a look that found enough: many small portions hold the loop for less than a large one."""
-COLLECT_YOUNG: Final = 500
-"""Objects that came to stay since the last collection, for the next: some 40 µs, and what 70 XML-RPC calls leave."""
+"""The same after a look that found enough: messages on their way are gone by then, and many small portions hold the
+loop for less than a large one."""
+COLLECT_YOUNG: Final = 1000
+"""Objects that came to stay since the last collection, for the next: some 70 µs, and what 140 XML-RPC calls leave."""
 COLLECT_YOUNG_MAX: Final = 20_000
 """The same where the loop never rests: 1.5 ms, and a few MB."""
 COLLECT_LOAD: Final = 0.5
@@ -305,8 +306,13 @@ RECEIVED_QUEUE: Final = 1000
 """Messages that wait for an ``async for``; the oldest is dropped beyond it."""
 HTTP_BODY_MAX: Final = 8 * MIB
 """An XML-RPC call: parameters with maps and URDFs reach a few MB."""
-HTTP_BODY_INLINE: Final = 256 * KIB
-"""Bodies above this are parsed in a thread: 8 MiB of numbers would hold the loop for seconds."""
+HTTP_BODY_INLINE: Final = 64 * KIB
+"""Bodies above this are read and written over several turns of the loop: 8 MiB of numbers would hold up keepalives for
+seconds. Shorter ones take some 5 ms, in which only data goes first."""
+XMLRPC_SLICE: Final = 2 * KIB
+"""What is parsed at once of a body, some 100 microseconds; then data goes first."""
+HTTP_ACCEPTS: Final = 4
+"""Connections that are accepted without a pause, 40 microseconds each."""
 HTTP_HEADERS_MAX: Final = 64 * KIB
 """A request's headers, all together."""
 HTTP_BACKLOG: Final = 128

@@ -41,7 +41,8 @@ def what_is_due(young: int, grown: int, load: float, *, quiet: bool) -> Due:
     """Decide.
 
     Args:
-        young: Objects made since the last collection, less those that are gone: no more of them can be garbage.
+        young: Objects made since the last collection, less those that are gone: no more of them can be garbage. The
+            least of the last two looks: messages on their way are objects too, but soon gone.
         grown: Memory blocks by which the heap has grown since the last full collection.
         load: Share of the time since the last look that the loop worked, 0 to 1.
         quiet: Whether the links carried next to nothing since then.
@@ -67,6 +68,7 @@ class Collector:
         self._timer: asyncio.TimerHandle | None = None
         self._enabled = False
         self._heap = 0
+        self._young = 0
         self._seen = (0.0, 0.0, 0)
         self.longest_pause = 0.0
         """Seconds of the longest collection so far."""
@@ -104,17 +106,16 @@ class Collector:
         then, worked, carried = self._seen
         now, works, carries = self._seen = self._now()
         elapsed = max(now - then, 1e-6)
+        before, self._young = self._young, gc.get_count()[0]
         due = what_is_due(
-            gc.get_count()[0],
+            min(before, self._young),
             sys.getallocatedblocks() - self._heap,
             (works - worked) / elapsed,
             quiet=0 <= carries - carried < limits.COLLECT_QUIET_BYTES * elapsed,
         )
-        if due is Due.NOTHING:
-            self._next(limits.COLLECT_LOOK)
-            return
-        self._collect(due)
-        self._next(limits.COLLECT_LOOK_AGAIN)
+        if due is not Due.NOTHING:
+            self._collect(due)
+        self._next(limits.COLLECT_LOOK if self._young < limits.COLLECT_YOUNG else limits.COLLECT_LOOK_AGAIN)
 
     def _collect(self, due: Due) -> None:
         begin = time.perf_counter()

@@ -1,0 +1,156 @@
+"""The collector in whole agents, and what they show of ``--realtime``."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from rmpa.agent import Agent
+from rmpa.core import limits
+from rmpa.core.aio.realtime import Wish
+from rmpa.core.config import Settings
+from rmpa.monitor.aio.control_client import ControlClient
+from rmpa.ros.aio.http_client import call_api
+from rmpa.ros.aio.node import Node
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Iterator
+    from pathlib import Path
+
+    from rmpa.monitor.snapshot import Snapshot
+
+DEADLINE: Final = 20.0
+MESSAGES: Final = 20_000
+PER_TURN: Final = 20
+
+
+async def until(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(DEADLINE):
+        while not condition():
+            await asyncio.sleep(0.005)
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Callable[[str], Settings]:
+    port = 20000 + os.getpid() % 20000
+
+    def make(name: str) -> Settings:
+        return Settings(name=name, core_port=0, interfaces=("lo",), group_port=port, runtime_dir=str(tmp_path))
+
+    return make
+
+
+@pytest.fixture
+async def pair(settings: Callable[[str], Settings]) -> AsyncIterator[tuple[Agent, Agent]]:
+    a, b = Agent(settings("a")), Agent(settings("b"))
+    await a.start()
+    await b.start()
+    await until(lambda: len(list(a.bridge.attached())) == len(list(b.bridge.attached())) == 1)
+    yield a, b
+    await b.close()
+    await a.close()
+
+
+@pytest.fixture
+def collections() -> Iterator[list[int]]:
+    """The generation of each collection from now on."""
+    seen: list[int] = []
+
+    def note(phase: str, info: dict[str, int]) -> None:
+        if phase == "start":
+            seen.append(info["generation"])
+
+    gc.callbacks.append(note)
+    yield seen
+    gc.callbacks.remove(note)
+
+
+async def test_no_collection_runs_while_messages_flow(pair: tuple[Agent, Agent], collections: list[int]) -> None:
+    a, b = pair
+    async with Node("talker", master_uri=a.core.uri) as talker, Node("hearer", master_uri=b.core.uri) as hearer:
+        heard = sent = 0
+
+        def hear(_: object) -> None:
+            nonlocal heard
+            heard += 1
+
+        publisher = await talker.advertise("/chatter", "std_msgs/String")
+        subscriber = await hearer.subscribe("/chatter", "std_msgs/String", hear)
+        await until(lambda: publisher.subscribers and subscriber.publishers)
+        message = publisher.make({"data": "x" * 64})
+
+        async def at_most_waiting(count: int) -> None:
+            await until(lambda: heard >= sent - count)
+
+        async def send(count: int) -> None:
+            nonlocal sent
+            for _ in range(count // PER_TURN):
+                for _ in range(PER_TURN):
+                    publisher.publish(message)
+                sent += PER_TURN
+                await at_most_waiting(10 * PER_TURN)  # no queue is full: none is dropped
+            await at_most_waiting(0)
+
+        await send(1000)  # what is made at the first message has come to stay
+        await asyncio.sleep(0.5)
+        gc.collect()
+        collections.clear()
+        made = gc.get_count()[0]
+        await send(MESSAGES)
+        assert collections == []
+        assert gc.get_count()[0] - made < limits.COLLECT_YOUNG
+        assert gc.collect() < 200  # keepalives and timers; the messages left nothing
+        assert not gc.isenabled()
+
+
+async def test_garbage_of_control_work_is_collected_while_the_agent_runs(
+    pair: tuple[Agent, Agent], collections: list[int]
+) -> None:
+    a, _ = pair
+    gc.collect()
+    collections.clear()
+    objects = len(gc.get_objects())
+    for _ in range(10):
+        for _ in range(100):
+            await call_api(a.core.uri, "getPid", "/somebody")  # a connection each: a cycle of asyncio's own
+        await asyncio.sleep(limits.COLLECT_LOOK_AGAIN)
+    await until(lambda: len(gc.get_objects()) < objects + 5 * limits.COLLECT_YOUNG)
+    assert 2 <= len(collections) < 40
+    assert set(collections) == {0}
+    assert a._view.snapshot().counters["collector.young"] >= 1
+
+
+async def test_the_collector_is_the_interpreters_again_when_the_agent_ends(
+    settings: Callable[[str], Settings],
+) -> None:
+    assert gc.isenabled()
+    agent = Agent(settings("a"))
+    await agent.start()
+    assert not gc.isenabled()
+    await agent.close()
+    assert gc.isenabled()
+    assert gc.get_freeze_count() == 0
+
+
+async def test_the_snapshot_shows_what_was_granted(settings: Callable[[str], Settings], tmp_path: Path) -> None:
+    wishes = (
+        Wish("SCHED_FIFO", True, "priority 50"),
+        Wish("memory lock", False, "Operation not permitted", "put LimitMEMLOCK=infinity into the systemd unit"),
+    )
+    agent = Agent(settings("a"), wishes)
+    await agent.start()
+    try:
+        snapshot = await asyncio.to_thread(ask, tmp_path)
+    finally:
+        await agent.close()
+    assert snapshot.agent.realtime == ("SCHED_FIFO: priority 50", "no memory lock: Operation not permitted")
+    assert snapshot.notes == ("realtime: no memory lock; the agent's log says what would grant it",)
+
+
+def ask(runtime_dir: Path) -> Snapshot:
+    with ControlClient(runtime_dir / "a.sock") as client:
+        return client.snapshot()
