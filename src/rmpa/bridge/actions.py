@@ -138,4 +138,6 @@ class Warn:
     text: str
 
 
-Action = Send | Connect | Disconnect | AddRoute | SuspendRoute | RemoveRoute | Publish | Retract | Describe | Detach | Warn
+Outgoing = Connect | Disconnect | AddRoute | SuspendRoute | RemoveRoute
+Incoming = Publish | Retract | Describe | Detach
+Action = Send | Outgoing | Incoming | Warn

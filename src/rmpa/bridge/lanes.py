@@ -62,7 +62,8 @@ class LaneSwitch:
                 self.target = BULK
             elif self.target is BULK:
                 self._small += 1
-                if self._small >= limits.EXPRESS_AGAIN_MESSAGES and now - self._large_at >= limits.EXPRESS_AGAIN_AFTER:
+                row = self._small >= limits.EXPRESS_AGAIN_MESSAGES
+                if row and now - self._large_at >= limits.EXPRESS_AGAIN_AFTER:
                     self.target = EXPRESS
         return self.target is not self.lane
 

@@ -205,13 +205,13 @@ def _validate(message: Message) -> None:
                 raise RemoteProtocolError(f"{offer.type[:200]!r}, offered for {offer.topic}, is not a message type")
         for source in message.removed:
             _check_names(source.topic, source.node)
-    elif isinstance(message, Open | Mismatch):
+    elif isinstance(message, Open):
         _check_names(message.topic, message.node)
-        if isinstance(message, Open):
-            _check_terms(message)
-        if isinstance(message, Mismatch):
-            _check_text(message.subscriber)
-            _check_text(message.text)
+        _check_terms(message)
+    elif isinstance(message, Mismatch):
+        _check_names(message.topic, message.node)
+        _check_text(message.subscriber)
+        _check_text(message.text)
     elif isinstance(message, Closed):
         _check_text(message.reason)
     elif isinstance(message, Opened):

@@ -40,7 +40,19 @@ class Parcel:
         born: When it was pushed, monotonic seconds.
     """
 
-    __slots__ = ("born", "chunks", "dropped", "framed", "held", "key", "pinned", "sent", "sequence", "size", "stamp_ns")
+    __slots__ = (
+        "born",
+        "chunks",
+        "dropped",
+        "framed",
+        "held",
+        "key",
+        "pinned",
+        "sent",
+        "sequence",
+        "size",
+        "stamp_ns",
+    )
 
     def __init__(self, key: int, size: int, sequence: int = 0, stamp_ns: int = 0, born: float = 0.0) -> None:
         self.key = key
@@ -459,8 +471,8 @@ class Outbox:
         Half of what the key holds may go at once, so that room for one large entry is not searched for by
         looking at all keys before each of a thousand small drops.
         """
-        sizes = ((f.size - newest.held * (f.parcels[-1] is newest and not newest.sent), k) for k, f in self._flows.items())
-        largest, key = max(sizes)
+        spared = 0 if newest.sent else newest.held
+        largest, key = max((f.size - spared * (f.parcels[-1] is newest), k) for k, f in self._flows.items())
         flow = self._flows[key]
         target = flow.size - largest // 2
         dropped = 0

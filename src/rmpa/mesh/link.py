@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core import limits
 from rmpa.core.clock import earliest
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
+from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import frames
 from rmpa.mesh.frames import Frame, Kind
 from rmpa.mesh.handshake import HandshakeError, Hello, Lane, Refuse, judge_welcome
@@ -284,8 +285,8 @@ class Link:
                         return offset, end - offset
                     # Handed on as it comes: nobody waits for the end of a large frame, and none is moved about.
                     self._left = end - size
-                    self._rest = (route, sequence, stamp_ns, flags & frames.LAST)
-                    self.on_part(route, sequence, stamp_ns, flags & frames.FIRST, view[start:])
+                    self._rest = (route, sequence, stamp_ns, flags & LAST)
+                    self.on_part(route, sequence, stamp_ns, flags & FIRST, view[start:])
                     return size, 0
                 offset = end
                 if kind != _DATA:
@@ -425,9 +426,7 @@ class Link:
             self.on_part(route, sequence, stamp_ns, 0 if self._left else last, view[:count])
         return count
 
-    def _handle(
-        self, kind: Kind, payload: memoryview, route: int, sequence: int, stamp_ns: int, now: float
-    ) -> None:
+    def _handle(self, kind: Kind, payload: memoryview, route: int, sequence: int, stamp_ns: int, now: float) -> None:
         if _log.isEnabledFor(logging.DEBUG):
             _log.debug("< %s: %s, %d bytes", self._name, kind.name, len(payload))
         if kind is Kind.PING:

@@ -286,10 +286,7 @@ class Bridge:
         self._by_number.pop(attached.peer, None)
         self._by_link.pop(attached.link, None)
         for action in self._exports.link_down(attached.peer):
-            if isinstance(action, act.RemoveRoute):
-                self._outbound.remove_route(action)
-            else:
-                self._do(action)
+            self._do(action)
         self._imports.link_down(attached.peer)  # its actions are what closing the inbound side does at once
         task = asyncio.create_task(attached.inbound.close(), name=f"retract {attached.inbound.prefix}")
         self._closing.add(task)
@@ -303,7 +300,8 @@ class Bridge:
     def _occurred(self, peer: int, source: Source, occurred: Occurred) -> None:
         attached = self._by_number.get(peer)
         if attached is not None:
-            self._warn(f"contract.{occurred.kind.value}", f"{peer} {source}", f"{attached.link.name}: {source}: {occurred.text}")
+            text = f"{attached.link.name}: {source}: {occurred.text}"
+            self._warn(f"contract.{occurred.kind.value}", f"{peer} {source}", text)
 
     # --- the local graph's side --------------------------------------------------------------------------------
 
@@ -368,30 +366,38 @@ class Bridge:
 
     def _do(self, action: act.Action) -> None:
         match action:
-            case act.Connect():
-                self._outbound.connect(action)
-                return
-            case act.Disconnect():
-                self._outbound.disconnect(action.source)
-                return
             case act.Warn():
                 self._warn(action.kind, action.who, action.text)
-                return
+            case act.Send():
+                attached = self._by_number.get(action.peer)
+                if attached is not None and attached.away is None:
+                    attached.link.send_control(encode(action.message))
+            case act.Publish() | act.Retract() | act.Describe() | act.Detach():
+                self._do_inbound(action)
+            case _:
+                self._do_outbound(action)
+
+    def _do_outbound(self, action: act.Outgoing) -> None:
+        match action:
+            case act.Connect():
+                self._outbound.connect(action)
+            case act.Disconnect():
+                self._outbound.disconnect(action.source)
             case act.SuspendRoute():
                 self._outbound.suspend_route(action)
-                return
+            case act.AddRoute():
+                self._outbound.add_route(action, self._by_number[action.peer].link)
             case act.RemoveRoute():
                 self._outbound.remove_route(action)
+                attached = self._by_number.get(action.peer)
+                if attached is not None and attached.away is None:
+                    attached.link.close_route(action.route)
+
+    def _do_inbound(self, action: act.Incoming) -> None:
         attached = self._by_number.get(action.peer)
         if attached is None:
             return
         match action:
-            case act.Send() if attached.away is None:
-                attached.link.send_control(encode(action.message))
-            case act.AddRoute():
-                self._outbound.add_route(action, attached.link)
-            case act.RemoveRoute() if attached.away is None:
-                attached.link.close_route(action.route)
             case act.Publish():
                 attached.inbound.publish(action)
             case act.Retract():

@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.bridge.aio.legs import Leg, ReliableLeg, make_leg
@@ -23,6 +22,8 @@ from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.reliable import ReliableReceiver
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rmpa.bridge.aio.legs import DataLink
     from rmpa.core.aio.stream import Buffer
 
@@ -218,7 +219,7 @@ class ImportFlow:
             self._receiver = ReliableReceiver()
         self._epoch = 0
         self._plain = self._receiver is None
-        self._stale_ns = round(limits.STALE_AGE * 1e9) if contract.lifespan is None else round(contract.lifespan * 1e9)
+        self._stale_ns = round((contract.lifespan or limits.STALE_AGE) * 1e9)
         self._size = self._got = 0
         self._parts: bytearray | None = None
         self._sequence: int | None = None

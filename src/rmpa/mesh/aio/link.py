@@ -32,6 +32,7 @@ from rmpa.mesh.link import (
 
 if TYPE_CHECKING:
     import socket
+
     from rmpa.core.clock import Clock
     from rmpa.core.guid import Guid
     from rmpa.core.identity import Identity
@@ -89,8 +90,9 @@ class Takers:
 
 
 class MeshLink:
-    """One connection with a peer. That of the express lane is the link, as the rooms above see it; it carries the
-    bulk lane's with it while there is one.
+    """One connection with a peer.
+
+    That of the express lane is the link, as the rooms above see it; it has the bulk lane's while there is one.
 
     Args:
         link_id: The mesh's number for it.
@@ -318,8 +320,8 @@ class MeshLink:
             self.detach(old)
             old.close("replaced by a newer bulk lane")
         self._bulk_link = bulk
-        bulk._listen(self, self._takers)  # noqa: SLF001 - its own class
-        self.bulk.connect(bulk._stream)  # noqa: SLF001
+        bulk._listen(self, self._takers)
+        self.bulk.connect(bulk._stream)
 
     def detach(self, bulk: MeshLink) -> bool:
         """The bulk lane's connection is gone; whether it was this one."""
@@ -328,7 +330,7 @@ class MeshLink:
         self._bulk_link = None
         self._bulk_before[0] += bulk.bytes_in
         self._bulk_before[1] += bulk.bytes_out
-        bulk._listen(self, None)  # noqa: SLF001 - its own class
+        bulk._listen(self, None)
         self.bulk.disconnect()
         if self._takers is not None:
             self._takers.lane_lost(self)

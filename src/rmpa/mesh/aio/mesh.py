@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from rmpa.core import limits
 from rmpa.core.aio.clock import SystemClock
-from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.backoff import Backoff
 from rmpa.core.config import LaneSettings
+from rmpa.core.counters import Counters, RefusalLog
 from rmpa.mesh.aio.link import MeshLink, Takers
 from rmpa.mesh.aio.sockets import tune_bulk, tune_express
 from rmpa.mesh.handshake import Lane, Refusal
@@ -324,7 +324,8 @@ class Mesh:
 
     def _bulk_wanted(self, link: MeshLink, delay: float = 0.0) -> None:
         """Dial a link's bulk lane, if it is ours to dial: who reached the other once will do so again."""
-        if self._running and link.used and link.dialled and link.bulk_link is None and link.id not in self._bulk_dials:
+        ours = self._running and link.used and link.dialled
+        if ours and link.bulk_link is None and link.id not in self._bulk_dials:
             task = asyncio.get_running_loop().create_task(self._dial_bulk(link, delay), name=f"bulk {link.name}")
             self._bulk_dials[link.id] = task
             task.add_done_callback(lambda _: self._bulk_dials.pop(link.id, None))

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def tune_express(sock: socket.socket, lanes: LaneSettings, counters: Counters) -> None:
-    """Set up the express lane: no Nagle, dead peers noticed, little waiting in the kernel, the first place in queues."""
+    """Set up the express lane: no Nagle, dead peers noticed, little waits in the kernel, first in every queue."""
     _tune(sock, limits.LINK_UNSENT_BYTES, lanes.express_dscp, lanes.express_priority, counters)
 
 
