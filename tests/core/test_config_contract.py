@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +22,7 @@ from rmpa.core.contract import KEYS, Contract, Contracts, Durability, History, L
 from rmpa.core.errors import ConfigError
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "rmpa.toml"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "contracts.md"
 Load = Callable[[str], Loaded]
 
 
@@ -96,6 +98,30 @@ def test_the_examples_rules_load_and_show_every_key(load: Load) -> None:
     assert contracts.of("/camera", "sensor_msgs/Image").max_rate == 10
     assert contracts.of("/tf_static", "tf2_msgs/TFMessage").durability is Durability.TRANSIENT_LOCAL
     assert contracts.of("/odom", "nav_msgs/Odometry") == Contract()
+
+
+def test_the_rules_of_the_documentation_load(load: Load) -> None:
+    blocks = re.findall(r"```toml\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+    assert len(blocks) > 5
+    for block in blocks:
+        loaded = load(block)
+        assert loaded.settings.contracts
+        assert loaded.notes == ()
+    contracts = Contracts(load(blocks[1]).settings.contracts)
+    assert contracts.of("/imu/data", "sensor_msgs/Imu") == Contract(priority=Priority.HIGH)
+    assert contracts.of("/scan", "sensor_msgs/LaserScan") == Contract(priority=Priority.LOW, max_rate=10.0)
+
+
+def test_the_documentation_has_every_key_and_every_default() -> None:
+    text = DOCUMENT.read_text().partition("## Both sides")[0]
+    written = dict(re.findall(r"^\| `(\w+)` \| `\"?(\w+)\"?`", text, re.MULTILINE))
+    defaults = {
+        key: str(
+            getattr(Contract(), key.removesuffix("_duration")) or ("unlimited" if key == "max_rate" else "infinite")
+        )
+        for key in CONTRACT_KEYS[2:]
+    }
+    assert {key: value for key, value in written.items() if key in defaults} == defaults
 
 
 RULE = '[[contract]]\ntopics = ["/a"]\n'

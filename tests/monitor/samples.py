@@ -2,7 +2,17 @@
 
 from __future__ import annotations
 
-from rmpa.monitor.snapshot import AgentInfo, LinkInfo, PeerInfo, RouteInfo, Snapshot, TopicInfo
+from rmpa.monitor.snapshot import (
+    AgentInfo,
+    EventInfo,
+    LatencyInfo,
+    LinkInfo,
+    PeerInfo,
+    RouteInfo,
+    Snapshot,
+    Spread,
+    TopicInfo,
+)
 
 SNAPSHOT = Snapshot(
     agent=AgentInfo(
@@ -20,6 +30,7 @@ SNAPSHOT = Snapshot(
         addresses=("10.0.0.1",),
         interfaces=("wlan0",),
         config_file="/etc/rmpa/rmpa.toml",
+        realtime=("SCHED_FIFO 50: granted",),
     ),
     taken=1_700_003_725.0,
     peers=(
@@ -73,9 +84,39 @@ SNAPSHOT = Snapshot(
                     direction="in",
                     state="open",
                     type="sensor_msgs/Joy",
+                    md5="5a9ea5f83505693b71e785041e67a8bb",
                     messages=600,
                     bytes=60_000,
-                    last_ago=0.05,
+                    dropped=1,
+                    lost=3,
+                    late=2,
+                    expired=4,
+                    age=0.05,
+                    rate=10.0,
+                    bandwidth=1_000.0,
+                    period=Spread(count=511, mean=0.1, sd=0.00031, min=0.0988, max=0.1012, p50=0.1, p99=0.10082),
+                    jitter=0.00082,
+                    latency=LatencyInfo(
+                        count=512,
+                        mean=0.00044,
+                        sd=0.00009,
+                        min=0.00031,
+                        max=0.0012,
+                        p50=0.000412,
+                        p99=0.00079,
+                        last=0.00039,
+                        error=0.000216,
+                    ),
+                    latched=True,
+                    lane="express",
+                    contract={"reliability": "reliable", "deadline": 0.2},
+                    events={"deadline_missed": 3, "messages_lost": 3},
+                    recent=(
+                        EventInfo(kind="messages_lost", count=3, text="3 messages lost", ago=62.0),
+                        EventInfo(
+                            kind="deadline_missed", count=3, text="no message for 610 ms; deadline 200 ms", ago=4.2
+                        ),
+                    ),
                 ),
             ),
         ),

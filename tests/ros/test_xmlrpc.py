@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime as dt
+import gc
 import math
 import xmlrpc.client
 from typing import TYPE_CHECKING
@@ -13,12 +14,14 @@ from hypothesis import strategies as st
 from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.ros.xmlrpc import (
+    CallReader,
     Reply,
     RosFault,
     XmlRpcValue,
     brief,
     parse_call,
     parse_response,
+    response_pieces,
     serialize_call,
     serialize_fault,
     serialize_response,
@@ -78,6 +81,61 @@ def test_every_prefix_of_a_call_is_refused_or_equal() -> None:
     for end in range(len(GOLDEN_CALL.rstrip())):
         with pytest.raises(RemoteProtocolError):
             parse_call(GOLDEN_CALL[:end])
+
+
+@pytest.mark.parametrize("size", [1, 2, 7, 100])
+def test_a_call_is_read_piece_by_piece(size: int) -> None:
+    reader = CallReader()
+    for begin in range(0, len(GOLDEN_CALL), size):
+        reader.feed(GOLDEN_CALL[begin : begin + size])
+    assert reader.close() == ("setParam", GOLDEN_PARAMS)
+
+
+def test_a_fault_in_pieces_is_no_call() -> None:
+    reader = CallReader()
+    for byte in serialize_fault(1, "no"):
+        reader.feed(bytes([byte]))
+    with pytest.raises(RemoteProtocolError, match="fault came"):
+        reader.close()
+
+
+def test_an_endless_comment_in_pieces_is_looked_at_a_few_times_only() -> None:
+    """expat begins again at the start of an unfinished token whenever it is fed: 8 MiB would take seconds."""
+    reader = CallReader()
+    given: list[bytes] = []
+    reader._document._parser.feed = given.append  # type: ignore[assignment]
+    reader._document._expat = type("Stuck", (), {"CurrentByteIndex": 0})()
+    for _ in range(4096):
+        reader.feed(b"x" * 2048)
+    assert len(given) < 16
+
+
+def test_reading_leaves_no_garbage_for_a_collector_that_is_off() -> None:
+    bodies = [GOLDEN_CALL, *MALFORMED]
+    gc.collect()
+    gc.disable()
+    try:
+        for body in bodies:
+            with contextlib.suppress(RemoteProtocolError):
+                parse_call(body)
+        assert gc.collect() == 0
+    finally:
+        gc.enable()
+
+
+def test_much_is_written_in_many_short_pieces() -> None:
+    value: XmlRpcValue = [1, "", {"numbers": [1.5] * 5000, "text": "<a>\n" * 20000, "bytes": b"x" * 100_000}]
+    written = list(response_pieces(value))
+    assert max(map(len, written)) < 64 * limits.KIB
+    assert len(written) > 50
+    assert parse_response(b"".join(written)) == value
+
+
+@pytest.mark.parametrize("length", [0, 56, 57, 58, 7295, 7296, 7297, 20_000])
+def test_long_texts_and_bytes_are_written_as_the_standard_library_does(length: int) -> None:
+    value: list[str | bytes] = [("<é&>" * length)[:length], b"\x00\xff" * (length // 2)]
+    expected = xmlrpc.client.dumps((value,), methodresponse=True).encode()
+    assert serialize_response(value) == expected
 
 
 def test_golden_response_and_fault() -> None:
@@ -247,8 +305,10 @@ def test_calls_come_back_as_they_were(params: list[XmlRpcValue]) -> None:
 
 
 @given(values)
-def test_the_standard_library_reads_what_we_write(value: XmlRpcValue) -> None:
-    (read,), _ = xmlrpc.client.loads(serialize_response(value).decode(), use_builtin_types=True)
+def test_we_write_what_the_standard_library_writes(value: XmlRpcValue) -> None:
+    written = serialize_response(value).decode()
+    assert written == xmlrpc.client.dumps((value,), methodresponse=True)  # type: ignore[arg-type]
+    (read,), _ = xmlrpc.client.loads(written, use_builtin_types=True)
     assert read == value
 
 

@@ -129,8 +129,11 @@ class Agent:
 
     # --- the control socket's handlers -------------------------------------------------------------------------
 
-    def _snapshot(self, _args: dict[str, object]) -> Snapshot:
-        return self._view.snapshot()
+    def _snapshot(self, args: dict[str, object]) -> Snapshot:
+        topics = args.get("topics")
+        if topics is not None and not isinstance(topics, list):
+            raise ConfigError("topics", f"{topics!r} is not a list of topics")
+        return self._view.snapshot(frozenset(map(str, topics)) if topics is not None else None)
 
     async def _ping(self, args: dict[str, object]) -> PingReply:
         link = self._link(str(args.get("peer", "")))

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 import click
 
 from rmpa.bridge.proxy_names import proxied_node
-from rmpa.cli.master import Graph, Master, choose_master, read_graph, read_topic
+from rmpa.cli.master import Graph, Master, TopicName, choose_master, read_graph, read_topic
 from rmpa.cli.options import agent_option, json_option, master_option
 from rmpa.cli.output import coloured, duration, print_json, printable, warn
+from rmpa.cli.topic_figures import ask_agent, facts
 from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
@@ -103,18 +104,30 @@ def _verbose(title: str, what: str, graph: Graph, names: list[str]) -> None:
         click.echo(f" * {printable(name)} [{kind}] {count} {what}{'s' if count != 1 else ''}{mark}")
 
 
-@click.command(epilog="\b\nExamples:\n  rmpa topic info /cmd\n")
+@click.command(
+    epilog="""\
+\b
+Examples:
+  rmpa topic info /cmd
+  rmpa topic info joystick:/cmd                       what comes from joystick alone
+  rmpa topic info /cmd --json | jq '.mesh.routes[0].latency.p99'
+"""
+)
 @click.argument("topic")
 @json_option
 @agent_option
 @master_option
 def info(topic: str, as_json: bool, agent: str | None, master: str | None) -> None:
-    """Show a topic's type, publishers and subscribers, and what of it crosses."""
+    """Show a topic's type, publishers and subscribers, and what of it crosses.
+
+    Of what comes over the mesh the agent measures, over the last minute: rate, period, jitter and bandwidth; what was
+    lost; and the one-way latency from the publisher's agent to this one, with the bound of what is known of the other
+    machine's clock. It measures only while somebody here listens.
+    """
     wanted = read_topic(topic)
     chosen, graph = _graph(master, agent)
     graph.require(wanted.topic)
-    snapshot = chosen.snapshot()
-    crossing = next((t for t in snapshot.topics if t.name == wanted.topic), None) if snapshot else None
+    crossing = ask_agent(chosen, wanted.topic)
     if as_json:
         print_json(_topic_json(graph, wanted.topic) | {"mesh": crossing})
         return
@@ -129,18 +142,21 @@ def info(topic: str, as_json: bool, agent: str | None, master: str | None) -> No
             whence = "" if proxy is None else f"{proxy[1]} of peer {proxy[0]}, by its proxy "
             click.echo(f" * {printable(whence + node)}")
     if crossing is not None:
-        _print_crossing(crossing)
+        _print_crossing(crossing, wanted)
 
 
-def _print_crossing(crossing: TopicInfo) -> None:
+def _print_crossing(crossing: TopicInfo, wanted: TopicName) -> None:
     click.echo("\nMesh:" + ("" if crossing.routes else " nothing of it crosses"))
     if crossing.policy:
         click.echo(f" * {'may cross' if crossing.crosses else 'stays home'}: {printable(crossing.policy)}")
     for route in crossing.routes:
-        way = f"from {route.peer}" if route.direction == "in" else f"to {route.peer}"
-        last = "" if route.last_ago is None else f", last {duration(route.last_ago)} ago"
-        text = f"{way}: {route.node} {route.state}, {route.messages} messages, {route.dropped} dropped{last}"
-        click.echo(f" * {printable(text)}")
+        if wanted.peer not in (None, route.peer):
+            continue
+        way = "from" if route.direction == "in" else "to"
+        last = "" if route.age is None else f", last {duration(route.age)} ago"
+        click.echo(printable(f" * {way} {route.peer}: {route.node} {route.state}, {route.messages} messages{last}"))
+        for label, text in facts(route):
+            click.echo(printable(f"     {label:<10} {text}"))
         if route.problem:
             warn(printable(f"{route.peer} {route.node}: {route.problem}"))
     for mismatch in crossing.mismatches:

@@ -216,7 +216,7 @@ def _doubts(rules: Sequence[Rule]) -> Iterator[Doubt]:
         if not values:
             yield Doubt((index,), "a rule that sets nothing")
         if values.get("history") == History.KEEP_ALL and "depth" in values:
-            yield Doubt((index, "depth"), "has no effect beside history keep_all, which is bounded by bytes alone")
+            yield Doubt((index, "depth"), "has no effect beside history keep_all")
         if values.get("liveliness") == Liveliness.MANUAL_BY_TOPIC and not leased:
             yield Doubt((index, "liveliness"), "has no effect without a liveliness_lease_duration")
         deadline, rate = values.get("deadline"), values.get("max_rate")

@@ -183,6 +183,8 @@ CUT_THROUGH_BYTES: Final = 32 * KIB
 """Messages above this are handed on while they still arrive."""
 STALE_AGE: Final = 0.1
 """A best-effort message that was on its way for longer (a cable was out) gives way to a newer one behind it."""
+STALE_TICK: Final = 0.04
+"""Between the looks of an agent that receives data: what it finds then came since the last one."""
 STALE_HOLD: Final = 0.03
 """How long such a message waits for a newer one; the last one of a burst is delivered after this."""
 BULK_LEASE: Final = 4.0
@@ -307,8 +309,8 @@ RECEIVED_QUEUE: Final = 1000
 HTTP_BODY_MAX: Final = 8 * MIB
 """An XML-RPC call: parameters with maps and URDFs reach a few MB."""
 HTTP_BODY_INLINE: Final = 64 * KIB
-"""Bodies above this are read and written over several turns of the loop: 8 MiB of numbers would hold up keepalives for
-seconds. Shorter ones take some 5 ms, in which only data goes first."""
+"""Bodies above this are read and written over several turns of the loop: 8 MiB of numbers would hold up keepalives
+for seconds. Shorter ones take some 5 ms, in which only data goes first."""
 XMLRPC_SLICE: Final = 2 * KIB
 """What is parsed at once of a body, some 100 microseconds; then data goes first."""
 HTTP_ACCEPTS: Final = 4
@@ -353,6 +355,12 @@ ROUTE_LINGER: Final = 1.0
 """A route stays open this long after its last local subscriber left: reconnecting nodes flap."""
 ROUTES_PER_LINK_MAX: Final = 8192
 """Open routes that one peer may hold with us."""
+ADVERTISED_AT_ONCE: Final = 64
+"""Sources in one advertisement of ours; more follow in the next turn of the loop."""
+LEARNT_AT_ONCE: Final = 16
+"""Sources of an advertisement that are dealt with at once, some 100 microseconds; then data goes first."""
+RESCANNED_AT_ONCE: Final = 16
+"""Topics of the local graph that are looked at in one turn of the loop, after a change or to reconcile."""
 TOPICS_PER_PEER_MAX: Final = 16384
 """(topic, node) pairs that one peer may advertise."""
 NODES_PER_PEER_MAX: Final = 256

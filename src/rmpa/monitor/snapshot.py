@@ -116,8 +116,68 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
     topics_out: int = 0
 
 
+class Spread(msgspec.Struct, kw_only=True, frozen=True):
+    """How samples are spread, in seconds. The percentiles are linear between neighbours.
+
+    Attributes:
+        count: Of samples.
+        mean: Their mean.
+        sd: Their standard deviation.
+        min: The least.
+        max: The greatest.
+        p50: Half of them are below.
+        p99: 99 of 100 are below.
+    """
+
+    count: int
+    mean: float
+    sd: float
+    min: float
+    max: float
+    p50: float
+    p99: float
+
+
+class LatencyInfo(Spread, kw_only=True, frozen=True):
+    """One-way latencies, from the publisher's agent taking a message to this agent handing it on.
+
+    Attributes:
+        count: Of messages.
+        mean: Their mean.
+        sd: Their standard deviation.
+        min: The least.
+        max: The greatest.
+        p50: Half of them are below.
+        p99: 99 of 100 are below.
+        last: The last message's.
+        error: The true ones lie within ± this: what is known of the other machine's clock.
+    """
+
+    last: float
+    error: float
+
+
+class EventInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """What happened to a topic's contract.
+
+    Attributes:
+        kind: ``deadline_missed``, ``lifespan_expired``, ``liveliness_lost``, ``liveliness_restored`` or
+            ``messages_lost``.
+        count: How often, or to how many messages.
+        text: Ready to read.
+        ago: Seconds since then.
+    """
+
+    kind: str
+    count: int
+    text: str
+    ago: float
+
+
 class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
     """One source that crosses the mesh, seen from here.
+
+    The figures are of the messages that an open route brought in the last minute, as far as they are remembered.
 
     Attributes:
         peer: The peer it comes from, or goes to.
@@ -127,11 +187,23 @@ class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
             is tried again) or ``hidden`` (not shown: see ``problem``).
         type: The message type that the source has.
         md5: Of that type; empty before it is known.
-        messages: That crossed since the route was first open.
+        messages: That crossed since the route was opened.
         bytes: Likewise.
         dropped: Messages dropped because a receiver was slow.
-        last_ago: Seconds since the last message.
+        lost: Messages that never came, by the gaps in their numbers.
+        late: Messages that came behind newer ones, and were dropped.
+        expired: Messages dropped beyond their lifespan.
+        age: Seconds since the last message.
+        rate: Messages a second.
+        bandwidth: Bytes a second.
+        period: From one message to the next.
+        jitter: The period's 99th percentile less its median, seconds.
+        latency: On the way; needs the link's clock.
         latched: Whether its publisher latches.
+        lane: ``express`` or ``bulk``; empty before it is known.
+        contract: What the topic's contract says that is not the default, by key.
+        events: What happened to the contract, counted by kind.
+        recent: The last of these, oldest first.
         problem: Why it does not flow, ready to read; empty if nothing is wrong.
     """
 
@@ -144,8 +216,20 @@ class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
     messages: int = 0
     bytes: int = 0
     dropped: int = 0
-    last_ago: float | None = None
+    lost: int = 0
+    late: int = 0
+    expired: int = 0
+    age: float | None = None
+    rate: float | None = None
+    bandwidth: float | None = None
+    period: Spread | None = None
+    jitter: float | None = None
+    latency: LatencyInfo | None = None
     latched: bool = False
+    lane: str = ""
+    contract: dict[str, str | float | None] = {}
+    events: dict[str, int] = {}
+    recent: tuple[EventInfo, ...] = ()
     problem: str = ""
 
 

@@ -1,25 +1,24 @@
 """XML-RPC calls and responses as bytes (xmlrpc.com/spec, and what ROS makes of it).
 
-The standard library marshals; ``defusedxml`` refuses entity declarations; this module bounds depth and size,
-insists on the types that ROS has, and writes only what XmlRpc++ (roscpp) can read: it matches strings, and an empty
-tag written ``<string/>`` or an ``<i8>`` ends its parsing without an error.
+The standard library reads; ``defusedxml`` refuses entity declarations; this module bounds depth and size and insists
+on the types that ROS has. Long documents are read and written piece by piece.
 """
 
 from __future__ import annotations
 
 import contextlib
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime
 from typing import Final, NamedTuple, TypeAlias, Union, cast
 from xml.parsers.expat import ExpatError
-from xmlrpc.client import Fault, Marshaller, ResponseError, Unmarshaller
+from xmlrpc.client import Fault, ResponseError, Unmarshaller
 
 from defusedxml.common import DefusedXmlException
 from defusedxml.xmlrpc import DefusedExpatParser
 
 from rmpa.core import limits
-from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError, RmpaError
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
+from rmpa.ros.xmlrpc_writer import legal_text, pieces
 
 XmlRpcValue: TypeAlias = Union[  # noqa: UP007 - | does not take the forward references of a recursive type
     bool, int, float, str, bytes, datetime, Sequence["XmlRpcValue"], Mapping[str, "XmlRpcValue"], None
@@ -28,8 +27,6 @@ XmlRpcValue: TypeAlias = Union[  # noqa: UP007 - | does not take the forward ref
 
 _MAX_INT: Final = (1 << 31) - 1
 _MIN_INT: Final = -(1 << 31)
-# XML 1.0, section 2.2: what a document cannot hold, not even escaped.
-_ILLEGAL: Final = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 _DECLARATION: Final = "<?xml version='1.0'?>\n"
 
 
@@ -91,7 +88,7 @@ def _end_int(unmarshaller: Unmarshaller, data: str) -> None:
 def _end_struct(unmarshaller: Unmarshaller, data: str) -> None:
     unmarshaller.end_struct(data)
     struct = unmarshaller._stack[-1]  # noqa: SLF001 - the standard library documents this class by its source
-    if not (isinstance(struct, dict) and all(isinstance(key, str) for key in struct)):
+    if not (isinstance(struct, dict) and set(map(type, struct)) <= {str}):
         raise RemoteProtocolError("XML-RPC struct with a member name that is not a string")
 
 
@@ -126,54 +123,105 @@ class _BoundedUnmarshaller(Unmarshaller):
         super().end(tag)
 
 
-def _unmarshal(data: bytes, unmarshaller: Unmarshaller) -> tuple[XmlRpcValue, ...]:
-    parser = DefusedExpatParser(unmarshaller)
-    try:
-        parser.feed(data)
-        parser.close()
-    except BaseException:
-        # Closing breaks a reference cycle, which nobody else does while the collector is off.
-        with contextlib.suppress(Exception):
-            parser.close()
-        raise
-    return cast(tuple[XmlRpcValue, ...], unmarshaller.close())
+class _Document:
+    """A document that comes piece by piece; what is wrong with it is a ``RemoteProtocolError``."""
+
+    def __init__(self) -> None:
+        self._unmarshaller = _BoundedUnmarshaller()
+        self._parser = DefusedExpatParser(self._unmarshaller)
+        self._expat = self._parser._parser  # type: ignore[attr-defined] # noqa: SLF001 - the standard library's
+        self._expat.buffer_text = True
+        self._size = 0
+        self._waiting = bytearray()
+        self._token = 0
+
+    def feed(self, data: bytes) -> None:
+        self._size += len(data)
+        if self._size > limits.HTTP_BODY_MAX:
+            raise LimitExceeded("XML-RPC body", self._size, limits.HTTP_BODY_MAX)
+        self._waiting += data
+        # expat looks at an unfinished token (a comment of megabytes) from its begin, each time that it is given more.
+        if len(self._waiting) < self._token:
+            return
+        with self._errors():
+            self._give()
+        self._token = self._size - self._expat.CurrentByteIndex
+
+    def close(self) -> tuple[str | None, tuple[XmlRpcValue, ...]]:
+        """The method's name, if it is a call, and the values.
+
+        Raises:
+            Fault: It is a fault.
+        """
+        with self._errors():
+            self._give()
+            self._parser.close()
+            params = cast(tuple[XmlRpcValue, ...], self._unmarshaller.close())
+        return self._unmarshaller.getmethodname(), params
+
+    def _give(self) -> None:
+        waiting = bytes(self._waiting)
+        self._waiting.clear()
+        self._parser.feed(waiting)
+
+    @contextlib.contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException as error:
+            # Closing breaks a reference cycle, which nobody else does while the collector is off.
+            with contextlib.suppress(Exception):
+                self._parser.close()
+            if isinstance(error, Fault):
+                raise
+            if isinstance(error, DefusedXmlException):
+                text = f"XML declares entities, which XML-RPC has no use for: {error}"
+                raise RemoteProtocolError(text) from error
+            if isinstance(error, ExpatError):
+                raise RemoteProtocolError(f"malformed XML: {error}") from error
+            if isinstance(error, ResponseError):
+                raise RemoteProtocolError(f"this XML is not XML-RPC {error}".rstrip()) from error
+            if isinstance(error, ArithmeticError | AttributeError | LookupError | TypeError | ValueError):
+                # The standard unmarshaller has no error of its own for elements in the wrong order or bad content.
+                raise RemoteProtocolError(f"malformed XML-RPC value: {error}") from error
+            raise
 
 
-def _parse(data: bytes) -> tuple[str | None, tuple[XmlRpcValue, ...]]:
-    if len(data) > limits.HTTP_BODY_MAX:
-        raise LimitExceeded("XML-RPC body", len(data), limits.HTTP_BODY_MAX)
-    unmarshaller = _BoundedUnmarshaller()
-    try:
-        params = _unmarshal(data, unmarshaller)
-    except DefusedXmlException as error:
-        raise RemoteProtocolError(f"XML declares entities, which XML-RPC has no use for: {error}") from error
-    except ExpatError as error:
-        raise RemoteProtocolError(f"malformed XML: {error}") from error
-    except ResponseError as error:
-        raise RemoteProtocolError(f"this XML is not XML-RPC {error}".rstrip()) from error
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        # The standard unmarshaller has no error of its own for elements in the wrong order or with bad content.
-        raise RemoteProtocolError(f"malformed XML-RPC value: {error}") from error
-    return unmarshaller.getmethodname(), params
+class CallReader:
+    """Reads a ``methodCall`` document piece by piece, for who has something else to do in between.
 
-
-def parse_call(data: bytes) -> tuple[str, tuple[XmlRpcValue, ...]]:
-    """Read a ``methodCall`` document.
-
-    Returns:
-        The method's name and its parameters.
-
-    Raises:
+    Both methods raise:
         RemoteProtocolError: It is malformed, too deep or too large, declares entities, or holds an integer beyond
             32 bits.
     """
-    try:
-        method, params = _parse(data)
-    except Fault as fault:
-        raise RemoteProtocolError("an XML-RPC fault came where a call was expected") from fault
-    if not method:
-        raise RemoteProtocolError("XML-RPC call without a methodName")
-    return method, params
+
+    def __init__(self) -> None:
+        self._document = _Document()
+
+    def feed(self, data: bytes) -> None:
+        """Take the next piece."""
+        self._document.feed(data)
+
+    def close(self) -> tuple[str, tuple[XmlRpcValue, ...]]:
+        """The method's name and its parameters, once all pieces are there."""
+        try:
+            method, params = self._document.close()
+        except Fault as fault:
+            raise RemoteProtocolError("an XML-RPC fault came where a call was expected") from fault
+        if not method:
+            raise RemoteProtocolError("XML-RPC call without a methodName")
+        return method, params
+
+
+def parse_call(data: bytes) -> tuple[str, tuple[XmlRpcValue, ...]]:
+    """Read a whole ``methodCall`` document; the errors are those of ``CallReader``.
+
+    Returns:
+        The method's name and its parameters.
+    """
+    reader = CallReader()
+    reader.feed(data)
+    return reader.close()
 
 
 def parse_response(data: bytes) -> XmlRpcValue:
@@ -181,10 +229,12 @@ def parse_response(data: bytes) -> XmlRpcValue:
 
     Raises:
         RosFault: The response is a fault.
-        RemoteProtocolError: As for ``parse_call``, or there is not exactly one value.
+        RemoteProtocolError: As for ``CallReader``, or there is not exactly one value.
     """
+    document = _Document()
     try:
-        method, params = _parse(data)
+        document.feed(data)
+        method, params = document.close()
     except Fault as fault:
         if not isinstance(fault.faultCode, int):
             raise RemoteProtocolError(f"XML-RPC fault with code {brief(fault.faultCode)}") from fault
@@ -194,33 +244,38 @@ def parse_response(data: bytes) -> XmlRpcValue:
     return params[0]
 
 
-def _dump(what: str, values: Fault | tuple[XmlRpcValue, ...]) -> str:
-    try:
-        text = Marshaller().dumps(cast(Fault | tuple[str], values))  # typeshed knows lists and dicts only
-    except (OverflowError, RecursionError, TypeError) as error:
-        raise LocalProtocolError(f"{what} cannot be said in XML-RPC: {error}") from error
-    illegal = _ILLEGAL.search(text)
-    if illegal is not None:
-        raise LocalProtocolError(f"{what} holds the character {illegal[0]!a}, which XML cannot hold; remove it")
-    return text
-
-
-def serialize_call(method: str, params: Sequence[XmlRpcValue]) -> bytes:
-    """Write a ``methodCall`` document.
+def call_pieces(method: str, params: Sequence[XmlRpcValue]) -> Iterator[bytes]:
+    """Write a ``methodCall`` document in pieces of some KiB, for who has something else to do in between.
 
     Raises:
         LocalProtocolError: A value cannot be said: ``None``, an integer beyond 32 bits, a control character.
     """
-    body = _dump(f"the call of {method}", tuple(params))
-    return f"{_DECLARATION}<methodCall>\n<methodName>{method}</methodName>\n{body}</methodCall>\n".encode()
+    yield f"{_DECLARATION}<methodCall>\n<methodName>{method}</methodName>\n<params>\n".encode()
+    for param in params:
+        yield b"<param>\n"
+        yield from pieces(f"the call of {method}", param)
+        yield b"</param>\n"
+    yield b"</params>\n</methodCall>\n"
+
+
+def response_pieces(value: XmlRpcValue) -> Iterator[bytes]:
+    """Write a ``methodResponse`` document in pieces; the errors are those of ``call_pieces``."""
+    yield f"{_DECLARATION}<methodResponse>\n<params>\n<param>\n".encode()
+    yield from pieces("the response", value)
+    yield b"</param>\n</params>\n</methodResponse>\n"
+
+
+def serialize_call(method: str, params: Sequence[XmlRpcValue]) -> bytes:
+    """Write a ``methodCall`` document; the errors are those of ``call_pieces``."""
+    return b"".join(call_pieces(method, params))
 
 
 def serialize_response(value: XmlRpcValue) -> bytes:
-    """Write a ``methodResponse`` document; the errors are those of ``serialize_call``."""
-    return f"{_DECLARATION}<methodResponse>\n{_dump('the response', (value,))}</methodResponse>\n".encode()
+    """Write a ``methodResponse`` document; the errors are those of ``call_pieces``."""
+    return b"".join(response_pieces(value))
 
 
 def serialize_fault(code: int, text: str) -> bytes:
     """Write a fault as a ``methodResponse``; characters that XML cannot hold become ``?``."""
-    body = _dump("the fault", Fault(code, _ILLEGAL.sub("?", text)))
-    return f"{_DECLARATION}<methodResponse>\n{body}</methodResponse>\n".encode()
+    body = b"".join(pieces("the fault", {"faultCode": code, "faultString": legal_text(text)}))
+    return b"%s<methodResponse>\n<fault>\n%s</fault>\n</methodResponse>\n" % (_DECLARATION.encode(), body)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core.aio.loop import AgentLoop, DirectSelector, breathe
+from rmpa.core.aio.loop import AgentLoop, DirectSelector, breathe, breathing
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Iterator
@@ -301,6 +301,26 @@ def test_a_socket_that_was_closed_first_is_forgotten(pair: tuple[socket.socket, 
         one.close()
         loop.remove_reader(number)
         breathe()
+
+    run(main())
+
+
+def test_who_goes_through_many_things_breathes_now_and_then(pair: tuple[socket.socket, socket.socket]) -> None:
+    one, other = pair
+
+    async def main() -> None:
+        loop = agent_loop()
+        got: list[bytes] = []
+        loop.add_direct_reader(one.fileno(), lambda: got.append(one.recv(100)))
+        seen = []
+        for item in breathing(range(1000)):
+            seen.append(item)
+            if item == 100:
+                other.send(b"a")
+            if item == 200:
+                assert got == [b"a"]
+        assert seen == list(range(1000))
+        loop.remove_reader(one.fileno())
 
     run(main())
 

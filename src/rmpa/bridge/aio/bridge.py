@@ -86,6 +86,7 @@ class Bridge:
         self._by_link: dict[MeshLink, Attached] = {}
         self._closing: set[asyncio.Task[None]] = set()
         self._timer: asyncio.TimerHandle | None = None
+        self._ticker: asyncio.TimerHandle | None = None
         self._reconciler: asyncio.TimerHandle | None = None
         self._rescan: asyncio.Handle | None = None
         self._closed = False
@@ -131,7 +132,7 @@ class Bridge:
     async def close(self) -> None:
         """Retract all that came from elsewhere and leave all local publishers."""
         self._closed = True
-        for timer in (self._timer, self._reconciler, self._rescan):
+        for timer in (self._ticker, self._timer, self._reconciler, self._rescan):
             if timer is not None:
                 timer.cancel()
         for attached in list(self._by_number.values()):
@@ -173,8 +174,7 @@ class Bridge:
         attached = self._by_link.pop(link, None)
         if attached is None:
             return
-        for flow in attached.inbound.flows.values():
-            flow.torn()
+        attached.inbound.link_down()
         exports, waited_for = self._exports.link_away(attached.peer)
         imports, waiting = self._imports.link_away(attached.peer)
         if waited_for or waiting:
@@ -342,6 +342,12 @@ class Bridge:
     def _demand(self, peer: int, source: Source, *, wanted: bool) -> None:
         self._act(self._imports.demand(peer, source, self._loop.time(), wanted=wanted))
 
+    def _tick(self) -> None:
+        """Wake up now and then while data comes: a link that was silent is told from an agent that slept."""
+        self._ticker = None
+        if not self._closed and any(attached.inbound.flows for attached in self._by_number.values()):
+            self._ticker = self._loop.call_later(limits.STALE_TICK, self._tick)
+
     def _mismatched(self, peer: int, source: Source, subscriber: str, text: str) -> None:
         self._remember(source, subscriber, text)
         self._act(self._imports.mismatched(peer, source, subscriber, text))
@@ -404,6 +410,8 @@ class Bridge:
                 attached.inbound.retract(action)
             case act.Describe():
                 route = action.route
+                if self._ticker is None:
+                    self._ticker = self._loop.call_later(limits.STALE_TICK, self._tick)
                 attached.inbound.describe(action, lambda last: attached.link.mark(FrameKind.ACK, route, last))
             case act.Detach():
                 attached.inbound.detach(action)

@@ -96,7 +96,7 @@ class ExportFlow:
         self.remove(peer)
         leg = make_leg(link, route, contract, epoch, large=self.large)
         if contract.durability is Durability.TRANSIENT_LOCAL:
-            self.keep(contract.depth)
+            self.keep(contract.kept)
         for framed, stamp in self._latched:
             leg.message(stamp, framed)
         self.by_peer[peer] = leg
@@ -353,6 +353,8 @@ class ImportFlow:
         error = self._time.error_ns
         if error is None or age <= self._stale_ns + error:
             return False
+        if self.contract.lifespan is None and age - self._waited_here() <= self._stale_ns + error:
+            return False  # it is not the link that was late, but we
         if self.contract.lifespan is not None:
             self.expired += 1
             self.watch.expired(1, self._loop.time())
@@ -365,6 +367,11 @@ class ImportFlow:
         if self._timer is None:
             self._timer = self._loop.call_later(limits.STALE_HOLD, self._nothing_newer)
         return True
+
+    def _waited_here(self) -> int:
+        """Nanoseconds for which the message may have been here already: this process got no CPU, perhaps."""
+        now = self._loop.time()
+        return round((now - getattr(self._loop, "looked_before", now)) * 1e9)
 
     def _supersede(self) -> None:
         self._stale = None

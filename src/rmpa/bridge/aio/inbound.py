@@ -133,6 +133,7 @@ class Inbound:
         flow = self._reliable.pop(source, None)
         if flow is not None and flow.contract == contract:
             flow.rebind(on_ack)
+            flow.watch.link_up(asyncio.get_running_loop().time())
             if not flow.begin_epoch(action.epoch, action.first):
                 _log.warning("! %s: %s: messages were lost, it is not known how many", self.prefix, source)
         else:
@@ -148,7 +149,7 @@ class Inbound:
             flow.begin_epoch(action.epoch, action.first)
         publication.bound(contract.depth)
         if contract.durability is Durability.TRANSIENT_LOCAL:
-            publication.keep(contract.depth)
+            publication.keep(contract.kept)
         if contract.reliability is Reliability.RELIABLE:
             self._reliable[source] = flow
         self._watch(source, flow)
@@ -181,15 +182,25 @@ class Inbound:
         if proxy is not None and proxy.publications.get(source.topic) is publication:
             self._register(proxy, source.topic)
 
+    def link_down(self) -> None:
+        """The link is gone: what it brought in part is dropped, and nobody says any more that its sources live."""
+        now = asyncio.get_running_loop().time()
+        for flow in self.flows.values():
+            flow.torn()
+            flow.watch.link_down(now)
+
     def detach(self, action: Detach) -> None:
         """No data comes on a route any more, or not until its peer is back."""
         flow = self.flows.pop(action.route, None)
         if action.keep:
             if flow is not None:
-                flow.torn()
+                self._watch(action.source, flow)
             return
-        self._reliable.pop(action.source, None)
+        flow = self._reliable.pop(action.source, flow)
         if flow is not None:
+            # Its proxy goes with it, so that the lease is not waited for.
+            for occurred in flow.watch.link_gone(asyncio.get_running_loop().time()):
+                self._on_occurred(action.source, occurred)
             self._end(action.source, flow)
         publication = self.publication(action.source)
         if publication is not None:

@@ -19,11 +19,12 @@ import logging
 import math
 import select
 import selectors
+import time
 from collections import deque
-from typing import TYPE_CHECKING, Any, Final, TypeVarTuple, cast
+from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple, cast
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from _typeshed import FileDescriptorLike
 
@@ -31,6 +32,9 @@ _log = logging.getLogger(__name__)
 
 _EPOLL_RESOLUTION: Final = 1e-3
 _LOOK: Final = 64
+_ITEMS: Final = 64
+"""Steps of some work between two breaths, of a microsecond or less each."""
+_T = TypeVar("_T")
 _Ts = TypeVarTuple("_Ts")
 _READ: Final = ~select.EPOLLOUT
 _WRITE: Final = ~select.EPOLLIN
@@ -48,6 +52,7 @@ class DirectSelector(selectors.BaseSelector):
         self._readers: dict[int, Callable[[], None]] = {}
         self._writers: dict[int, Callable[[], None]] = {}
         self._calling = False
+        self.woke = self.woke_before = time.monotonic()
 
     def call_directly(self, fd: int, reader: Callable[[], None] | None) -> None:
         """Call ``reader`` when ``fd``, which is registered for reading, is readable; ``None``: as usual again."""
@@ -136,6 +141,7 @@ class DirectSelector(selectors.BaseSelector):
             happened = self._epoll.poll(wait, max(len(self._keys), 1))
         except InterruptedError:
             return []
+        self.woke_before, self.woke = self.woke, time.monotonic()
         ready = []
         for fd, event in self._call(happened):
             key = self._keys.get(fd)
@@ -203,6 +209,14 @@ class AgentLoop(asyncio.SelectorEventLoop):
         self.poll_data: Final = self._direct_selector.poll_data
         """Let data that has come go first, now; see ``breathe()``."""
 
+    @property
+    def looked_before(self) -> float:
+        """When the sockets were last looked at before what is being read now came, in monotonic seconds.
+
+        What was not there then came later: so long, and no longer, this process may have let it wait.
+        """
+        return self._direct_selector.woke_before
+
     def add_direct_reader(self, fd: int, callback: Callable[[], None]) -> None:
         """Like ``add_reader``, on the short way; ``remove_reader`` ends it.
 
@@ -241,6 +255,14 @@ def breathe() -> None:
     loop = asyncio._get_running_loop()  # noqa: SLF001 - the public one raises where there is none
     if isinstance(loop, AgentLoop):
         loop.poll_data()
+
+
+def breathing(items: Iterable[_T], /) -> Iterator[_T]:
+    """Pass on items one after the other, and breathe now and then (``core.breathing.Breathing``)."""
+    for number, item in enumerate(items):
+        if number % _ITEMS == 0:
+            breathe()
+        yield item
 
 
 class _Turnstile(deque[asyncio.Handle]):

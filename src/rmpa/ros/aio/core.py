@@ -11,15 +11,18 @@ import os
 import uuid
 from typing import TYPE_CHECKING, Final
 
+from rmpa.core.aio.loop import breathe, breathing
 from rmpa.core.counters import Counters
 from rmpa.ros.aio.http_server import XmlRpcServer
 from rmpa.ros.aio.liveness import Liveness
 from rmpa.ros.aio.notifier import Notifier
 from rmpa.ros.aio.rosout import Rosout
 from rmpa.ros.master.api import MasterApi
+from rmpa.ros.master.effects import Kind
+from rmpa.ros.master.registrations import ANY_TYPE
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from rmpa.ros.master.effects import GraphChange, GraphState
     from rmpa.ros.xmlrpc import Reply, XmlRpcValue
@@ -60,7 +63,7 @@ class RosCore:
         self._host = host
         self._advertised = advertised_host or (os.uname().nodename if host in {"", "0.0.0.0"} else host)  # noqa: S104
         self._on_shutdown = on_shutdown
-        self._api = MasterApi("", os.getpid(), self._asked_to_end)
+        self._api = MasterApi("", os.getpid(), self._asked_to_end, breathing=breathing)
         self._server = XmlRpcServer(self._answer, host, port, counters=self.counters, name="ROS core")
         self._notifier: Notifier | None = None
         self._liveness: Liveness | None = None
@@ -123,12 +126,15 @@ class RosCore:
     def call(self, method: str, *params: XmlRpcValue) -> Reply:
         """Call a method of the Master or Parameter Server API, as over XML-RPC but at once.
 
+        It breathes before it does: who registers hundreds of topics in a row gives way to data between them.
+
         Returns:
-            ``(code, status, value)``; the value must not be changed.
+            ``(code, status, value)``; the value must not be changed, nor may ``params`` be afterwards.
 
         Raises:
             RosFault: There is no such method.
         """
+        breathe()
         reply = self._api.call(method, params)
         self._carry_out()
         return reply
@@ -136,6 +142,14 @@ class RosCore:
     def state(self) -> GraphState:
         """All registrations at this moment; the same object until one changes."""
         return self._api.state()
+
+    def publishers(self, topic: str) -> Mapping[str, str]:
+        """Who publishes a topic now, and their slave APIs; never changed afterwards."""
+        return self._api.registrations.at(Kind.PUBLISHER, topic)
+
+    def type_of(self, topic: str) -> str:
+        """The type that was last said for a topic; ``*`` for none."""
+        return self._api.registrations.types().get(topic, ANY_TYPE)
 
     def on_change(self, callback: Callable[[GraphChange], None]) -> None:
         """Call ``callback`` in the loop after each change of a registration, before the reply to it leaves.

@@ -7,25 +7,20 @@ h11 speaks HTTP/1.1 (RFC 9112), ``ros.xmlrpc`` reads the bodies. Made for client
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import logging
 import socket
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from typing import Final
 
 import h11
 
 from rmpa.core import limits
+from rmpa.core.aio.loop import breathe
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, StartError
-from rmpa.ros.xmlrpc import (
-    RosFault,
-    XmlRpcValue,
-    brief,
-    parse_call,
-    serialize_fault,
-    serialize_response,
-)
+from rmpa.ros.xmlrpc import CallReader, RosFault, XmlRpcValue, brief, response_pieces, serialize_fault
 
 _log = logging.getLogger(__name__)
 
@@ -83,11 +78,15 @@ class XmlRpcServer:
                 self._host,
                 self._wanted_port,
                 family=socket.AF_INET,
-                backlog=limits.HTTP_BACKLOG,
+                backlog=limits.HTTP_ACCEPTS,
             )
         except OSError as error:
             raise self._start_error(error) from error
-        self.port = self._server.sockets[0].getsockname()[1]
+        listening = self._server.sockets[0]
+        self.port = listening.getsockname()[1]
+        # asyncio accepts as many at once as may wait; more may wait than shall be accepted without a pause.
+        with listening.dup() as same:
+            same.listen(limits.HTTP_BACKLOG)
         _log.info("= %s listens at %s:%d", self._name, self._host, self.port)
 
     def _start_error(self, error: OSError) -> StartError:
@@ -145,20 +144,33 @@ class XmlRpcServer:
         self._refusals.refuse(now, name, connection.client, f"{self._name}: {connection.client}: {text}")
 
     def _answer(self, body: bytes, connection: _Connection) -> bytes | Awaitable[bytes]:
-        """The response to one call, at once unless the handler has to wait."""
+        """The response to one call, at once unless the handler has to wait, or there is much to read or write."""
         if len(body) > limits.HTTP_BODY_INLINE:
             return self._answer_large(body, connection)
+        reader = CallReader()
         try:
-            method, params = parse_call(body)
+            for begin in range(0, len(body), limits.XMLRPC_SLICE):
+                reader.feed(body[begin : begin + limits.XMLRPC_SLICE])
+                breathe()
+            method, params = reader.close()
         except RemoteProtocolError as error:
             return self._malformed(error, connection)
         return self._dispatch(method, params, connection)
 
     async def _answer_large(self, body: bytes, connection: _Connection) -> bytes:
+        # Not in a thread: one that computes takes the interpreter from the loop for milliseconds at a time.
+        reader = CallReader()
         try:
-            method, params = await asyncio.to_thread(parse_call, body)
+            for begin in range(0, len(body), limits.XMLRPC_SLICE):
+                reader.feed(body[begin : begin + limits.XMLRPC_SLICE])
+                await asyncio.sleep(0)
+            method, params = reader.close()
         except RemoteProtocolError as error:
             return self._malformed(error, connection)
+        except BaseException:
+            with contextlib.suppress(RemoteProtocolError):
+                reader.close()
+            raise
         answer = self._dispatch(method, params, connection)
         return answer if isinstance(answer, bytes) else await answer
 
@@ -182,15 +194,34 @@ class XmlRpcServer:
 
     async def _answer_later(self, method: str, value: Awaitable[XmlRpcValue]) -> bytes:
         try:
-            return self._respond(method, await value)
+            answer = self._respond(method, await value)
         except Exception as error:  # noqa: BLE001 - as above
             return self._failed(method, error)
+        return answer if isinstance(answer, bytes) else await answer
 
-    def _respond(self, method: str, value: XmlRpcValue) -> bytes:
+    def _respond(self, method: str, value: XmlRpcValue) -> bytes | Awaitable[bytes]:
+        written: list[bytes] = []
+        size = 0
+        rest = response_pieces(value)
         try:
-            return serialize_response(value)
+            for piece in rest:
+                written.append(piece)
+                size += len(piece)
+                if size > limits.HTTP_BODY_INLINE:
+                    return self._respond_large(method, written, rest)
+                breathe()
         except LocalProtocolError as error:
             return self._failed(method, error)
+        return b"".join(written)
+
+    async def _respond_large(self, method: str, written: list[bytes], rest: Iterator[bytes]) -> bytes:
+        try:
+            for piece in rest:
+                written.append(piece)
+                await asyncio.sleep(0)
+        except LocalProtocolError as error:
+            return self._failed(method, error)
+        return b"".join(written)
 
     def _failed(self, method: str, error: Exception) -> bytes:
         if isinstance(error, RosFault):
@@ -340,7 +371,9 @@ class _Connection(asyncio.Protocol):
         self._body.clear()
         self._receiving = False
         self._server._used(self)  # noqa: SLF001
+        breathe()
         answer = self._server._answer(body, self)  # noqa: SLF001
+        breathe()
         if isinstance(answer, bytes):
             self._reply(200, answer)
             return

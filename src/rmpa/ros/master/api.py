@@ -20,6 +20,8 @@ from rmpa.ros.xmlrpc import Reply, RosFault, XmlRpcValue, brief
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from rmpa.core.breathing import Breathing
+
 _log = logging.getLogger(__name__)
 
 SUCCESS: Final = 1
@@ -43,9 +45,13 @@ class MasterApi:
         uri: What ``getUri`` answers.
         pid: What ``getPid`` answers.
         on_shutdown: Called with the reason when somebody asks the master to end.
+        breathing: For what takes long in a graph of thousands, or with large parameters.
     """
 
-    def __init__(self, uri: str, pid: int, on_shutdown: Callable[[str], None]) -> None:
+    def __init__(
+        self, uri: str, pid: int, on_shutdown: Callable[[str], None], *, breathing: Breathing = iter
+    ) -> None:
+        self._breathing = breathing
         self.uri = uri
         self._pid = pid
         self._on_shutdown = on_shutdown
@@ -156,11 +162,16 @@ class MasterApi:
         return Reply(SUCCESS, f"deleted {key}", 0)
 
     def _set_param(self, caller_id: str, key: str, value: XmlRpcValue) -> Reply:
+        if params.holds_nil(value, self._breathing):
+            text = "value is nil or contains one, which ROS does not have"
+            _log.info("! %s: setParam: %s", caller_id, text)
+            return Reply(ERROR, text, 0)
         try:
             self.parameters.set(key, value)
         except TypeError as error:
             return Reply(ERROR, str(error), 0)
-        self.registrations.effects += params.updates(self.registrations.param_subscribers(), key, value, caller_id)
+        subscribers = self.registrations.param_subscribers()
+        self.registrations.effects += params.updates(subscribers, key, value, caller_id, self._breathing)
         return Reply(SUCCESS, f"set {key}", 0)
 
     def _get_param(self, _caller_id: str, key: str) -> Reply:
@@ -193,7 +204,7 @@ class MasterApi:
         return Reply(SUCCESS, key, self.parameters.has(key))
 
     def _get_param_names(self, _caller_id: str) -> Reply:
-        return Reply(SUCCESS, "the names of all parameters", self.parameters.names())
+        return Reply(SUCCESS, "the names of all parameters", list(self._breathing(self.parameters.names())))
 
     # --- services ---------------------------------------------------------------------------------------------
 
@@ -242,16 +253,19 @@ class MasterApi:
     def _get_published_topics(self, _caller_id: str, subgraph: str) -> Reply:
         prefix = subgraph if not subgraph or subgraph.endswith("/") else f"{subgraph}/"
         types = self.registrations.types()
-        found = [[topic, types[topic]] for topic in self.registrations.published() if topic.startswith(prefix)]
+        published = self._breathing(self.registrations.published())
+        found = [[topic, types[topic]] for topic in published if topic.startswith(prefix)]
         return Reply(SUCCESS, "the topics that somebody publishes", found)
 
     def _get_topic_types(self, _caller_id: str) -> Reply:
-        return Reply(
-            SUCCESS, "the topics and their types", [list(item) for item in self.registrations.types().items()]
-        )
+        types = self._breathing(list(self.registrations.types().items()))
+        return Reply(SUCCESS, "the topics and their types", [list(item) for item in types])
 
     def _get_system_state(self, _caller_id: str) -> Reply:
-        tables = [self.registrations.providers(kind) for kind in (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)]
+        tables: list[XmlRpcValue] = []
+        for kind in (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE):
+            providers = self._breathing(self.registrations.providers(kind))
+            tables.append([[key, list(nodes)] for key, nodes in providers])
         return Reply(SUCCESS, "publishers, subscribers and services", tables)
 
     def _table(self) -> dict[str, _Method]:
@@ -263,7 +277,7 @@ class MasterApi:
             "getUri": method(self._get_uri, ""),
             "getPid": method(self._get_pid, -1),
             "deleteParam": method(self._delete_param, 0, key=v.key),
-            "setParam": method(self._set_param, 0, key=v.key, value=v.present),
+            "setParam": method(self._set_param, 0, key=v.key, value=v.anything),
             "getParam": method(self._get_param, 0, key=v.key),
             "searchParam": method(self._search_param, 0, key=v.text),
             "subscribeParam": method(self._subscribe_param, 0, caller_api=v.uri, key=v.key),

@@ -14,6 +14,7 @@ from rmpa.ros.master.resolution import join, with_slash
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
+    from rmpa.core.breathing import Breathing
     from rmpa.ros.xmlrpc import XmlRpcValue
 
 Tree: TypeAlias = "dict[str, XmlRpcValue]"
@@ -21,15 +22,6 @@ Tree: TypeAlias = "dict[str, XmlRpcValue]"
 
 def _parts(key: str) -> list[str]:
     return [part for part in key.split("/") if part]
-
-
-def _plain(value: XmlRpcValue) -> XmlRpcValue:
-    """A copy made of dicts and lists, that shares nothing with the caller's."""
-    if isinstance(value, dict):
-        return {name: _plain(part) for name, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    return value
 
 
 def _with(tree: Tree, parts: list[str], value: XmlRpcValue) -> Tree:
@@ -54,6 +46,22 @@ def _without(tree: Tree, parts: list[str]) -> Tree:
     else:
         del copy[first]
     return copy
+
+
+def holds_nil(value: XmlRpcValue, breathing: Breathing = iter) -> bool:
+    """Whether there is a nil in a value, at any depth; ROS has none, and it could not be written again."""
+    return any(part is None for part in breathing(_all_parts(value)))
+
+
+def _all_parts(value: XmlRpcValue) -> Iterator[XmlRpcValue]:
+    waiting = [value]
+    while waiting:
+        part = waiting.pop()
+        yield part
+        if isinstance(part, dict):
+            waiting.extend(part.values())
+        elif isinstance(part, list | tuple):
+            waiting.extend(part)
 
 
 class Parameters:
@@ -86,10 +94,13 @@ class Parameters:
     def set(self, key: str, value: XmlRpcValue) -> None:
         """Put a value or a namespace at ``key``; what was there is gone, a value on the way becomes a namespace.
 
+        Args:
+            key: Its resolved name.
+            value: Kept as it is, not copied: nobody may change it afterwards.
+
         Raises:
             TypeError: The root is set to something that is no dict.
         """
-        value = _plain(value)
         parts = _parts(key)
         if parts:
             self._tree = _with(self._tree, parts, value)
@@ -109,9 +120,9 @@ class Parameters:
             raise KeyError(key)
         self._tree = _without(self._tree, parts)
 
-    def names(self) -> list[str]:
-        """The full names of all values; an empty namespace has none."""
-        return list(_names("/", self._tree))
+    def names(self) -> Iterator[str]:
+        """The full names of all values as they are now; an empty namespace has none."""
+        return _names("/", self._tree)
 
     def search(self, namespace: str, key: str) -> str | None:
         """Find ``key`` in ``namespace`` or the nearest one above it.
@@ -157,7 +168,11 @@ def _below(key: str, value: XmlRpcValue) -> Iterator[tuple[str, XmlRpcValue]]:
 
 
 def updates(
-    subscribers: Mapping[str, Mapping[str, str]], key: str, value: XmlRpcValue, setter: str | None = None
+    subscribers: Mapping[str, Mapping[str, str]],
+    key: str,
+    value: XmlRpcValue,
+    setter: str | None = None,
+    breathing: Breathing = iter,
 ) -> list[ParamUpdate]:
     """Who is to be told what after a parameter was set or deleted.
 
@@ -166,6 +181,7 @@ def updates(
         key: The key that changed.
         value: What it is now; deleted is ``{}``.
         setter: The node that set it, which is not told of its own namespace's change.
+        breathing: For large values.
 
     Returns:
         In rosmaster's order: first those who subscribed the key or a namespace above it, or something below that is
@@ -174,7 +190,9 @@ def updates(
     if not subscribers:
         return []
     key = with_slash(key)
-    below = dict(_below(key, value))
+    # Most values are set where nobody has subscribed something within them, and some are large.
+    within = any(subscribed != key and subscribed.startswith(key) for subscribed in subscribers)
+    below = dict(breathing(_below(key, value))) if within else {}
     found: list[ParamUpdate] = []
     for subscribed, nodes in subscribers.items():
         if key.startswith(subscribed):

@@ -11,6 +11,7 @@ from typing import Final
 from rmpa.ros.master.effects import Effect, GraphChange, GraphState, Kind, PublisherUpdate, Shutdown
 
 ANY_TYPE: Final = "*"
+_NOBODY: Final[dict[str, str]] = {}
 
 
 @dataclass(slots=True)
@@ -34,9 +35,11 @@ class Registrations:
 
     def __init__(self) -> None:
         self._nodes: dict[str, _Node] = {}
-        # key -> node -> slave API
+        # key -> node -> slave API. The inner dicts are never changed but replaced: they may have been handed out.
         self._tables: dict[Kind, dict[str, dict[str, str]]] = {kind: {} for kind in Kind}
         self._service_uris: dict[str, str] = {}
+        # service -> node -> service URI, likewise
+        self._services: dict[str, dict[str, str]] = {}
         self._types: dict[str, str] = {}
         # The URI that each node's name was last taken from, while the name is in use.
         self._evicted: dict[str, str] = {}
@@ -63,6 +66,10 @@ class Registrations:
         """The slave APIs registered for a key, in order."""
         return list(self._tables[kind].get(key, {}).values())
 
+    def at(self, kind: Kind, key: str) -> dict[str, str]:
+        """The nodes registered for a key, in order, and their slave APIs; never changed afterwards."""
+        return self._tables[kind].get(key, _NOBODY)
+
     def param_subscribers(self) -> dict[str, dict[str, str]]:
         """Subscribed parameters (keys end in ``/``), each with its nodes and their APIs; not to be changed."""
         return self._tables[Kind.PARAM]
@@ -79,23 +86,22 @@ class Registrations:
         """Topics with a publisher."""
         return list(self._tables[Kind.PUBLISHER])
 
-    def providers(self, kind: Kind) -> list[list[str | list[str]]]:
-        """``[[key, [node, …]], …]`` as ``getSystemState`` shows it."""
-        return [[key, list(nodes)] for key, nodes in self._tables[kind].items()]
+    def providers(self, kind: Kind) -> list[tuple[str, dict[str, str]]]:
+        """All keys of a kind, each with its nodes and their slave APIs; not to be changed."""
+        return list(self._tables[kind].items())
 
     def state(self) -> GraphState:
-        """All registrations; the same object until something changes."""
+        """All registrations; the same object until something changes.
+
+        What is in it is shared with the tables, so that a look at a graph of thousands costs microseconds.
+        """
         if self._state is None:
-
-            def copy(kind: Kind) -> dict[str, dict[str, str]]:
-                return {key: dict(nodes) for key, nodes in self._tables[kind].items()}
-
-            services = {
-                service: dict.fromkeys(nodes, self._service_uris[service])
-                for service, nodes in self._tables[Kind.SERVICE].items()
-            }
             self._state = GraphState(
-                copy(Kind.PUBLISHER), copy(Kind.SUBSCRIBER), services, dict(self._types), self.nodes()
+                dict(self._tables[Kind.PUBLISHER]),
+                dict(self._tables[Kind.SUBSCRIBER]),
+                dict(self._services),
+                dict(self._types),
+                self.nodes(),
             )
         return self._state
 
@@ -124,11 +130,13 @@ class Registrations:
         """Make this node the service's provider, in place of any other."""
         self._seat(node, api)
         retyped = self._service_uris.get(service) != uri
-        for other, other_api in list(self._tables[Kind.SERVICE].get(service, {}).items()):
-            if other != node:
-                del self._tables[Kind.SERVICE][service][other]
-                self._changed(Kind.SERVICE, service, other, other_api, added=False)
+        before = self.at(Kind.SERVICE, service)
+        if gone := [other for other in before if other != node]:
+            self._tables[Kind.SERVICE][service] = {n: its for n, its in before.items() if n == node}
+            for other in gone:
+                self._changed(Kind.SERVICE, service, other, before[other], added=False)
         self._service_uris[service] = uri
+        self._services[service] = {node: uri}
         self._register(Kind.SERVICE, service, node, api, retyped=retyped)
 
     def subscribe_param(self, key: str, node: str, api: str) -> None:
@@ -202,20 +210,23 @@ class Registrations:
 
     def _register(self, kind: Kind, key: str, node: str, api: str, *, retyped: bool = False) -> None:
         self._seat(node, api).keys[kind][key] = None
-        providers = self._tables[kind].setdefault(key, {})
+        providers = self.at(kind, key)
         new = node not in providers
-        providers[node] = api
+        if providers.get(node) != api:
+            self._tables[kind][key] = {**providers, node: api}
         self._state = None
         if new or retyped:
             self._changed(kind, key, node, api, added=True)
 
     def _remove(self, kind: Kind, key: str, node: str, api: str) -> None:
         providers = self._tables[kind][key]
-        del providers[node]
-        if not providers:
+        if len(providers) > 1:
+            self._tables[kind][key] = {other: its for other, its in providers.items() if other != node}
+        else:
             del self._tables[kind][key]
             if kind is Kind.SERVICE:
                 del self._service_uris[key]
+                del self._services[key]
         self._nodes[node].keys[kind].pop(key, None)
         self._changed(kind, key, node, api, added=False)
 

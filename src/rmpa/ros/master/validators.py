@@ -24,21 +24,6 @@ def anything(value: XmlRpcValue, name: str, caller_id: str) -> XmlRpcValue:  # n
     return value
 
 
-def present(value: XmlRpcValue, name: str, caller_id: str) -> XmlRpcValue:  # noqa: ARG001 - a Validator
-    """Anything that can be written in XML-RPC again: nil cannot, at no depth."""
-    if _has_nil(value):
-        raise InvalidParameterError(f"{name} is nil or contains one, which ROS does not have")
-    return value
-
-
-def _has_nil(value: XmlRpcValue) -> bool:
-    if isinstance(value, dict):
-        return any(_has_nil(part) for part in value.values())
-    if isinstance(value, list | tuple):
-        return any(_has_nil(part) for part in value)
-    return value is None
-
-
 def text(value: XmlRpcValue, name: str, caller_id: str) -> str:  # noqa: ARG001 - a Validator
     """A string that is not empty."""
     if not isinstance(value, str) or not value:

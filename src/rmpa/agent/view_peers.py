@@ -1,0 +1,95 @@
+"""The peers' part of the snapshot: what discovery, mesh and bridge know of each."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from rmpa.core.aio.clock import SystemClock
+from rmpa.monitor.snapshot import LinkInfo, PeerInfo
+
+if TYPE_CHECKING:
+    from rmpa.agent.station import Station
+    from rmpa.bridge.aio.bridge import Attached, Bridge
+    from rmpa.discovery.events import PeerView
+    from rmpa.mesh.aio.link import MeshLink
+    from rmpa.mesh.peering import PeerStatus
+
+
+class PeersView:
+    """Reads what is known of peers; changes nothing.
+
+    Args:
+        bridge: The agent's.
+    """
+
+    def __init__(self, bridge: Bridge) -> None:
+        self._bridge = bridge
+        self._clock = SystemClock()
+
+    def infos(self, station: Station) -> tuple[PeerInfo, ...]:
+        """Every peer that is known, by name."""
+        now = self._clock.now()
+        links = {attached.link.guid: attached for attached in self._bridge.attached()}
+        roster = {view.identity.guid: view for view in station.discovery.peers()}
+        statuses = {status.identity.guid: status for status in station.mesh.peers()}
+        offered = Counter(peer for peer, _ in {(peer, source.topic) for peer, source, _ in self._bridge.imports})
+        ours = len({source.topic for source in self._bridge.exports.offered})
+        infos = []
+        for guid in {*roster, *statuses, *links}:
+            attached = links.get(guid)
+            info = self._peer(roster.get(guid), statuses.get(guid), attached, now)
+            if attached is not None:
+                info = msgspec.structs.replace(info, topics_in=offered[attached.peer], topics_out=ours)
+            infos.append(info)
+        return tuple(sorted(infos, key=lambda info: (info.name, info.guid)))
+
+    def _peer(
+        self, view: PeerView | None, status: PeerStatus | None, attached: Attached | None, now: float
+    ) -> PeerInfo:
+        identity = (view or status or attached.link).identity  # type: ignore[union-attr] # one of the three is there
+        conflicts = view.conflicts if view is not None else ()
+        unlinked = status.since if status is not None and status.since is not None else view.since if view else now
+        if attached is not None:
+            state, since = "linked", attached.link.since or now
+        elif view is not None and not view.present:
+            state, since = "conflict", view.since
+        elif status is not None and status.state == "refused":
+            state, since = "refused", unlinked
+        else:
+            state, since = "linking", unlinked
+        next_attempt = status.next_attempt if status is not None else None
+        return PeerInfo(
+            name=identity.name,
+            guid=str(identity.guid),
+            instance=identity.instance.hex(),
+            state=state,
+            since_ago=max(0.0, now - since),
+            addresses=tuple(f"{host}:{port}" for host, port in identity.endpoints),
+            found_ago=now - view.since if view else None,
+            beacon_ago=now - view.heard if view else None,
+            source=view.found_by.value if view else "link",
+            link=self._link(attached.link, now) if attached is not None else None,
+            last_error=status.last_error if status is not None else "",
+            next_attempt=max(0.0, next_attempt - now) if next_attempt is not None else None,
+            conflicts=conflicts,
+        )
+
+    @staticmethod
+    def _link(link: MeshLink, now: float) -> LinkInfo:
+        host, port = link.remote_endpoint
+        return LinkInfo(
+            remote=f"{host}:{port}",
+            dialled=link.dialled,
+            up_ago=now - (link.since or now),
+            rtt=link.rtt,
+            clock_offset=link.clock_offset,
+            clock_error=link.clock_error,
+            bytes_in=link.bytes_in,
+            bytes_out=link.bytes_out,
+            queued=link.queue_bytes,
+            dropped=link.dropped,
+            heard_ago=now - link.heard_at,
+        )

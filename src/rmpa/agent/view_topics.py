@@ -1,0 +1,216 @@
+"""The topics' part of the snapshot: the local graph, what crosses the mesh, and how well."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from rmpa.bridge.imports import RouteState
+from rmpa.bridge.policy import Policy, is_own
+from rmpa.core.aio.clock import SystemClock
+from rmpa.core.aio.loop import breathe
+from rmpa.core.contract import KEYS, Contract, Contracts
+from rmpa.monitor.snapshot import EventInfo, LatencyInfo, RouteInfo, Spread, TopicInfo
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator
+
+    from rmpa.bridge.aio.bridge import Attached, Bridge
+    from rmpa.bridge.exports import LocalSource
+    from rmpa.bridge.imports import Import
+    from rmpa.bridge.messages import Source
+    from rmpa.bridge.quality import QualitySummary
+    from rmpa.core.config import Settings
+    from rmpa.core.stats import Summary
+    from rmpa.ros.aio.core import RosCore
+
+_DEFAULT = Contract()
+
+
+class TopicsView:
+    """Reads what is known of topics; changes nothing.
+
+    Data may go on between two topics, and change the plan: what is iterated over is a copy.
+
+    Args:
+        settings: The agent's.
+        core: Its ROS core.
+        bridge: Its bridge.
+    """
+
+    def __init__(self, settings: Settings, core: RosCore, bridge: Bridge) -> None:
+        self._core = core
+        self._bridge = bridge
+        self._clock = SystemClock()
+        self._policy = Policy(settings.policy)
+        self._contracts = Contracts(settings.contracts)
+
+    def infos(self, wanted: Collection[str] | None = None) -> tuple[TopicInfo, ...]:
+        """Every topic of the graph and every one that peers offer, by name; or those that are wanted."""
+        state = self._core.state()
+        routes: dict[str, list[RouteInfo]] = {}
+        mismatches: dict[str, list[str]] = {}
+        for source, info, texts in (*self._inbound(wanted), *self._outbound(wanted)):
+            if info is not None:
+                routes.setdefault(source.topic, []).append(info)
+            mismatches.setdefault(source.topic, []).extend(texts)
+        names = {*state.publishers, *state.subscribers, *routes}
+        return tuple(
+            self._topic(
+                name,
+                state.types.get(name, ""),
+                tuple(node for node in state.publishers.get(name, {}) if not is_own(node)),
+                tuple(node for node in state.subscribers.get(name, {}) if not is_own(node)),
+                tuple(routes.get(name, ())),
+                tuple(mismatches.get(name, ())),
+            )
+            for name in sorted(names)
+            if wanted is None or name in wanted
+        )
+
+    def _topic(
+        self,
+        name: str,
+        type_name: str,
+        publishers: tuple[str, ...],
+        subscribers: tuple[str, ...],
+        routes: tuple[RouteInfo, ...],
+        mismatches: tuple[str, ...],
+    ) -> TopicInfo:
+        breathe()
+        decision = self._policy.judge(name, type_name, publishers[0] if publishers else "/")
+        return TopicInfo(
+            name=name,
+            type=type_name or next((route.type for route in routes), ""),
+            md5=next((route.md5 for route in routes if route.md5), ""),
+            publishers=publishers,
+            subscribers=subscribers,
+            routes=routes,
+            crosses=decision.allowed,
+            policy=decision.rule,
+            mismatches=mismatches,
+        )
+
+    def _inbound(self, wanted: Collection[str] | None) -> Iterator[tuple[Source, RouteInfo, list[str]]]:
+        """Each source of a peer, its route, and what did not fit it."""
+        attached = {at.peer: at for at in self._bridge.everyone()}
+        clocks = {at.peer: (at.link.clock_offset, at.link.clock_error) for at in attached.values()}
+        for peer, source, entry in list(self._bridge.imports):
+            if wanted is not None and source.topic not in wanted:
+                continue
+            breathe()
+            at = attached[peer]
+            texts = [f"{at.link.name}: {entry.hidden}"] if entry.conflict else []
+            texts += self._bridge.mismatches(source)
+            yield source, self._import(at, source, entry, clocks[peer]), texts
+
+    def _import(
+        self, at: Attached, source: Source, entry: Import, clock: tuple[float | None, float | None]
+    ) -> RouteInfo:
+        flow = at.inbound.flows.get(entry.route)
+        publication = at.inbound.publication(source)
+        latched = entry.description.latching if entry.description else False
+        now = self._clock.now()
+        quality = flow.quality.summary(*clock, now, latching=latched) if flow else None
+        return RouteInfo(
+            peer=at.link.name,
+            node=source.node,
+            direction="in",
+            state="hidden" if not entry.shown else entry.state.name.lower(),
+            type=entry.type,
+            md5=entry.description.md5 if entry.description else "",
+            messages=quality.messages if quality else 0,
+            bytes=quality.bytes if quality else 0,
+            dropped=publication.dropped if publication else 0,
+            lost=flow.lost if flow else 0,
+            late=flow.late + flow.stale if flow else 0,
+            expired=flow.expired if flow else 0,
+            lane=flow.lane if flow else "",
+            events={kind.value: count for kind, count in flow.watch.counts.items()} if flow else {},
+            recent=tuple(
+                EventInfo(kind=event.kind.value, count=event.count, text=event.text, ago=now - event.now)
+                for event in flow.watch.recent
+            )
+            if flow
+            else (),
+            age=quality.age if quality else None,
+            rate=_known(quality.rate) if quality else None,
+            bandwidth=_known(quality.bandwidth) if quality else None,
+            period=_spread(quality.period) if quality else None,
+            jitter=_known(quality.jitter) if quality else None,
+            latency=_latency(quality) if quality else None,
+            latched=latched,
+            contract=_contract(entry.contract or self._contracts.of(source.topic, entry.type)),
+            problem=entry.hidden or (entry.problem if entry.state is not RouteState.OPEN else ""),
+        )
+
+    def _outbound(self, wanted: Collection[str] | None) -> Iterator[tuple[Source, RouteInfo | None, list[str]]]:
+        """Each source of ours with what did not fit it, and its route to each peer that wants it."""
+        names = {attached.peer: attached.link.name for attached in self._bridge.attached()}
+        for source, local in list(self._bridge.exports.offered.items()):
+            if wanted is not None and source.topic not in wanted:
+                continue
+            breathe()
+            yield source, None, list(self._bridge.mismatches(source))
+            for peer in list(self._bridge.exports.flowing(source)):
+                yield source, self._export(source, local, peer, names.get(peer, "")), []
+
+    def _export(self, source: Source, local: LocalSource, peer: int, name: str) -> RouteInfo:
+        about = self._bridge.exports.description(source)
+        flow = self._bridge.outbound.flows.get(source)
+        leg = flow.by_peer.get(peer) if flow else None
+        contract = self._bridge.exports.contract(source, peer)
+        return RouteInfo(
+            peer=name,
+            node=source.node,
+            direction="out",
+            state="open",
+            type=local.type,
+            md5=about.md5 if about else "",
+            messages=flow.messages if flow else 0,
+            bytes=flow.bytes if flow else 0,
+            dropped=flow.dropped if flow else 0,
+            latched=about.latching if about else False,
+            lane=leg.lane if leg else "",
+            contract=_contract(contract or self._contracts.of(source.topic, local.type)),
+        )
+
+
+def _known(figure: float) -> float | None:
+    return None if math.isnan(figure) else figure
+
+
+def _spread(summary: Summary) -> Spread | None:
+    if not summary.count:
+        return None
+    return Spread(
+        count=summary.count,
+        mean=summary.mean,
+        sd=summary.sd,
+        min=summary.minimum,
+        max=summary.maximum,
+        p50=summary.p50,
+        p99=summary.p99,
+    )
+
+
+def _latency(quality: QualitySummary) -> LatencyInfo | None:
+    s, last, error = quality.latency, quality.latency_last, quality.latency_error
+    if s is None or last is None or error is None:
+        return None
+    return LatencyInfo(
+        count=s.count,
+        mean=s.mean,
+        sd=s.sd,
+        min=s.minimum,
+        max=s.maximum,
+        p50=s.p50,
+        p99=s.p99,
+        last=last,
+        error=error,
+    )
+
+
+def _contract(contract: Contract) -> dict[str, str | float | None]:
+    """What is not the default."""
+    return {key: getattr(contract, key) for key in KEYS if getattr(contract, key) != getattr(_DEFAULT, key)}

@@ -1,0 +1,168 @@
+"""``rmpa up --realtime``: what the kernel says of the process, with the rights and without."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from tests.interop.namespaces import Host
+from tests.interop.processes import eventually
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from tests.interop.agents import Agent
+    from tests.interop.conftest import AgentFactory
+
+FIFO: Final = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+NOBODY: Final = 65534
+AS_NOBODY: Final = (
+    "env",
+    "HOME=/nonexistent",
+    "setpriv",
+    "--reuid",
+    str(NOBODY),
+    "--regid",
+    str(NOBODY),
+    "--clear-groups",
+)
+WITHOUT_RIGHTS: Final = ("setpriv", "--bounding-set=-sys_nice,-ipc_lock,-sys_resource")
+NO_LIMIT: Final = resource.RLIM_INFINITY
+
+
+@dataclass(slots=True)
+class Prefixed(Host):
+    """This machine, with every command behind a prefix."""
+
+    prefix: Sequence[str] = ()
+
+    def command(self, argv: Sequence[str | Path]) -> list[str]:
+        """The command line with the prefix."""
+        return [*self.prefix, *map(str, argv)]
+
+
+def status(pid: int) -> dict[str, int]:
+    """The fields of /proc/PID/status that are KB."""
+    text = Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
+    pairs = (line.split(":", 1) for line in text.splitlines())
+    return {name: int(value.split()[0]) for name, value in pairs if value.endswith(" kB")}
+
+
+def threads(pid: int) -> dict[int, tuple[int, int]]:
+    """Policy and priority of each thread."""
+    ids = [int(path.name) for path in Path(f"/proc/{pid}/task").iterdir()]
+    return {tid: (os.sched_getscheduler(tid), os.sched_getparam(tid).sched_priority) for tid in ids}
+
+
+def may(*capabilities: int) -> bool:
+    """Whether this process has them all."""
+    text = Path("/proc/self/status").read_text(encoding="utf-8")
+    mask = next(int(line.split()[1], 16) for line in text.splitlines() if line.startswith("CapEff:"))
+    return all(mask >> number & 1 for number in capabilities)
+
+
+def runs(prefix: Sequence[str]) -> bool:
+    """Whether rmpa can be run behind that prefix here."""
+    argv = [*prefix, sys.executable, "-c", "import rmpa.cli.main"]
+    return bool(shutil.which("setpriv")) and not subprocess.run(argv, capture_output=True, check=False).returncode
+
+
+needs_rights = pytest.mark.skipif(not may(23, 14), reason="takes CAP_SYS_NICE and CAP_IPC_LOCK")
+needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="takes root, to become somebody else")
+
+
+@pytest.fixture
+def home_of_nobody() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="rmpa-nobody-") as name:
+        os.chown(name, NOBODY, NOBODY)
+        yield Path(name)
+
+
+def said(made: Agent, level: str) -> list[str]:
+    """The texts of the agent's log lines of one level about real time."""
+    lines = [line.split(maxsplit=3) for line in made.process.output.splitlines() if " realtime: " in line]
+    return [text for _, found, _, text in lines if found == level]
+
+
+@needs_rights
+def test_an_agent_is_scheduled_and_locked_as_the_kernel_says(agent: AgentFactory) -> None:
+    plain = agent()
+    made = agent(flags=["--realtime"])
+    made.wait_peer(plain.name)
+    assert os.sched_getscheduler(made.pid) == FIFO
+    assert os.sched_getparam(made.pid).sched_priority == 50
+    assert os.sched_getscheduler(plain.pid) == os.SCHED_OTHER
+    others = {tid: how for tid, how in threads(made.pid).items() if tid != made.pid}
+    assert set(others.values()) == {(FIFO, 49)}
+    memory = status(made.pid)
+    assert memory["VmLck"] > 20_000
+    assert status(plain.pid)["VmLck"] == 0
+    assert memory["VmRSS"] < status(plain.pid)["VmRSS"] + 15_000
+    assert said(made, "warning") == []
+    assert [text.split(":")[1].strip() for text in said(made, "info")] == [
+        "SCHED_FIFO",
+        "timer slack",
+        "memory lock",
+    ]
+
+
+@needs_rights
+def test_the_file_says_how_much_of_it(agent: AgentFactory) -> None:
+    cpu = max(os.sched_getaffinity(0))
+    text = f"[realtime]\nenabled = true\npriority = 7\ncpus = [{cpu}]\nlock_memory = false\n"
+    made = agent(config=text)
+    assert threads(made.pid)[made.pid] == (FIFO, 7)
+    assert {tuple(os.sched_getaffinity(tid)) for tid in threads(made.pid)} == {(cpu,)}
+    assert status(made.pid)["VmLck"] == 0
+
+
+@needs_root
+def test_root_without_the_capabilities_is_told_and_the_agent_runs_on(agent: AgentFactory) -> None:
+    if not runs(WITHOUT_RIGHTS):
+        pytest.skip("capabilities cannot be dropped here")
+    made = agent(Prefixed("bare", "", prefix=WITHOUT_RIGHTS), flags=["--realtime"])
+    told_what_to_do(made, "root")
+    made.wait_peer(agent().name)
+    # Their own words are said once; whoever asks is reminded of them.
+    assert len(said(made, "warning")) == 2
+    code, output = made.rmpa("peer", "list")
+    assert code == 0
+    assert "realtime: no SCHED_FIFO, no memory lock; the agent's log says what would grant it" in output
+
+
+@needs_root
+def test_any_user_is_told_and_the_agent_runs_on(agent: AgentFactory, home_of_nobody: Path) -> None:
+    if not runs(AS_NOBODY):
+        pytest.skip("nobody but root can run this rmpa")
+    made = agent(
+        Prefixed("user", "", prefix=AS_NOBODY), ready=False, flags=["--realtime"], runtime_dir=home_of_nobody
+    )
+    made.process.wait_for("ROS_MASTER_URI=")  # systemd's socket of this test is root's
+    told_what_to_do(made, "nobody")
+    peer = agent()
+    eventually(lambda: made.name in peer.peers(), what="the peer sees it")
+    assert Path(f"/proc/{made.pid}").stat().st_uid == NOBODY
+
+
+def told_what_to_do(made: Agent, user: str) -> None:
+    """Fail unless both refusals are in the log, with what grants each."""
+    fifo, memory = said(made, "warning")
+    assert fifo.startswith("! realtime: no SCHED_FIFO: ")
+    assert memory.startswith("! realtime: no memory lock: ")
+    for text, ways in (
+        (fifo, ("LimitRTPRIO=50", f"'{user} - rtprio 50'", "setcap cap_sys_nice+ep")),
+        (memory, ("LimitMEMLOCK=infinity", f"'{user} - memlock unlimited'", "setcap cap_ipc_lock+ep", "ulimit -l")),
+    ):
+        assert [way for way in ways if way not in text] == []
+    assert os.sched_getscheduler(made.pid) == os.SCHED_OTHER
+    assert status(made.pid)["VmLck"] == 0
+    assert "Traceback" not in made.process.output
