@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from rich.console import Console
 
-from bench import bed, idle, path, startup, throughput
+from bench import bed, crosstraffic, idle, path, period, startup, throughput
 from tests.interop import namespaces
 
 if TYPE_CHECKING:
@@ -35,9 +35,9 @@ class Measurement:
 
 
 MEASUREMENTS: Final[dict[str, Measurement]] = {
-    "path": Measurement(
-        "how late a message is, on every path", path.run, needs=()
-    ),  # leaves out what it cannot start
+    "path": Measurement("how late a message is, on every path", path.run, needs=()),  # leaves out what cannot start
+    "period": Measurement("how evenly messages arrive", period.measure),
+    "crosstraffic": Measurement("a command beside images on 100 Mbit/s", crosstraffic.measure),
     "throughput": Measurement("how much goes through", throughput.measure),
     "startup": Measurement("how soon the first message arrives", startup.measure),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),

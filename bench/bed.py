@@ -5,12 +5,15 @@ from __future__ import annotations
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 from tests.interop import namespaces, ros
 from tests.interop.agents import Agent
 from tests.interop.namespaces import MACHINE, Host, Lab
 from tests.interop.ros import Ros, free_port
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 NODES: Final = Path(__file__).parent / "nodes"
 
@@ -41,9 +44,27 @@ class Bed:
         port = port or (11311 if host.namespace else free_port())
         return self._stack.enter_context(Ros(host, self.home, port))
 
-    def agent(self, host: Host = MACHINE, *, name: str = "", start: bool = True, multicast: str = "") -> Agent:
+    def classic(self, network: int = 0) -> tuple[Ros, Ros]:
+        """Two shells as classic ROS has them: on two hosts of one network, with one rosmaster, on the first."""
+        a, b = self.lab.hosts("classic_a", "classic_b", network=network)
+        here, there = self.shell(a), self.shell(b)
+        here.env["ROS_IP"], there.env["ROS_IP"] = a.address, b.address
+        here.env["ROS_MASTER_URI"] = there.env["ROS_MASTER_URI"] = f"http://{a.address}:{here.port}"
+        here.master()
+        return here, there
+
+    def agent(
+        self,
+        host: Host = MACHINE,
+        *,
+        name: str = "",
+        start: bool = True,
+        multicast: str = "",
+        flags: Sequence[str] = (),
+    ) -> Agent:
         """An agent as users run it; ready when this returns, unless ``start`` is false."""
-        agent = self._stack.enter_context(Agent(host, self.home, name=name, log_level="warning", multicast=multicast))
+        made = Agent(host, self.home, name=name, log_level="warning", multicast=multicast, flags=flags)
+        agent = self._stack.enter_context(made)
         if start:
             agent.start()
             agent.wait_ready()

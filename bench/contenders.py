@@ -104,11 +104,7 @@ def direct(client: str, *, nodelay: bool) -> Callable[[Bed], Contender]:
 
 def direct_hosts(bed: Bed) -> Contender:
     """Roscpp straight from host to host by the same kind of cable as the agents': classic ROS at its best."""
-    a, b = bed.lab.hosts("classic_a", "classic_b")
-    here, there = bed.shell(a), bed.shell(b)
-    here.env["ROS_IP"], there.env["ROS_IP"] = a.address, b.address
-    here.env["ROS_MASTER_URI"] = there.env["ROS_MASTER_URI"] = f"http://{a.address}:{here.port}"
-    here.master()
+    here, there = bed.classic()
     return _nodes("roscpp_hosts", "roscpp direct, two hosts", here, there, "roscpp")
 
 

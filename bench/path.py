@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Final
 
 from rich.table import Table
 
-from bench import contenders, machine, plot, results, samples
+from bench import contenders, machine, plot, results, samples, tables
 from bench.bed import Bed, why_no_hosts, why_no_ros
 from bench.usage import Usage, add
 from tests.interop.processes import Deadline
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
     from pathlib import Path
 
     from rich.console import Console
@@ -132,7 +131,7 @@ def _one_way(score: _Score) -> samples.Summary:
 def _ratio(value: float | None, scores: Scores, base: str, size: int) -> float | None:
     other = scores.get((base, size))
     median = _one_way(other).p50 if other else None
-    return round(value / median, 2) if value and median else None
+    return tables.ratio(value, median)
 
 
 def _result(scores: Scores, titles: dict[str, str], late: list[float]) -> dict[str, object]:
@@ -147,7 +146,7 @@ def _result(scores: Scores, titles: dict[str, str], late: list[float]) -> dict[s
                 "one_way_us": asdict(row),
                 "to_roscpp": _ratio(row.p50, scores, _BASE, size),
                 "to_relays": _ratio(row.p50, scores, "relays", size),
-                "processes": {name: _row(usage, len(score.trips)) for name, usage in score.usage.items()},
+                "processes": {name: tables.usage_row(usage, len(score.trips)) for name, usage in score.usage.items()},
             }
         )
     return {
@@ -157,57 +156,21 @@ def _result(scores: Scores, titles: dict[str, str], late: list[float]) -> dict[s
     }
 
 
-def _row(usage: Usage, trips: int) -> dict[str, float]:
-    return {
-        "cpu_percent": round(usage.percent, 1),
-        "cpu_us_per_trip": round(1e6 * usage.cpu / trips, 1) if trips else 0.0,
-        "rss_mb": round(usage.rss / 1e6, 1),
-    }
-
-
 def _table(size: int, scores: Scores, titles: dict[str, str]) -> Table:
-    table = Table(title=f"one way, {_bytes(size)}, µs")
+    table = Table(title=f"one way, {tables.size(size)}, µs")
     table.add_column("path")
     for head in ("p50", "p95", "p99", "p99.9", "max", "trips", "lost", "to roscpp", "to relays"):
         table.add_column(head, justify="right")
     for key, title in titles.items():
         if score := scores.get((key, size)):
             row = _one_way(score)
-            cells = [_us(value) for value in (row.p50, row.p95, row.p99, row.p999, row.largest)]
+            cells = [tables.us(value) for value in (row.p50, row.p95, row.p99, row.p999, row.largest)]
             ratios = [_ratio(row.p50, scores, base, size) for base in (_BASE, "relays")]
-            table.add_row(title, *cells, str(row.count), str(row.lost), *[_dash(ratio) for ratio in ratios])
+            table.add_row(title, *cells, str(row.count), str(row.lost), *[tables.dash(ratio) for ratio in ratios])
     return table
 
 
 def _usage_table(scores: Scores, titles: dict[str, str], size: int) -> Table:
-    table = Table(title=f"processes on the path, {_bytes(size)}")
-    for head in ("path", "process"):
-        table.add_column(head)
-    for head in ("µs of CPU a round trip", "% of a core", "RSS, MB"):
-        table.add_column(head, justify="right")
-    for key, title in titles.items():
-        if score := scores.get((key, size)):
-            for name, usage in score.usage.items():
-                row = _row(usage, len(score.trips))
-                table.add_row(title, name, *[str(value) for value in _order(row)])
-                title = ""  # noqa: PLW2901 - named once for its block
-    return table
-
-
-def _order(row: dict[str, float]) -> Iterable[float]:
-    return row["cpu_us_per_trip"], row["cpu_percent"], row["rss_mb"]
-
-
-def _bytes(size: int) -> str:
-    for unit, name in ((1024 * 1024, "MB"), (1024, "KB")):
-        if size >= unit:
-            return f"{size // unit} {name}"
-    return f"{size} B"
-
-
-def _us(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1f}" if value < 1000 else f"{value:.0f}"
-
-
-def _dash(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
+    measured = [(title, scores[key, size]) for key, title in titles.items() if (key, size) in scores]
+    rows = [(title, score.usage, len(score.trips)) for title, score in measured]
+    return tables.usage_table(f"processes on the path, {tables.size(size)}", rows, "round trip")

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import signal
 from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.cli.conftest import Place, with_core
+from rmpa.ros.aio.node import Node
+from tests.cli.conftest import Background, Place, with_core
 
 if TYPE_CHECKING:
     import subprocess
     from collections.abc import Callable, Iterator
 
     from rmpa.ros.aio.core import RosCore
+    from rmpa.ros.aio.topics import Publisher
 
 TWIST = "{linear: {x: 0.5}, angular: {z: -1}}"
 
@@ -84,6 +87,73 @@ def test_figures(place: Place, talking: subprocess.Popen[str], command: str, fig
     assert code == 0
     assert out.startswith("subscribed to [/cmd]\naverage")
     assert "window: 10\n" in out
+
+
+@pytest.mark.parametrize(
+    ("command", "line"),
+    [
+        ("hz", "at the agent, from joystick /joy_node: 10.000 Hz, period 100 ms (sd 310 µs, min 98.80 ms, "),
+        ("bw", "at the agent, from joystick /joy_node: 1.00 kB/s, 100 B a message"),
+        ("delay", "by the link's clock, from joystick /joy_node: p50 412 µs, p99 790 µs, max 1.20 ms, last 390 µs; "),
+    ],
+)
+def test_the_agents_figures_of_a_remote_source_stand_behind(
+    place: Place,
+    talking: subprocess.Popen[str],
+    agent: Callable[..., None],
+    core: RosCore,
+    command: str,
+    line: str,
+) -> None:
+    agent(snapshot=with_core(core.uri))
+    code, out, _ = place.run("topic", command, "/cmd", "-n", "10")
+    assert code == 0
+    assert f"\n\t{line}" in out
+    (*_, last) = place.json("topic", command, "/cmd", "-n", "10", "--json")
+    assert last["source"] == ("header" if command == "delay" else "subscriber")
+    assert last["window"] == 10
+    assert isinstance(last["routes"], list)
+    assert last["routes"][0]["latency"]["error"] == 0.000216
+
+
+@pytest.fixture
+def proxy(background: Background, core: RosCore) -> Iterator[None]:
+    """A node that stands for one of peer joystick: texts on /cmd at 50 Hz."""
+    node = Node("/rmpa/joystick/joy_node", master_uri=core.uri)
+    tasks: list[asyncio.Task[None]] = []
+
+    async def talk(publisher: Publisher) -> None:
+        while True:
+            publisher.publish(publisher.make({"data": "hello"}))
+            await asyncio.sleep(0.02)
+
+    async def start() -> None:
+        await node.__aenter__()
+        tasks.append(asyncio.create_task(talk(await node.advertise("/cmd", "std_msgs/String"))))
+
+    async def stop() -> None:
+        tasks[0].cancel()
+        await node.close()
+
+    background.do(start())
+    yield
+    background.do(stop())
+
+
+@pytest.mark.usefixtures("proxy")
+def test_over_the_mesh_a_delay_needs_no_header(place: Place, agent: Callable[..., None], core: RosCore) -> None:
+    agent(snapshot=with_core(core.uri))
+    code, out, err = place.run("topic", "delay", "joystick:/cmd", "-n", "5")
+    assert (code, err) == (0, "")
+    assert "no header, and so no stamp to tell the whole age by\n\tby the link's clock, from joystick" in out
+    (*_, last) = place.json("topic", "delay", "/cmd", "-n", "5", "--json")
+    assert (last["source"], last["delay"], last["error"]) == ("link", 0.00044, 0.000216)
+
+
+@pytest.mark.usefixtures("proxy")
+def test_without_the_agent_nobody_knows_the_links_clock(place: Place, core: RosCore) -> None:
+    code, _, err = place.run("topic", "delay", "/cmd", "--master", core.uri)
+    assert (code, err) == (1, "rmpa: std_msgs/String has no header, and so no stamp to tell its age by\n")
 
 
 def test_ctrl_c_is_quiet_and_leaves_nothing(place: Place, talking: subprocess.Popen[str], core: RosCore) -> None:

@@ -18,7 +18,7 @@ from rmpa.monitor.aio.control_client import ControlClient, choose_agent
 from rmpa.monitor.snapshot import PingReply
 
 if TYPE_CHECKING:
-    from rmpa.monitor.snapshot import PeerInfo, Snapshot
+    from rmpa.monitor.snapshot import PeerInfo, RouteInfo, Snapshot, TopicInfo
 
 _HERE: Final = "rmpa.cli.peer"
 _COLOURS: Final = {"linked": "green", "linking": "yellow", "refused": "red", "conflict": "red"}
@@ -34,6 +34,17 @@ _COLUMNS: Final = (
     Column("OUT", right=True),
     Column("QUEUE", right=True),
     Column("DROPS", right=True),
+)
+_ROUTES: Final = (
+    Column("  TOPIC"),
+    Column("TYPE"),
+    Column("NODE"),
+    Column("ROUTE"),
+    Column("MESSAGES", right=True),
+    Column("RATE", right=True),
+    Column("LATENCY", right=True),
+    Column("P99", right=True),
+    Column("LOST", right=True),
 )
 
 
@@ -131,7 +142,11 @@ def find_peer(snapshot: Snapshot, wanted: str) -> PeerInfo:
 @json_option
 @agent_option
 def info(name: str, as_json: bool, agent: str | None) -> None:
-    """Show all that is known of the peer NAME (or of one by its GUID)."""
+    """Show all that is known of the peer NAME (or of one by its GUID).
+
+    Clock is its wall clock less ours, with the bound of what is known of it. Of each topic that comes from it: how
+    often it came in the last minute, and the median and 99th percentile of its one-way latency, true within ±.
+    """
     with connect(agent) as client:
         snapshot = client.snapshot()
     found = find_peer(snapshot, name)
@@ -144,14 +159,22 @@ def info(name: str, as_json: bool, agent: str | None) -> None:
         routes = [
             (t, r) for t in snapshot.topics for r in t.routes if r.peer == found.name and r.direction == direction
         ]
-        if not routes:
-            continue
-        click.echo(f"\nTopics that {title}:")
-        columns = (Column("  TOPIC"), Column("TYPE"), Column("NODE"), Column("ROUTE"), Column("MESSAGES", right=True))
-        print_table(
-            columns,
-            [[f"  {t.name}", r.type or t.type or "-", r.node, r.state, str(r.messages)] for t, r in routes],
-        )
+        if routes:
+            click.echo(f"\nTopics that {title}:")
+            columns = _ROUTES if direction == "in" else _ROUTES[:5]
+            print_table(columns, [_route_row(t, r)[: len(columns)] for t, r in routes])
+
+
+def _route_row(topic: TopicInfo, route: RouteInfo) -> list[str]:
+    latency = route.latency
+    return [
+        *map(printable, (f"  {topic.name}", route.type or topic.type or "-", route.node, route.state)),
+        str(route.messages),
+        "-" if route.rate is None else f"{route.rate:.1f} Hz",
+        "-" if latency is None else f"{duration(latency.p50)} ±{duration(latency.error)}",
+        "-" if latency is None else duration(latency.p99),
+        str(route.lost + route.late + route.expired),
+    ]
 
 
 def _facts(info: PeerInfo) -> list[tuple[str, str]]:

@@ -22,7 +22,7 @@ _WATCH: Final = "rmpa.cli.topic_watch"
         "echo": ("rmpa.cli.topic_echo", "Print messages."),
         "hz": (_WATCH, "Show how often messages come."),
         "bw": (_WATCH, "Show how many bytes they need."),
-        "delay": (_WATCH, "Show how old they are when they come, by their header's stamp."),
+        "delay": (_WATCH, "Show how old they are when they come; over the mesh by the link's clock too."),
         "pub": ("rmpa.cli.topic_pub", "Publish messages."),
     },
     epilog="""\

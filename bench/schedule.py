@@ -1,0 +1,311 @@
+"""Streams on a fixed schedule: a roscpp node that publishes, and one that notes when each message came.
+
+Latency runs from the moment at which a message was *due*, so that a path that holds the publisher back is charged for
+it (no coordinated omission). All hosts are network namespaces of one machine and share its clock.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import statistics
+import time
+from array import array
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from bench import machine, samples
+from bench.bed import NODES, Bed
+from bench.tables import usage_row
+from bench.usage import Meter, Usage, add
+from tests.interop.processes import Deadline
+from tests.interop.ros import compiled
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from rich.console import Console
+
+    from tests.interop.agents import Agent
+    from tests.interop.processes import Process
+    from tests.interop.ros import Ros
+
+_LEAD_IN: Final = 0.2
+"""Seconds of each round whose messages are thrown away: caches and the processor's clock come up."""
+_START: Final = 0.02
+"""Seconds from the command to the first message."""
+_SETTLE: Final = 0.3
+"""Seconds without an arrival after which a round is over."""
+_FLOWING_DEADLINE: Final = 30.0
+_HOST_LATENESS: Final = 2.0
+"""Seconds of sleeps, before and after, that tell how late the machine itself wakes."""
+_rounds = itertools.count(1)
+
+
+@dataclass(slots=True)
+class Arrivals:
+    """What came of one round, without its lead-in.
+
+    Args:
+        sent: Messages that were given to roscpp.
+        sequence: Of each that came, in the order of arrival.
+        due: When each was due to leave, ns.
+        came: When each was there, ns of the same clock.
+        late: How late the publisher itself was with each that it sent, ns.
+        usage: What the processes on the way used, lead-in included.
+        total: How many messages that was for.
+    """
+
+    sent: int
+    sequence: Sequence[int]
+    due: Sequence[int]
+    came: Sequence[int]
+    late: Sequence[int] = ()
+    usage: dict[str, Usage] = field(default_factory=dict)
+    total: int = 0
+
+    @property
+    def lost(self) -> int:
+        """How many never came."""
+        return self.sent - len(set(self.sequence))
+
+    @property
+    def doubled(self) -> int:
+        """How many came more than once."""
+        return len(self.sequence) - len(set(self.sequence))
+
+    def latencies(self) -> list[float]:
+        """From due to there, µs."""
+        return [(came - due) / 1000 for came, due in zip(self.came, self.due, strict=True)]
+
+    def periods(self) -> list[float]:
+        """Between arrivals that are neighbours in the sequence, µs."""
+        pairs = zip(self.sequence, self.came, strict=True)
+        return [(b - a) / 1000 for (i, a), (j, b) in itertools.pairwise(pairs) if j == i + 1]
+
+    def source_periods(self) -> list[float]:
+        """Between what the publisher sent, µs: the part of the jitter that no path can take away."""
+        step = self.step
+        return [step + (b - a) / 1000 for a, b in itertools.pairwise(self.late)]
+
+    @property
+    def step(self) -> float:
+        """The period that was meant, µs; 0 if fewer than two came."""
+        if len(self.due) < 2 or self.sequence[-1] == self.sequence[0]:
+            return 0.0
+        return (self.due[-1] - self.due[0]) / (self.sequence[-1] - self.sequence[0]) / 1000
+
+    def bytes_per_second(self, size: int, begin: int, end: int) -> float:
+        """What came of messages of ``size`` bytes between two moments of the clock."""
+        inside = [came for came in self.came if begin <= came <= end]
+        return size * (len(inside) - 1) / (inside[-1] - inside[0]) * 1e9 if len(inside) > 1 else 0.0
+
+
+class Stream:
+    """A publisher and a receiver of one topic, and their rounds.
+
+    Args:
+        bed: Where scratch files go.
+        source: Runs ``pace``.
+        target: Runs ``arrive``.
+        between: The processes between them, by name.
+    """
+
+    def __init__(self, bed: Bed, source: Process, target: Process, between: Mapping[str, Process]) -> None:
+        self.source, self.target = source, target
+        self.pids = {
+            "publisher": source.pid,
+            **{name: process.pid for name, process in between.items()},
+            "receiver": target.pid,
+        }
+        self._sent = bed.home / f"sent-{source.pid}"
+        self._came = bed.home / f"came-{target.pid}"
+        self._round = self._lead = self._mark = 0
+        self._deadline = self._rate = 0.0
+        self._meter = Meter({})
+
+    def wait_flowing(self) -> None:
+        """Return when messages come through, and connections are as they will be.
+
+        Raises:
+            Deadline: None came.
+        """
+        deadline = time.monotonic() + _FLOWING_DEADLINE
+        self.source.wait_event("connected", _FLOWING_DEADLINE)
+        while not self.run(64, 100.0, 0.1).sequence:
+            if time.monotonic() > deadline:
+                raise Deadline(f"nothing of {self.source.name} came to {self.target.name}")
+
+    def run(self, size: int, rate: float, seconds: float) -> Arrivals:
+        """Send for so long; return what came."""
+        self.begin(size, rate, seconds)
+        return self.end()
+
+    def begin(self, size: int, rate: float, seconds: float) -> None:
+        """Start a round; ``end`` returns what came of it."""
+        self._round = next(_rounds)
+        self._lead = max(2, round(rate * _LEAD_IN))
+        count = self._lead + max(2, round(rate * seconds))
+        self._rate, self._deadline = rate, count / rate + 30.0
+        self._mark = self.source.mark_events()
+        self._meter = Meter(self.pids)
+        self.source.tell(f"{self._round} {size} {rate} {count} {self._sent}")
+
+    def wait_lead_in(self, seconds: float) -> None:
+        """Let so much of a round that was begun go by."""
+        time.sleep(_START + self._lead / self._rate + seconds)
+
+    def end(self) -> Arrivals:
+        """Wait until all is sent, and nothing more arrives; return what came."""
+        self.source.wait_event("sent", self._deadline, since=self._mark)
+        usage = self._meter.read()
+        mark = self.target.mark_events()
+        self.target.tell(f"{self._round} {self._came} {_SETTLE}")
+        self.target.wait_event("noted", since=mark)
+        rows, late = array("Q"), array("Q")
+        rows.frombytes(self._came.read_bytes())
+        late.frombytes(self._sent.read_bytes())
+        arrivals = parse(rows, late, self._lead)
+        arrivals.usage, arrivals.total = usage, len(late)
+        return arrivals
+
+
+def parse(rows: Sequence[int], late: Sequence[int], lead: int) -> Arrivals:
+    """Read the files of the two nodes (``arrive.cpp``, ``pace.cpp``), without the first ``lead`` messages."""
+    counted = [at for at in range(0, len(rows), 3) if rows[at] >= lead]
+    sequence, due, came = (array("Q", [rows[at + column] for at in counted]) for column in range(3))
+    return Arrivals(max(0, len(late) - lead), sequence, due, came, late[lead:])
+
+
+@dataclass(slots=True)
+class Way:
+    """One way from host to host.
+
+    Args:
+        key: Its name in JSON.
+        title: Its name in tables.
+        here: The publisher's shell.
+        there: The receiver's.
+        agents: The agents between them; none in classic ROS.
+    """
+
+    key: str
+    title: str
+    here: Ros
+    there: Ros
+    agents: list[Agent] = field(default_factory=list)
+
+    def stream(self, bed: Bed, topic: str, *, queue: int = 100, fifo: int = 0) -> Stream:
+        """Start both nodes of one topic, under SCHED_FIFO if ``fifo`` is a priority."""
+        prefix = ["chrt", "-f", str(fifo)] if fifo else []
+        words = ["--topic", topic, "--queue", str(queue), "--nodelay"]
+        target = self.there.start(*prefix, compiled("arrive", NODES), *words, name="arrive", commands=True)
+        source = self.here.start(*prefix, compiled("pace", NODES), *words, name="pace", commands=True)
+        between = {f"agent {number}": agent.process for number, agent in enumerate(self.agents, 1)}
+        made = Stream(bed, source, target, between)
+        made.wait_flowing()
+        return made
+
+
+def direct(bed: Bed, network: int = 0) -> Way:
+    """Classic ROS at its best: roscpp with tcpNoDelay across the cable, one master."""
+    return Way("direct", "roscpp direct", *bed.classic(network))
+
+
+def agents(
+    bed: Bed,
+    *,
+    key: str = "agents",
+    title: str = "two agents",
+    network: int = 0,
+    flags: Sequence[str] = (),
+) -> Way:
+    """Two agents on two hosts of a network of their own, linked."""
+    hosts = bed.lab.hosts(f"{key}_a", f"{key}_b", network=network)
+    pair = [bed.agent(host, name=host.name, flags=flags) for host in hosts]
+    pair[0].wait_peer(pair[1].name)
+    here, there = (bed.shell(agent.host, agent.core_port) for agent in pair)
+    return Way(key, title, here, there, pair)
+
+
+class Score:
+    """One way under one condition, over all rounds."""
+
+    def __init__(self) -> None:
+        self.latencies = array("d")
+        self.source_late = array("d")
+        self.lost = self.doubled = 0
+        self.usage: dict[str, Usage] = {}
+        self.messages = 0
+        self.rounds: list[list[float]] = []
+
+    def add(self, arrivals: Arrivals) -> None:
+        """Take one round."""
+        self.rounds.append(arrivals.latencies())
+        self.latencies.extend(self.rounds[-1])
+        self.source_late.extend(late / 1000 for late in arrivals.late)
+        self.lost += arrivals.lost
+        self.doubled += arrivals.doubled
+        self.usage = add(self.usage, arrivals.usage)
+        self.messages += arrivals.total
+
+    @property
+    def summary(self) -> samples.Summary:
+        """All rounds together, µs."""
+        return samples.summary(self.latencies, self.lost)
+
+    def median_of_rounds(self, percent: float) -> float | None:
+        """The median over rounds of their own percentile, whatever one bad moment of the machine did; µs."""
+        kept = [sorted(one) for one in self.rounds if one]
+        return statistics.median(samples.percentile(one, percent) for one in kept) if kept else None
+
+    def later_than(self, deadline: float) -> float:
+        """The share of what was sent that came later than ``deadline`` µs, or never."""
+        sent = len(self.latencies) - self.doubled + self.lost
+        return (sum(late > deadline for late in self.latencies) + self.lost) / sent if sent else math.nan
+
+    def row(self, deadline: float) -> dict[str, object]:
+        """For the result."""
+        return {
+            "latency_us": asdict(self.summary),
+            "p99_median_of_rounds_us": self.median_of_rounds(99.0),
+            "p999_median_of_rounds_us": self.median_of_rounds(99.9),
+            "doubled": self.doubled,
+            "deadline_us": deadline,
+            "share_past_deadline": self.later_than(deadline),
+            "publisher_late_us": asdict(samples.summary(self.source_late)),
+            "processes": {name: usage_row(usage, self.messages) for name, usage in self.usage.items()},
+        }
+
+
+def turns(ways: Sequence[Way], rounds: int, console: Console) -> Iterator[list[Way]]:
+    """The order of each round: another one starts it, so that nobody is always behind the same neighbour."""
+    for turn in range(rounds):
+        console.print(f"round {turn + 1} of {rounds}", style="dim")
+        first = turn % len(ways)
+        yield [*ways[first:], *ways[:first]]
+
+
+class HostLateness:
+    """How late the machine itself wakes, before and after a measurement."""
+
+    def __init__(self) -> None:
+        self._late = machine.lateness(_HOST_LATENESS)
+
+    def finish(self, console: Console) -> dict[str, object]:
+        """Measure again, print the histogram, return both for the result."""
+        self._late += machine.lateness(_HOST_LATENESS)
+        histogram = machine.histogram(self._late)
+        console.print(f"late wake-ups of this machine (1 ms sleeps, µs): {histogram}")
+        return {"late_wake_ups_us": asdict(samples.summary(self._late)), "late_histogram": histogram}
+
+
+def lateness_under_fifo(seconds: float, priority: int) -> list[float]:
+    """As ``machine.lateness``, under SCHED_FIFO: what the kernel and the hypervisor add to real-time processes."""
+    policy, before = os.sched_getscheduler(0), os.sched_getparam(0)
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    try:
+        return machine.lateness(seconds)
+    finally:
+        os.sched_setscheduler(0, policy, before)
