@@ -179,7 +179,7 @@ EXPRESS_AGAIN_MESSAGES: Final = 200
 """Small messages in a row before a topic that had a large one goes back to the express lane."""
 EXPRESS_AGAIN_AFTER: Final = 5.0
 """Seconds since its last large message, likewise: a topic that mixes both sizes must not go to and fro."""
-CUT_THROUGH_BYTES: Final = 32 * KIB
+CUT_THROUGH_BYTES: Final = 128 * KIB
 """Messages above this are handed on while they still arrive."""
 STALE_AGE: Final = 0.1
 """A best-effort message that was on its way for longer (a cable was out) gives way to a newer one behind it."""

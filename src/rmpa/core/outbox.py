@@ -194,6 +194,11 @@ class Outbox:
         if data:
             self._commit_bytes(memoryview(data))
 
+    def commit(self, data: bytes) -> None:
+        """Queue a part of a parcel whose parts before it have left or are committed: it stays, in front of turns."""
+        if data:
+            self._commit_bytes(memoryview(data))
+
     def prepend(self, data: bytes) -> None:
         """Queue bytes in front of everything: what a connection still had to say before it carried this outbox."""
         if data:

@@ -21,10 +21,11 @@ from rmpa.core.outbox import ABORT, FIRST, LAST, URGENT, Framer, Outbox, Parcel
 _log = logging.getLogger(__name__)
 
 _FIRST_BUFFER: Final = 64 * limits.KIB
+_BUSY_BUFFER: Final = 256 * limits.KIB
 _KEPT_BUFFER: Final = 4 * limits.MIB
 _IOV: Final = 64
 _CORK_MESSAGES: Final = 128
-_CORK_BYTES: Final = 64 * limits.KIB
+_CORK_BYTES: Final = 512 * limits.KIB
 _PART: Final = limits.MIB
 
 Buffer = bytes | bytearray | memoryview
@@ -75,7 +76,7 @@ class Stream:
         self._wanted = 0
         self._writing = False
         self._finishing = False
-        self._kept: list[tuple[Sequence[Buffer], int]] = []
+        self._kept: list[tuple[Sequence[Buffer], int, bool]] = []
         self._kept_bytes = 0
         self._closed = False
         self._drained: asyncio.Future[None] | None = None
@@ -159,7 +160,7 @@ class Stream:
         self._keep = True
         self.pump()
 
-    def _send_now(self, parts: Sequence[Buffer], key: int) -> int:
+    def _send_now(self, parts: Sequence[Buffer], key: int, part: bool = False) -> int:  # noqa: FBT001, FBT002
         try:
             sent = self._sock.sendmsg(parts)
         except (BlockingIOError, InterruptedError):
@@ -174,7 +175,7 @@ class Stream:
         if sent == size:
             return 0
         self._wait_for_room()
-        if not sent:
+        if not sent and not part:
             return self._queue(b"".join(parts), key)
         self._outbox.push_rest(_behind(parts, sent), key)
         return 0
@@ -196,8 +197,6 @@ class Stream:
         """
         if self._closed or self._finishing or parcel.dropped:
             return 0
-        if self._kept:
-            self._uncork()
         view = memoryview(data)
         dropped = 0
         while len(view) > _PART:
@@ -216,7 +215,10 @@ class Stream:
             return dropped
         parts: list[Buffer] = self._framed(parcel, view) if self._frame is not None else [view]
         parcel.sent += len(view)
-        return self._send_now(parts, parcel.key)
+        if _corked is not None:
+            self._cork(parts, parcel.key, part=True)
+            return 0
+        return self._send_now(parts, parcel.key, part=True)
 
     def abandon(self, parcel: Parcel) -> bool:
         """The rest of a message will never come.
@@ -226,6 +228,8 @@ class Stream:
         """
         if self._closed or parcel.sent == parcel.size:
             return False
+        if self._kept:
+            self._uncork()
         if not self._writing and parcel.sent and not parcel.dropped and self._frame is not None:
             parcel.dropped = True
             self._send_now([self._frame(parcel, 0, LAST | ABORT)], parcel.key)
@@ -253,10 +257,10 @@ class Stream:
 
     # --- the end --------------------------------------------------------------------------------------------
 
-    def _cork(self, parts: Sequence[Buffer], key: int) -> None:
+    def _cork(self, parts: Sequence[Buffer], key: int, *, part: bool = False) -> None:
         """Keep a message until the read that it came from is done with; what is kept is sent in one call."""
         cast("list[Stream]", _corked).append(self)
-        self._kept.append((parts, key))
+        self._kept.append((parts, key, part))
         for part in parts:
             self._kept_bytes += len(part)
         if len(self._kept) >= _CORK_MESSAGES or self._kept_bytes >= _CORK_BYTES:
@@ -271,7 +275,7 @@ class Stream:
             self._send_now(*kept[0])
             return
         try:
-            sent = self._sock.sendmsg([part for parts, _ in kept for part in parts])
+            sent = self._sock.sendmsg([buffer for parts, _, _ in kept for buffer in parts])
         except (BlockingIOError, InterruptedError):
             sent = 0
         except OSError as error:
@@ -281,16 +285,18 @@ class Stream:
         if sent < size:
             self._keep_rest(kept, sent)
 
-    def _keep_rest(self, kept: list[tuple[Sequence[Buffer], int]], sent: int) -> None:
+    def _keep_rest(self, kept: list[tuple[Sequence[Buffer], int, bool]], sent: int) -> None:
         """Queue what a batch's ``sendmsg`` did not take: the rest of one message perhaps, then whole ones."""
         self._wait_for_room()
-        for parts, key in kept:
+        for parts, key, part in kept:
             length = sum(map(len, parts))
             if sent >= length:
                 sent -= length
             elif sent > 0:
                 self._outbox.push_rest(_behind(parts, sent), key)
                 sent = 0
+            elif part:
+                self._outbox.commit(b"".join(parts))
             else:
                 self._queue(b"".join(parts), key)
 
@@ -377,6 +383,8 @@ class Stream:
         self.last_in = self._loop.time()
         self.bytes_in += count
         self._filled += count
+        if self._filled == _FIRST_BUFFER == len(self._buffer):
+            self._reserve(_BUSY_BUFFER)  # more is waiting: large messages, in fewer reads from now on
         if self._filled >= self._wanted or self._filled == len(self._buffer):
             self._deliver()
 
