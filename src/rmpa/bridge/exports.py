@@ -182,7 +182,11 @@ class Exports:
             del flow.routes[peer, number]
             flow.away[peer] = route
             actions.append(SuspendRoute(source, peer))
-        return actions, any(peer in flow.away for flow in self._flows.values())
+        return actions, self.waits_for(peer)
+
+    def waits_for(self, peer: int) -> bool:
+        """Whether a reliable route waits for a peer without a link."""
+        return any(peer in flow.away for flow in self._flows.values())
 
     def opened(self, peer: int, message: Open) -> list[Action]:
         """A peer asks for a source."""

@@ -94,6 +94,9 @@ def _nothing(_peer: int, _source: Source) -> None:
     """Nothing outlives its link."""
 
 
+_LISTENED: Final = frozenset({RouteState.OPENING, RouteState.OPEN, RouteState.WAITING})
+
+
 class Imports:
     """The inbound half of the bridge.
 
@@ -155,8 +158,13 @@ class Imports:
         self._nodes.setdefault(peer, Counter())
         return []
 
-    def link_away(self, peer: int) -> tuple[list[Action], bool]:
+    def link_away(self, peer: int, *, briefly: bool = False) -> tuple[list[Action], bool]:
         """A link is gone, but its peer may come back: what does not need a reliable route leaves the local graph.
+
+        Args:
+            peer: Whose.
+            briefly: Nothing leaves yet: the link fell silent, and most of those are back at once. Called again
+                without this when the time is over.
 
         Returns:
             What to do, and whether something waits for the peer: if nothing does, ``link_down`` it.
@@ -166,22 +174,25 @@ class Imports:
         self._routes[peer] = {}
         for source, entry in list(self._peers[peer].items()):
             reliable = entry.contract is not None and entry.contract.reliability is Reliability.RELIABLE
-            if reliable and entry.state in {RouteState.OPEN, RouteState.WAITING} and entry.wanted:
-                if entry.route:
-                    actions.append(Detach(peer, source, entry.route, keep=True))
-                entry.route = 0
-                entry.problem = "its peer is away"
-                if entry.state is RouteState.OPEN:
-                    self._move(peer, source, entry, RouteState.WAITING)
-                entry.timer = None
-                self._timed.discard((peer, source))
-                continue
-            self._timed.discard((peer, source))
+            keep = briefly or (reliable and entry.wanted and entry.state in _LISTENED)
             if entry.route:
-                actions.append(Detach(peer, source, entry.route))
+                actions.append(Detach(peer, source, entry.route, keep=keep))
             entry.route = 0
-            actions += self._drop(peer, source, entry)
+            self._timed.discard((peer, source))
+            if keep:
+                self._suspend(peer, source, entry)
+            else:
+                actions += self._drop(peer, source, entry)
         return actions, bool(self._peers[peer])
+
+    def _suspend(self, peer: int, source: Source, entry: Import) -> None:
+        """Bring an entry into a state without a link."""
+        entry.problem = "its peer is away"
+        if entry.state is RouteState.LINGERING:
+            self._move(peer, source, entry, RouteState.IDLE)
+        elif entry.state in {RouteState.OPEN, RouteState.OPENING}:
+            self._move(peer, source, entry, RouteState.WAITING)
+        entry.timer = None
 
     def link_down(self, peer: int) -> list[Action]:
         """A link is gone: all that came over it leaves the local graph."""

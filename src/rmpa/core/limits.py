@@ -196,6 +196,9 @@ RELIABLE_WINDOW_MESSAGES: Final = 512
 """Reliable messages of one route on their way to a peer and not yet acknowledged."""
 RELIABLE_WINDOW_BYTES: Final = 4 * MIB
 """The same in bytes; one message always fits."""
+AWAY_GRACE: Final = 0.5
+"""A peer whose link fell silent keeps its place in the local graph for this long: after a cable's second without
+contact the next link stands within it, and no node need connect anew."""
 KEEP_ALL_MESSAGES: Final = 1_000_000
 """What "all" means for a contract's history: bytes bound it first."""
 BULK_STALE_AGE: Final = 1.0

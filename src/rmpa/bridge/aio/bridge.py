@@ -175,14 +175,26 @@ class Bridge:
         if attached is None:
             return
         attached.inbound.link_down()
-        exports, waited_for = self._exports.link_away(attached.peer)
-        imports, waiting = self._imports.link_away(attached.peer)
-        if waited_for or waiting:
-            attached.away = self._loop.call_later(limits.RESUME_WINDOW, self._give_up, attached)
-            _log.info("= %s is away: its reliable topics wait for %g s", link.name, limits.RESUME_WINDOW)
-            self._act([*exports, *imports])
+        exports, _ = self._exports.link_away(attached.peer)
+        self._act(exports)
+        if link.silent:
+            # Most silences end soon, by a new link: until then nobody need notice.
+            attached.away = self._loop.call_later(limits.AWAY_GRACE, self._stay_away, attached)
+            imports, _ = self._imports.link_away(attached.peer, briefly=True)
+            self._act(imports)
         else:
-            self._act(exports)
+            self._stay_away(attached)
+
+    def _stay_away(self, attached: Attached) -> None:
+        """A peer without a link does not come back at once: only what a reliable route needs waits for it."""
+        name = attached.link.name
+        attached.away = self._loop.call_later(limits.RESUME_WINDOW, self._give_up, attached)
+        waited_for = self._exports.waits_for(attached.peer)
+        imports, waiting = self._imports.link_away(attached.peer)
+        self._act(imports)
+        if waited_for or waiting:
+            _log.info("= %s is away: its reliable topics wait for %g s", name, limits.RESUME_WINDOW)
+        else:
             self._give_up(attached)
 
     def clock(self, link: MeshLink) -> None:

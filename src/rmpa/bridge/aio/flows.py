@@ -213,7 +213,8 @@ class ImportFlow:
         self._time = link_time
         self._on_ack = on_ack
         self._on_torn = on_torn
-        self._expected = 1
+        self._expected = -1  # none: the first one takes the long way, once
+        self._replay: bytes | None = None
         self._receiver: ReliableReceiver | None = None
         if contract.reliability is Reliability.RELIABLE:
             self._receiver = ReliableReceiver()
@@ -260,6 +261,10 @@ class ImportFlow:
         self._drop_parts()
         return self._receiver.begin(epoch, first) if self._receiver is not None else True
 
+    def expect_replay(self, latched: bytes | None) -> None:
+        """The subscribers have this latched message already; the new route brings it again, if it is still that."""
+        self._replay = latched
+
     def rebind(self, on_ack: Callable[[int], None]) -> None:
         """Go on over another link."""
         self._on_ack = on_ack
@@ -271,6 +276,8 @@ class ImportFlow:
             if sequence != self._expected and not self._follows(sequence):
                 return
             self._expected = sequence + 1 & _SEQUENCE_MASK
+            if self._replay is not None and self._is_replay(framed):
+                return
             age = now_ns - stamp_ns + self._time.ahead_ns
             if age > self._stale_ns and self._give_way(sequence, stamp_ns, framed, age):
                 return
@@ -333,12 +340,18 @@ class ImportFlow:
 
     def _follows(self, sequence: int) -> bool:
         """A jump of the sequence: count what is missing; whether the message is not one from before."""
-        gap = sequence - self._expected & _SEQUENCE_MASK
+        expected = 1 if self._expected < 0 else self._expected
+        gap = sequence - expected & _SEQUENCE_MASK
         if gap >= _HALF:
             self.late += 1
             return False
-        self._missing(gap)
+        if gap:
+            self._missing(gap)
         return True
+
+    def _is_replay(self, framed: memoryview) -> bool:
+        latched, self._replay = self._replay, None
+        return latched is not None and framed == memoryview(latched)
 
     def _missing(self, count: int) -> None:
         self.lost += count

@@ -147,6 +147,7 @@ class Inbound:
                 on_torn=lambda: self._call_back(source, publication),
             )
             flow.begin_epoch(action.epoch, action.first)
+            flow.expect_replay(publication.latched)
         publication.bound(contract.depth)
         if contract.durability is Durability.TRANSIENT_LOCAL:
             publication.keep(contract.kept)

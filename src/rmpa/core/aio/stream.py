@@ -160,7 +160,7 @@ class Stream:
         self._keep = True
         self.pump()
 
-    def _send_now(self, parts: Sequence[Buffer], key: int, part: bool = False) -> int:  # noqa: FBT001, FBT002
+    def _send_now(self, parts: Sequence[Buffer], key: int, part: bool = False) -> int:
         try:
             sent = self._sock.sendmsg(parts)
         except (BlockingIOError, InterruptedError):
@@ -170,8 +170,8 @@ class Stream:
             return 0
         self.bytes_out += sent
         size = 0
-        for part in parts:
-            size += len(part)
+        for buffer in parts:
+            size += len(buffer)
         if sent == size:
             return 0
         self._wait_for_room()
@@ -261,8 +261,8 @@ class Stream:
         """Keep a message until the read that it came from is done with; what is kept is sent in one call."""
         cast("list[Stream]", _corked).append(self)
         self._kept.append((parts, key, part))
-        for part in parts:
-            self._kept_bytes += len(part)
+        for buffer in parts:
+            self._kept_bytes += len(buffer)
         if len(self._kept) >= _CORK_MESSAGES or self._kept_bytes >= _CORK_BYTES:
             self._uncork()
 

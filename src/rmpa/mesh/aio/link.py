@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core import limits
 from rmpa.core.aio.stream import Stream
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
     from rmpa.mesh.handshake import Hello, Refuse, Verdict
 
 _log = logging.getLogger(__name__)
+
+_SILENCE: Final = frozenset({errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ENETDOWN})
 
 OnLinkData = Callable[["MeshLink", int, int, int, memoryview], None]
 OnLinkPart = Callable[["MeshLink", int, int, int, int, memoryview], None]
@@ -135,6 +138,8 @@ class MeshLink:
         self._mark_to: Callable[[Kind, int, int], None] | None = None
         self._of = self
         self._malformed = False
+        self.silent = False
+        """Once it has ended: whether nobody said so; its peer may be there, and the cable is not."""
         self.used = False
         """Whether this is the link that is used with its peer."""
         self.express = LaneSender("express")
@@ -424,6 +429,7 @@ class MeshLink:
             bulk.close(reason)
 
     def _lost(self, error: Exception | None) -> None:
+        self.silent = isinstance(error, OSError) and error.errno in _SILENCE
         reason = f"{self.name} closed the connection" if error is None else f"connection to {self.name} lost: {error}"
         self._machine.lost(reason)
 
@@ -455,7 +461,9 @@ class MeshLink:
         self._timer = None
         # A large message renews the lease while it arrives, long before the machine sees a whole frame of it.
         self._machine.heard(self._stream.last_in)
+        was_up = self._machine.state is State.UP
         self._machine.handle_timer(self._clock.now())
+        self.silent = was_up and self._machine.state is State.CLOSED
         self._after()
         self._arm()
 

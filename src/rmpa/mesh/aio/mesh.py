@@ -22,7 +22,7 @@ from rmpa.mesh.aio.link import MeshLink, Takers
 from rmpa.mesh.aio.sockets import tune_bulk, tune_express
 from rmpa.mesh.handshake import Lane, Refusal
 from rmpa.mesh.link import Role
-from rmpa.mesh.peering import CloseLink, Dial, LinkDown, LinkRefused, LinkUp, Output, Peering, PeerStatus
+from rmpa.mesh.peering import REPLACED, CloseLink, Dial, LinkDown, LinkRefused, LinkUp, Output, Peering, PeerStatus
 
 if TYPE_CHECKING:
     from rmpa.core.clock import Clock
@@ -298,6 +298,7 @@ class Mesh:
             _log.info("= %s: link down: %s", output.identity, output.reason)
             down = self._links.get(output.link_id, ended)
             if down is not None:
+                down.silent = down.silent or output.reason == REPLACED
                 down.use(None)
                 self._on_link_down(down, output.reason)
         elif isinstance(output, LinkRefused):

@@ -88,6 +88,11 @@ class Publication:
         return self._description
 
     @property
+    def latched(self) -> bytes | None:
+        """The last message that is kept for later subscribers, with its length in front."""
+        return self._latched[-1] if self._latched else None
+
+    @property
     def subscribers(self) -> int:
         """Connections, held ones included."""
         return len(self._held) + len(self._open)
