@@ -196,6 +196,10 @@ RELIABLE_WINDOW_MESSAGES: Final = 512
 """Reliable messages of one route on their way to a peer and not yet acknowledged."""
 RELIABLE_WINDOW_BYTES: Final = 4 * MIB
 """The same in bytes; one message always fits."""
+REDIAL_TIMEOUT: Final = 0.2
+"""For one attempt to reach a silent peer anew: a lost SYN is repeated by us, not by TCP a second later."""
+REDIAL_PAUSE: Final = 0.05
+"""Between such attempts, where the system says at once that there is no way."""
 AWAY_GRACE: Final = 0.5
 """A peer whose link fell silent keeps its place in the local graph for this long: after a cable's second without
 contact the next link stands within it, and no node need connect anew."""

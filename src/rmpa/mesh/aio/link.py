@@ -41,7 +41,10 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_SILENCE: Final = frozenset({errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ENETDOWN})
+_SILENCE: Final = frozenset(
+    {errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ENETDOWN, errno.ECONNRESET, errno.EPIPE}
+)
+"""How a connection ends whose other side gave it up after a silence, or whose process died with bytes unread."""
 
 OnLinkData = Callable[["MeshLink", int, int, int, memoryview], None]
 OnLinkPart = Callable[["MeshLink", int, int, int, int, memoryview], None]
@@ -65,6 +68,10 @@ class LinkOwner(Protocol):
 
     def link_control(self, link: MeshLink, payload: bytes) -> None:
         """A control frame came."""
+        ...
+
+    def link_quiet(self, link: MeshLink) -> None:
+        """Nothing came for ``limits.GHOST_QUIET``; called again from time to time while that lasts."""
         ...
 
     def link_ended(self, link: MeshLink, reason: str, *, malformed: bool, was_up: bool) -> None:
@@ -464,6 +471,8 @@ class MeshLink:
         was_up = self._machine.state is State.UP
         self._machine.handle_timer(self._clock.now())
         self.silent = was_up and self._machine.state is State.CLOSED
+        if was_up and not self.silent and self._clock.now() - self.heard_at > limits.GHOST_QUIET:
+            self._owner.link_quiet(self)
         self._after()
         self._arm()
 

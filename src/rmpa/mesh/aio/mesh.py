@@ -19,7 +19,7 @@ from rmpa.core.backoff import Backoff
 from rmpa.core.config import LaneSettings
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.mesh.aio.link import MeshLink, Takers
-from rmpa.mesh.aio.sockets import tune_bulk, tune_express
+from rmpa.mesh.aio.sockets import tune_bulk, tune_express, unacknowledged
 from rmpa.mesh.handshake import Lane, Refusal
 from rmpa.mesh.link import Role
 from rmpa.mesh.peering import REPLACED, CloseLink, Dial, LinkDown, LinkRefused, LinkUp, Output, Peering, PeerStatus
@@ -132,6 +132,7 @@ class Mesh:
         self._dials: set[asyncio.Task[None]] = set()
         self._bulk_dials: dict[int, asyncio.Task[None]] = {}
         self._bulk_backoffs: dict[int, Backoff] = {}
+        self._redials: dict[int, asyncio.Task[None]] = {}
         self._rng = rng
         self._ids = count(1)
         self._timer: asyncio.TimerHandle | None = None
@@ -157,7 +158,7 @@ class Mesh:
         for timer in (self._timer, self._accept_timer):
             if timer is not None:
                 timer.cancel()
-        dials = [*self._dials, *self._bulk_dials.values()]
+        dials = [*self._dials, *self._bulk_dials.values(), *self._redials.values()]
         for task in dials:
             task.cancel()
         await asyncio.gather(*dials, return_exceptions=True)
@@ -242,6 +243,13 @@ class Mesh:
         """A control frame came."""
         if link.used:
             self._on_control(link, payload)
+
+    def link_quiet(self, link: MeshLink) -> None:
+        """A link is silent: TCP repeats ever more rarely, so try whether a new connection gets through."""
+        if self._running and link.used and link.dialled and link.id not in self._redials:
+            task = asyncio.get_running_loop().create_task(self._redial(link), name=f"redial {link.name}")
+            self._redials[link.id] = task
+            task.add_done_callback(lambda _: self._redials.pop(link.id, None))
 
     def link_ended(self, link: MeshLink, reason: str, *, malformed: bool, was_up: bool) -> None:
         """A socket is closed."""
@@ -375,11 +383,30 @@ class Mesh:
 
     # --- connections ----------------------------------------------------------------------------------------
 
-    async def _connect(self, endpoint: tuple[str, int], lane: Lane) -> socket.socket:
+    async def _redial(self, link: MeshLink) -> None:
+        """Replace a link whose bytes nobody acknowledges, as soon as the peer can be reached again."""
+        while link.used and not self._alive(link.id):
+            try:
+                sock = await self._connect(link.remote_endpoint, Lane.EXPRESS, limits.REDIAL_TIMEOUT)
+            except OSError as error:
+                _log.debug("! %s: silent, and not to be reached: %s", link.name, error or "no answer")
+                await asyncio.sleep(limits.REDIAL_PAUSE)
+                continue
+            if self._alive(link.id) or not unacknowledged(link.sock):
+                _log.debug("= %s: silent, but not for want of a way to it", link.name)
+                sock.close()
+                return
+            _log.debug("= %s: silent, but it can be reached: a new link", link.name)
+            self._open(sock, Role.DIALLER, link.remote_endpoint, link.guid)
+            return
+
+    async def _connect(
+        self, endpoint: tuple[str, int], lane: Lane, within: float = limits.DIAL_TIMEOUT
+    ) -> socket.socket:
         sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         try:
             (tune_bulk if lane is Lane.BULK else tune_express)(sock, self._lanes, self.counters)
-            async with asyncio.timeout(limits.DIAL_TIMEOUT):
+            async with asyncio.timeout(within):
                 await asyncio.get_running_loop().sock_connect(sock, endpoint)
         except BaseException:
             sock.close()

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import socket
+import sys
+import termios
 from typing import TYPE_CHECKING
 
 from rmpa.core import limits
@@ -20,6 +23,14 @@ def tune_express(sock: socket.socket, lanes: LaneSettings, counters: Counters) -
 def tune_bulk(sock: socket.socket, lanes: LaneSettings, counters: Counters) -> None:
     """Set up the bulk lane: as little as possible waits in the kernel, behind everything else."""
     _tune(sock, limits.BULK_UNSENT_BYTES, lanes.bulk_dscp, lanes.bulk_priority, counters)
+
+
+def unacknowledged(sock: socket.socket) -> int:
+    """Bytes that were sent and that the other side's kernel has not acknowledged, those not sent yet included."""
+    try:
+        return int.from_bytes(fcntl.ioctl(sock, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
+    except OSError:
+        return 0
 
 
 def _tune(sock: socket.socket, unsent: int, dscp: int, priority: int, counters: Counters) -> None:
