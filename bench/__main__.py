@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from rich.console import Console
 
-from bench import bed, crosstraffic, idle, path, period, startup, throughput
+from bench import bed, crosstraffic, idle, load, path, period, startup, storm, throughput
 from tests.interop import namespaces
 
 if TYPE_CHECKING:
@@ -38,6 +38,9 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     "path": Measurement("how late a message is, on every path", path.run, needs=()),  # leaves out what cannot start
     "period": Measurement("how evenly messages arrive", period.measure),
     "crosstraffic": Measurement("a command beside images on 100 Mbit/s", crosstraffic.measure),
+    "load": Measurement("a command while every core is busy", load.measure),
+    "storm": Measurement("a stream while the core is asked 200 times a second", storm.measure),
+    "storm_realtime": Measurement("the same, nodes and agents under SCHED_FIFO", storm.measure_realtime),
     "throughput": Measurement("how much goes through", throughput.measure),
     "startup": Measurement("how soon the first message arrives", startup.measure),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),

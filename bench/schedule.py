@@ -10,6 +10,7 @@ import itertools
 import math
 import os
 import statistics
+import subprocess
 import time
 from array import array
 from dataclasses import asdict, dataclass, field
@@ -19,6 +20,7 @@ from bench import machine, samples
 from bench.bed import NODES, Bed
 from bench.tables import usage_row
 from bench.usage import Meter, Usage, add
+from tests.interop.agents import RMPA
 from tests.interop.processes import Deadline
 from tests.interop.ros import compiled
 
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
     from tests.interop.processes import Process
     from tests.interop.ros import Ros
 
-_LEAD_IN: Final = 0.2
+LEAD_IN: Final = 0.2
 """Seconds of each round whose messages are thrown away: caches and the processor's clock come up."""
 _START: Final = 0.02
 """Seconds from the command to the first message."""
@@ -40,6 +42,10 @@ _SETTLE: Final = 0.3
 _FLOWING_DEADLINE: Final = 30.0
 _HOST_LATENESS: Final = 2.0
 """Seconds of sleeps, before and after, that tell how late the machine itself wakes."""
+NODE_PRIORITY: Final = 40
+"""Of measuring nodes under SCHED_FIFO: below the agents', as a user's nodes would be."""
+_AGENT_PRIORITY: Final = 50
+"""What ``--realtime`` asks for by default."""
 _rounds = itertools.count(1)
 
 
@@ -55,6 +61,7 @@ class Arrivals:
         late: How late the publisher itself was with each that it sent, ns.
         usage: What the processes on the way used, lead-in included.
         total: How many messages that was for.
+        lead: The sequence of the first that counts.
     """
 
     sent: int
@@ -64,6 +71,7 @@ class Arrivals:
     late: Sequence[int] = ()
     usage: dict[str, Usage] = field(default_factory=dict)
     total: int = 0
+    lead: int = 0
 
     @property
     def lost(self) -> int:
@@ -78,6 +86,11 @@ class Arrivals:
     def latencies(self) -> list[float]:
         """From due to there, µs."""
         return [(came - due) / 1000 for came, due in zip(self.came, self.due, strict=True)]
+
+    def from_send(self) -> list[float]:
+        """From when the publisher did send to there, µs: without what kept the publisher from its processor."""
+        late = (self.late[sequence - self.lead] for sequence in self.sequence)
+        return [value - by / 1000 for value, by in zip(self.latencies(), late, strict=True)]
 
     def periods(self) -> list[float]:
         """Between arrivals that are neighbours in the sequence, µs."""
@@ -145,7 +158,7 @@ class Stream:
     def begin(self, size: int, rate: float, seconds: float) -> None:
         """Start a round; ``end`` returns what came of it."""
         self._round = next(_rounds)
-        self._lead = max(2, round(rate * _LEAD_IN))
+        self._lead = max(2, round(rate * LEAD_IN))
         count = self._lead + max(2, round(rate * seconds))
         self._rate, self._deadline = rate, count / rate + 30.0
         self._mark = self.source.mark_events()
@@ -175,7 +188,7 @@ def parse(rows: Sequence[int], late: Sequence[int], lead: int) -> Arrivals:
     """Read the files of the two nodes (``arrive.cpp``, ``pace.cpp``), without the first ``lead`` messages."""
     counted = [at for at in range(0, len(rows), 3) if rows[at] >= lead]
     sequence, due, came = (array("Q", [rows[at + column] for at in counted]) for column in range(3))
-    return Arrivals(max(0, len(late) - lead), sequence, due, came, late[lead:])
+    return Arrivals(max(0, len(late) - lead), sequence, due, came, late[lead:], lead=lead)
 
 
 @dataclass(slots=True)
@@ -229,12 +242,34 @@ def agents(
     return Way(key, title, here, there, pair)
 
 
+def realtime_agents(bed: Bed, *, network: int = 0) -> tuple[Way, str]:
+    """Two agents with ``--realtime``, and how they got it: from outside where this rmpa has no such flag."""
+    shown = subprocess.run([RMPA, "up", "--help"], capture_output=True, text=True, check=True, timeout=30).stdout
+    flags = ["--realtime"] if "--realtime" in shown else []
+    way = agents(bed, key="agents_realtime", title="agents, --realtime", network=network, flags=flags)
+    how = "rmpa up --realtime"
+    if not flags:
+        how = f"chrt -f {_AGENT_PRIORITY} from outside: this rmpa has no --realtime"
+        way.title = "agents, chrt -f"
+        for agent in way.agents:
+            chrt = ["chrt", "--all-tasks", "--fifo", "--pid", str(_AGENT_PRIORITY), str(agent.pid)]
+            subprocess.run(chrt, check=True, timeout=10)
+    return way, f"{how}; {', '.join(sorted({_policy(agent.pid) for agent in way.agents}))}"
+
+
+def _policy(pid: int) -> str:
+    names = {os.SCHED_OTHER: "SCHED_OTHER", os.SCHED_FIFO: "SCHED_FIFO", os.SCHED_RR: "SCHED_RR"}
+    policy = os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK
+    return f"{names.get(policy, str(policy))} {os.sched_getparam(pid).sched_priority}"
+
+
 class Score:
     """One way under one condition, over all rounds."""
 
     def __init__(self) -> None:
         self.latencies = array("d")
         self.source_late = array("d")
+        self.from_send = array("d")
         self.lost = self.doubled = 0
         self.usage: dict[str, Usage] = {}
         self.messages = 0
@@ -245,6 +280,7 @@ class Score:
         self.rounds.append(arrivals.latencies())
         self.latencies.extend(self.rounds[-1])
         self.source_late.extend(late / 1000 for late in arrivals.late)
+        self.from_send.extend(arrivals.from_send())
         self.lost += arrivals.lost
         self.doubled += arrivals.doubled
         self.usage = add(self.usage, arrivals.usage)
@@ -269,6 +305,7 @@ class Score:
         """For the result."""
         return {
             "latency_us": asdict(self.summary),
+            "latency_from_send_us": asdict(samples.summary(self.from_send)),
             "p99_median_of_rounds_us": self.median_of_rounds(99.0),
             "p999_median_of_rounds_us": self.median_of_rounds(99.9),
             "doubled": self.doubled,

@@ -28,8 +28,9 @@ from rmpa.monitor.aio.control_client import ControlClient, choose_agent
 from watch import HERE, TOPICS, PoseView, View, Watch
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
+    from rmpa.monitor.snapshot import Snapshot
     from rmpa.ros.aio.node import Node, Received
 
 LOOKS = 4
@@ -87,18 +88,33 @@ def _pose(received: Received) -> PoseView:
 
 
 async def _look(watch: Watch) -> None:
-    """Ask our agent who is there, as `rmpa peer list` does."""
+    """Ask our agent who is there, and how long messages without a header were on the way."""
+    counted: dict[str, int] = {}
     async for _ in Rate(LOOKS):
         with contextlib.suppress(RmpaError):
-            states = await asyncio.to_thread(_peers)
-            watch.peers(states, time.monotonic())
+            snapshot = await asyncio.to_thread(_snapshot)
+            now = time.monotonic()
+            # A module that came back has a new GUID; its ghost may still be listed beside it.
+            peers = sorted(snapshot.peers, key=lambda peer: peer.state == "linked")
+            watch.peers({peer.name: peer.state for peer in peers}, now)
+            for topic, messages, latency in _measured(snapshot):
+                if counted.get(topic) != messages:  # each message at most once
+                    counted[topic] = messages
+                    watch.latency(topic, now, latency)
 
 
-def _peers() -> dict[str, str]:
+def _snapshot() -> Snapshot:
     with ControlClient(choose_agent(os.environ, HERE).path) as agent:
-        peers = agent.snapshot().peers
-    # A module that came back has a new GUID; its ghost may still be listed beside it.
-    return {peer.name: peer.state for peer in sorted(peers, key=lambda peer: peer.state == "linked")}
+        return agent.snapshot()
+
+
+def _measured(snapshot: Snapshot) -> Iterator[tuple[str, int, float]]:
+    """Topics without a header, how many messages of them came, and how long the last one was on the way."""
+    for topic in snapshot.topics:
+        if topic.name in TOPICS and not TOPICS[topic.name].stamped:
+            for route in topic.routes:
+                if route.direction == "in" and route.latency is not None:
+                    yield topic.name, route.messages, route.latency.last
 
 
 def _follow(descriptor: int, watch: Watch, screen: Screen, task: asyncio.Task[None] | None) -> None:

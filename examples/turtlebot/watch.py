@@ -31,16 +31,20 @@ NOTES = 4
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One topic of the demo: its label, its type, and the modules that must live for it to flow, its source last."""
+    """One topic of the demo: its label, its type, and the modules that must live for it to flow, its source last.
+
+    ``stamped``: whether its messages have a header, whose stamp tells their latency.
+    """
 
     label: str
     type: str
     needs: tuple[str, ...]
+    stamped: bool = True
 
 
 TOPICS = {
     "/command_information": Topic("CMD", "sensor_msgs/Joy", ("joystick",)),
-    "/velocity_order": Topic("VEL", "geometry_msgs/Twist", ("joystick", "velocity")),
+    "/velocity_order": Topic("VEL", "geometry_msgs/Twist", ("joystick", "velocity"), stamped=False),
     "/odom": Topic("ODOM", "nav_msgs/Odometry", ("base",)),
 }
 COMMAND, ORDER = "/command_information", "/velocity_order"
@@ -50,7 +54,11 @@ HERE = "pc"
 
 @dataclass(frozen=True, slots=True)
 class TopicView:
-    """A topic's figures; ``latency`` is one way, from the header's stamp, ``None`` for a type that has none."""
+    """A topic's figures.
+
+    ``latency`` is one way, from the header's stamp to here; of a type without header between the agents, as ours
+    measures it by the link's clock. ``None``: nothing is known yet.
+    """
 
     messages: int
     rate: float
@@ -182,6 +190,12 @@ class Watch:
                 self._commands.append(now)
         elif topic == ORDER:
             self._ordered(now)
+
+    def latency(self, topic: str, now: float, seconds: float) -> None:
+        """Our agent measured how long a message without a header was on the way."""
+        settled = self._flows[topic].settled
+        if settled is not None and now >= settled:
+            self._flows[topic].latencies.add(seconds)
 
     def _first_message(self, module: _Module, now: float) -> None:
         if module.started is None or now < module.started + IN_FLIGHT:

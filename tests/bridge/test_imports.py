@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from rmpa.bridge.actions import Describe, Detach, Publish, Retract, Send, Warn
@@ -124,7 +126,7 @@ def test_a_link_that_falls_retracts_all_that_came_over_it_and_nothing_else(impor
     imports.demand(1, CMD, 0.0, wanted=True)
     imports.opened(1, Opened(1, ABOUT), 0.0)
     imports.demand(1, CMD, 0.0, wanted=False)
-    assert imports.link_down(1) == [Detach(1, CMD, 1), Retract(1, CMD)]
+    assert list(imports.link_down(1)) == [Detach(1, CMD, 1), Retract(1, CMD)]
     assert imports.next_timer() is None
     assert state(imports, 2) is RouteState.IDLE
     assert imports.demand(1, CMD, 0.0, wanted=True) == []
@@ -139,7 +141,7 @@ def test_a_changed_type_is_retracted_and_published_anew(imports: Imports) -> Non
 
 
 def test_another_type_than_the_local_one_is_refused_loudly_on_both_sides_until_it_goes(imports: Imports) -> None:
-    imports.local_types({"/cmd": "std_msgs/String"})
+    imports.local_type("/cmd", "std_msgs/String")
     warn, told = imports.advertised(1, Advertise(added=(OFFER,)))
     assert isinstance(warn, Warn)
     assert "std_msgs/String" in warn.text
@@ -147,8 +149,8 @@ def test_another_type_than_the_local_one_is_refused_loudly_on_both_sides_until_i
     assert isinstance(told, Send)
     assert isinstance(told.message, Mismatch)
     assert imports.demand(1, CMD, 0.0, wanted=False) == []
-    assert imports.local_types({}) == [Publish(1, CMD, "sensor_msgs/Joy")]
-    retract, *loud = imports.local_types({"/cmd": "std_msgs/String"})
+    assert imports.local_type("/cmd", None) == [Publish(1, CMD, "sensor_msgs/Joy")]
+    retract, *loud = imports.local_type("/cmd", "std_msgs/String")
     assert retract == Retract(1, CMD)
     assert [type(action) for action in loud] == [Warn, Send]
 
@@ -187,6 +189,65 @@ def test_the_number_of_nodes_is_bounded(imports: Imports, monkeypatch: pytest.Mo
     imports.advertised(1, Advertise(removed=(CMD, more.source)))
     other = Offer("/b", "/other", "a/B")
     assert imports.advertised(1, Advertise(added=(other,))) == [Publish(1, other.source, "a/B")]
+
+
+def many(count: int) -> tuple[Offer, ...]:
+    return tuple(Offer(f"/t{index:04}", "/n", "a/B") for index in range(count))
+
+
+def test_a_long_advertisement_comes_to_the_same_in_portions(imports: Imports) -> None:
+    imports.link_up(2)
+    for peer in (1, 2):
+        imports.advertised(peer, Advertise(added=(OFFER, *many(50))))
+    change = Advertise(added=many(100)[20:], full=True)
+    whole = imports.advertised(1, change)
+    portions = list(imports.portions(2, change))
+    assert max(len(portion.added) + len(portion.removed) for portion in portions) <= 16
+    parts = [action for portion in portions for action in imports.advertised(2, portion)]
+    assert [replace(action, peer=1) for action in parts if isinstance(action, Publish | Retract)] == whole
+    assert set(imports.offered_by(1)) == set(imports.offered_by(2)) == {offer.topic for offer in many(100)[20:]}
+
+
+def test_many_timers_are_dealt_with_a_few_at_a_time(imports: Imports) -> None:
+    imports.advertised(1, Advertise(added=many(50)))
+    for offer in many(50):
+        imports.demand(1, offer.source, 0.0, wanted=True)
+    rounds = 0
+    while (due := imports.next_timer()) is not None and due <= 6.0:
+        assert len(imports.handle_timer(6.0)) <= 48
+        rounds += 1
+    assert rounds > 3
+    assert {entry.state for _, _, entry in imports} == {RouteState.WAITING}
+
+
+def test_timers_that_were_set_anew_count_once(imports: Imports) -> None:
+    imports.advertised(1, Advertise(added=(OFFER,)))
+    imports.demand(1, CMD, 0.0, wanted=True)
+    imports.opened(1, Opened(1, ABOUT), 0.0)
+    for now in range(10):
+        imports.demand(1, CMD, float(now), wanted=False)
+        imports.demand(1, CMD, now + 0.5, wanted=True)
+    assert imports.next_timer() is None
+    imports.demand(1, CMD, 20.0, wanted=False)
+    assert imports.next_timer() == 20.0 + limits.ROUTE_LINGER
+
+
+def test_what_changes_while_somebody_looks_does_no_harm(imports: Imports) -> None:
+    imports.advertised(1, Advertise(added=many(3)))
+    seen = []
+    for _, source, _ in imports:
+        seen.append(source)
+        imports.advertised(1, Advertise(added=(OFFER,), removed=(source,)))
+    assert len(seen) == 3
+
+
+def test_a_source_is_known_as_long_as_a_peer_offers_it(imports: Imports) -> None:
+    imports.link_up(2)
+    imports.advertised(2, Advertise(added=(OFFER,)))
+    assert imports.knows(CMD)
+    imports.link_down(2)
+    assert not imports.knows(CMD)
+    assert imports.offered_by(2) == ()
 
 
 def test_every_state_can_be_left() -> None:

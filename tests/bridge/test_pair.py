@@ -92,6 +92,10 @@ class World:
                 case _:
                     raise AssertionError(action)
 
+    def graph_changed(self, topic: str) -> None:
+        publishers = {source.node: local for source, local in self.local.items() if source.topic == topic}
+        self.act(self.exports.graph(topic, publishers))
+
     def deliver(self) -> bool:
         if self.to_importer:
             self._import(decode(self.to_importer.popleft()))
@@ -127,8 +131,8 @@ class World:
 
     def settle(self) -> None:
         for _ in range(200):
-            while self.deliver():
-                pass
+            while self.deliver() or self.exports.untold:
+                self.act(self.exports.tell())
             for source in list(self.connected):
                 self.act(self.exports.described(source, ABOUT))
             timer = self.imports.next_timer()
@@ -149,6 +153,7 @@ _steps = st.lists(
         st.tuples(st.just("unwant"), st.integers(0, 2)),
         st.tuples(st.just("describe"), st.integers(0, 2)),
         st.tuples(st.just("lose"), st.integers(0, 2)),
+        st.tuples(st.just("tell"), st.just(0)),
         st.tuples(st.just("deliver"), st.integers(1, 3)),
         st.tuples(st.just("wait"), st.integers(1, 9)),
     ),
@@ -169,10 +174,12 @@ def _step(world: World, what: str, index: int) -> None:
     if what in {"publish", "restart"}:
         if (what == "publish") != (source in world.local):
             world.local[source] = LocalSource("a/B", f"http://127.0.0.1:{4000 + len(world.local) + int(world.now)}/")
-            world.act(world.exports.graph(world.local))
+            world.graph_changed(source.topic)
     elif what == "unpublish":
         world.local.pop(source, None)
-        world.act(world.exports.graph(world.local))
+        world.graph_changed(source.topic)
+    elif what == "tell":
+        world.act(world.exports.tell())
     elif what == "describe" and source in world.connected:
         world.act(world.exports.described(source, ABOUT))
     elif what == "lose" and source in world.connected:

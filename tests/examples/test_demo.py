@@ -117,6 +117,7 @@ def test_the_paper_s_set_up_runs_and_leaves_nothing(tidy: dict[str, str]) -> Non
     }
     for name in ("/command_information", "/odom"):
         assert 0 < summary["topics"][name]["latency"]["p50"] < 1
+    assert abs(summary["topics"]["/velocity_order"]["latency"]["p50"]) < 1, "by the link's clock: it has no header"
     assert 0 < summary["command_to_velocity"]["mean"] < 0.1
     assert summary["pose"]["x"] != 0 or summary["pose"]["y"] != 0
     poses = {(view["pose"]["x"], view["pose"]["y"]) for view in views(demo) if view["pose"]}

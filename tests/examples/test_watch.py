@@ -39,6 +39,19 @@ def test_figures_of_a_steady_drive() -> None:
     assert view.unanswered == 0
 
 
+def test_the_agent_tells_the_latency_of_what_has_no_header() -> None:
+    watch = Watch(100.0)
+    watch.latency(ORDER, 100.0, 9.0)  # before the first message there is nothing to measure
+    drive(watch, 100.0, 1.0)
+    watch.latency(ORDER, 100.5, 9.0)  # still settling
+    drive(watch, 101.0, 2.0)
+    watch.latency(ORDER, 103.0, 0.0004)
+    for whole in (False, True):
+        latency = watch.view(103.0, whole=whole).topics[ORDER].latency
+        assert latency is not None
+        assert (latency.count, latency.maximum) == (1, 0.0004)
+
+
 def test_a_silent_topic_has_no_rate_but_keeps_its_figures_in_the_summary() -> None:
     watch = Watch(100.0)
     drive(watch, 100.0, 5.0)

@@ -70,8 +70,7 @@ class Pair:
         self.data: deque[Fragment] = deque()
         self.acks: deque[tuple[int, int]] = deque()
         self.ghosts: deque[Fragment] = deque()
-        """What an old link still brings, whole messages, behind the position that its successor was opened with."""
-        self.haunted = False
+        """What an old link still brings, behind the position that its successor was opened with."""
         self.receiver = ReliableReceiver()
         self.doubled: set[int] = set()
         self.fresh_receiver()
@@ -87,6 +86,7 @@ class Pair:
         self.delivered: list[int] = []
         self.gaps = 0
         self.newest = 0
+        self.haunted = False
         self.data.clear()
         self.acks.clear()
         self.linked = True
@@ -127,7 +127,7 @@ class Pair:
         self._handle(self.data.popleft())
 
     def haunt(self) -> None:
-        """The old link brings one more message."""
+        """The old link brings one more fragment."""
         self._handle(self.ghosts.popleft())
 
     def tick(self, seconds: float) -> None:
@@ -150,10 +150,10 @@ class Pair:
         self._trim(number)
 
     def cut(self, ghosts: int) -> None:
-        """The link falls: what is under way is lost, but for some that the receiver reads later."""
-        whole = [f for f in self.data if f.first and f.last][:ghosts]
-        self.ghosts.extend(whole)
-        self.haunted |= bool(whole)
+        """The link falls: what is under way is lost, but for some fragments that the receiver reads later."""
+        late = [self.data.popleft() for _ in range(min(ghosts, len(self.data)))]
+        self.ghosts.extend(late)
+        self.haunted |= bool(late)
         self.data.clear()
         self.acks.clear()
         self.linked = False
@@ -200,6 +200,8 @@ class Pair:
         if not self.linked:
             self.resume()
         while self.send(None, 1) or self.data or self.acks or self.receiver.next_timer() is not None:
+            while self.ghosts:
+                self.haunt()
             while self.data:
                 self.arrive()
             self.tick(limits.ACK_DELAY)

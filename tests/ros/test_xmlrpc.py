@@ -103,8 +103,8 @@ def test_an_endless_comment_in_pieces_is_looked_at_a_few_times_only() -> None:
     """expat begins again at the start of an unfinished token whenever it is fed: 8 MiB would take seconds."""
     reader = CallReader()
     given: list[bytes] = []
-    reader._document._parser.feed = given.append  # type: ignore[assignment]
-    reader._document._expat = type("Stuck", (), {"CurrentByteIndex": 0})()
+    reader._parser.feed = given.append  # type: ignore[assignment]
+    reader._expat = type("Stuck", (), {"CurrentByteIndex": 0})()
     for _ in range(4096):
         reader.feed(b"x" * 2048)
     assert len(given) < 16

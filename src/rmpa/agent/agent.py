@@ -12,6 +12,7 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
+from rmpa.agent.diagnostics import Diagnostics
 from rmpa.agent.station import Station
 from rmpa.agent.view import View
 from rmpa.bridge.aio.bridge import Bridge
@@ -78,6 +79,9 @@ class Agent:
             undo.push_async_callback(self.core.close)
             await self.bridge.start()
             undo.push_async_callback(self.bridge.close)
+            diagnostics = Diagnostics(self.core, self.bridge, self._view)
+            diagnostics.start()
+            undo.callback(diagnostics.close)
             await self._join(self._settings.port)
             undo.push_async_callback(self._leave)
             await self._control.start()

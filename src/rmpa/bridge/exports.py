@@ -11,12 +11,16 @@ A source is connected while at least one peer wants it::
 
 Who lost a route asks again: the one that wants the data is the one that retries. A reliable route outlives its
 link: it is suspended, its source stays connected, and the peer's next ``Open`` goes on where it was (``link_away``).
+
+A change of the graph costs what changed, however large the graph is; what peers are to hear of it is gathered, and
+told a bounded number of sources at a time.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from itertools import islice
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -37,7 +41,7 @@ from rmpa.core import limits
 from rmpa.core.contract import Contract, Contracts, Durability, Reliability, combine
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
 
     from rmpa.bridge.policy import Policy
 
@@ -83,6 +87,37 @@ class _Flow:
         return bool(self.routes or self.away)
 
 
+@dataclass(slots=True)
+class _Topic:
+    """One topic of the local graph.
+
+    Args:
+        seen: Its publishers as they were told, by node.
+        crossing: Those that policy lets cross, whether they are offered or there are too many.
+    """
+
+    seen: Mapping[str, LocalSource]
+    crossing: dict[Source, LocalSource] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class _Peer:
+    """One link.
+
+    Args:
+        news: Sources that it is to hear of, and the type by which it knows each, empty if it does not.
+        routes: What it has open.
+        beginning: Whether it has not heard everything once yet.
+    """
+
+    news: dict[Source, str]
+    routes: dict[int, Source] = field(default_factory=dict)
+    beginning: bool = True
+
+
+_NOTHING: Final = _Topic({})
+
+
 class Exports:
     """The outbound half of the bridge.
 
@@ -95,8 +130,10 @@ class Exports:
         self._policy = policy
         self._contracts = contracts if contracts is not None else Contracts()
         self._epochs = 0
+        self._topics: dict[str, _Topic] = {}
         self._local: dict[Source, LocalSource] = {}
-        self._peers: dict[int, dict[int, Source]] = {}
+        self._too_many: dict[Source, LocalSource] = {}
+        self._peers: dict[int, _Peer] = {}
         self._flows: dict[Source, _Flow] = {}
 
     @property
@@ -119,47 +156,108 @@ class Exports:
         flow = self._flows.get(source)
         return flow.description if flow else None
 
-    def graph(self, sources: Mapping[Source, LocalSource]) -> list[Action]:
-        """The local graph changed: ``sources`` is all that it publishes now, proxies left out."""
-        crossing = [
-            source
-            for source, local in sources.items()
-            if is_crossing_type(local.type)
-            and is_crossing_name(source.topic)
-            and is_crossing_name(source.node)
-            and self._policy.judge(source.topic, local.type, source.node).allowed
-        ]
+    @property
+    def topics(self) -> Collection[str]:
+        """The topics that the local graph was last said to have."""
+        return self._topics.keys()
+
+    @property
+    def untold(self) -> bool:
+        """Whether there is something to ``tell``."""
+        return any(peer.news for peer in self._peers.values())
+
+    def graph(self, topic: str, publishers: Mapping[str, LocalSource]) -> list[Action]:
+        """Say who publishes a topic in the local graph now, by node, proxies left out; peers hear it by ``tell``."""
+        before = self._topics.get(topic, _NOTHING)
+        if before.seen == publishers:
+            return []
+        crossing = {
+            source: local
+            for node, local in publishers.items()
+            if self._crosses(source := Source(topic, node), local.type)
+        }
+        if publishers:
+            self._topics[topic] = _Topic(publishers, crossing)
+        else:
+            del self._topics[topic]
         actions: list[Action] = []
-        if len(crossing) > limits.TOPICS_PER_PEER_MAX:
-            crossing = sorted(crossing)[: limits.TOPICS_PER_PEER_MAX]
-            text = f"more than {limits.TOPICS_PER_PEER_MAX} sources would cross; the rest stays home: deny some"
-            actions.append(Warn("sources.too_many", "local", text))
-        new = {source: sources[source] for source in crossing}
-        old, self._local = self._local, new
-        removed = tuple(s for s in old if s not in new)
-        # A type that changed is removed and offered again; a new address alone is nobody's business but ours.
-        added = tuple(
-            Offer(s.topic, s.node, local.type)
-            for s, local in new.items()
-            if s not in old or old[s].type != local.type
-        )
-        for source in [s for s, flow in self._flows.items() if s not in new or new[s].uri != flow.uri]:
-            why = "the node has gone" if source not in new else "the node has restarted"
-            actions += self._end(source, why)
-        if added or removed:
-            actions += [Send(peer, Advertise(added=added, removed=removed)) for peer in self._peers]
+        for source in before.crossing:
+            if source not in crossing:
+                actions += self._went(source)
+        for source, local in crossing.items():
+            actions += self._came(source, local)
         return actions
 
+    def _crosses(self, source: Source, type_name: str) -> bool:
+        return (
+            is_crossing_type(type_name)
+            and is_crossing_name(source.topic)
+            and is_crossing_name(source.node)
+            and self._policy.judge(source.topic, type_name, source.node).allowed
+        )
+
+    def _came(self, source: Source, local: LocalSource) -> list[Action]:
+        """A source is there: new, as it was, with another type, or at another address."""
+        before = self._local.get(source)
+        if before is None and len(self._local) >= limits.TOPICS_PER_PEER_MAX:
+            self._too_many[source] = local
+            text = f"more than {limits.TOPICS_PER_PEER_MAX} sources would cross; the rest stays home: deny some"
+            return [Warn("sources.too_many", "local", text)]
+        self._too_many.pop(source, None)
+        self._local[source] = local
+        if before is None or before.type != local.type:
+            self._note(source, before)
+        # A new address is nobody's business but ours.
+        flow = self._flows.get(source)
+        return self._end(source, "the node has restarted") if flow is not None and flow.uri != local.uri else []
+
+    def _went(self, source: Source) -> list[Action]:
+        before = self._local.pop(source, None)
+        if before is None:
+            del self._too_many[source]
+            return []
+        self._note(source, before)
+        actions = self._end(source, "the node has gone")
+        if self._too_many:
+            source = next(iter(self._too_many))
+            actions += self._came(source, self._too_many.pop(source))
+        return actions
+
+    def _note(self, source: Source, before: LocalSource | None) -> None:
+        for peer in self._peers.values():
+            peer.news.setdefault(source, before.type if before is not None else "")
+
+    def tell(self) -> list[Action]:
+        """One message for each peer that has not heard everything; call again while ``untold``."""
+        actions: list[Action] = []
+        for number, peer in self._peers.items():
+            begins = peer.beginning
+            if peer.news and ((message := self._next(peer)).added or message.removed or begins is not message.more):
+                actions.append(Send(number, message))
+        return actions
+
+    def _next(self, peer: _Peer, *, full: bool = False) -> Advertise:
+        added: list[Offer] = []
+        removed: list[Source] = []
+        for source in tuple(islice(peer.news, limits.ADVERTISED_AT_ONCE)):
+            known, local = peer.news.pop(source), self._local.get(source)
+            if local is None and known:
+                removed.append(source)
+            elif local is not None and local.type != known:
+                added.append(Offer(source.topic, source.node, local.type))
+        peer.beginning = peer.beginning and bool(peer.news)
+        return Advertise(added=tuple(added), removed=tuple(removed), full=full, more=peer.beginning)
+
     def link_up(self, peer: int) -> list[Action]:
-        """A link is up: tell all we have."""
-        self._peers[peer] = {}
-        offers = tuple(Offer(s.topic, s.node, local.type) for s, local in self._local.items())
-        return [Send(peer, Advertise(added=offers, full=True))]
+        """A link is up: begin to tell all we have; ``tell`` goes on with it."""
+        self._peers[peer] = new = _Peer(dict.fromkeys(self._local, ""))
+        return [Send(peer, self._next(new, full=True))]
 
     def link_down(self, peer: int) -> list[Action]:
         """A peer is gone for good, and all its routes, suspended ones too."""
         actions: list[Action] = []
-        for route, source in self._peers.pop(peer, {}).items():
+        gone = self._peers.pop(peer, None)
+        for route, source in gone.routes.items() if gone is not None else ():
             actions += self._remove(source, peer, route)
         for source, flow in list(self._flows.items()):
             if flow.away.pop(peer, None) is not None:
@@ -173,7 +271,8 @@ class Exports:
             What to do, and whether a reliable route waits for the peer: if none does, ``link_down`` it.
         """
         actions: list[Action] = []
-        for number, source in self._peers.pop(peer, {}).items():
+        gone = self._peers.pop(peer, None)
+        for number, source in gone.routes.items() if gone is not None else ():
             flow = self._flows.get(source)
             route = flow.routes.get((peer, number)) if flow is not None else None
             if flow is None or route is None or not (route.live and route.epoch):
@@ -190,7 +289,7 @@ class Exports:
 
     def opened(self, peer: int, message: Open) -> list[Action]:
         """A peer asks for a source."""
-        routes = self._peers[peer]
+        routes = self._peers[peer].routes
         if message.route in routes:
             return [
                 Warn("route.doubled", str(peer), f"a peer opens route {message.route} twice; the second is ignored")
@@ -228,7 +327,7 @@ class Exports:
 
     def closed(self, peer: int, message: Close) -> list[Action]:
         """A peer wants no more of a route; one that is not open is none of our worry (it crossed ours)."""
-        source = self._peers[peer].pop(message.route, None)
+        source = self._peers[peer].routes.pop(message.route, None)
         return self._remove(source, peer, message.route) if source is not None else []
 
     def described(self, source: Source, description: Description) -> list[Action]:
@@ -280,7 +379,7 @@ class Exports:
         actions: list[Action] = []
         actions += [RemoveRoute(source, peer, 0) for peer in flow.away]
         for (peer, number), route in flow.routes.items():
-            self._peers[peer].pop(number, None)
+            self._peers[peer].routes.pop(number, None)
             if route.live:
                 actions.append(RemoveRoute(source, peer, number))
             actions.append(Send(peer, Closed(number, reason)))

@@ -8,25 +8,28 @@ of each peer is in one state of this table::
       │ unwanted        ▼                   ▼                    ▼
       └────────────── waiting ◄────────────────                 open
                         │ time ──► opening
+
+What each method costs depends on what it is told, not on how many peers and sources there are; only who takes a long
+advertisement in one piece waits long (``portions``).
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum, auto
+from heapq import heappop, heappush
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.actions import Action, Describe, Detach, Publish, Retract, Send, Warn
 from rmpa.bridge.messages import Advertise, Close, Closed, Mismatch, Offer, Open, Opened, Source
 from rmpa.core import limits
 from rmpa.core.backoff import Backoff
-from rmpa.core.clock import earliest
 from rmpa.core.contract import Contract, Contracts, Reliability
 from rmpa.core.errors import LocalProtocolError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterator, Mapping
 
     from rmpa.bridge.messages import Description
     from rmpa.bridge.policy import Policy
@@ -74,6 +77,7 @@ class Import:
         problem: Why the last attempt failed, or empty.
         wanted: Whether somebody local listens.
         contract: What holds for its route, once it was open.
+        serial: Of the timer.
     """
 
     type: str
@@ -88,6 +92,7 @@ class Import:
     problem: str = ""
     wanted: bool = False
     contract: Contract | None = None
+    serial: int = 0
 
 
 def _nothing(_peer: int, _source: Source) -> None:
@@ -95,6 +100,29 @@ def _nothing(_peer: int, _source: Source) -> None:
 
 
 _LISTENED: Final = frozenset({RouteState.OPENING, RouteState.OPEN, RouteState.WAITING})
+
+
+@dataclass(slots=True)
+class _Peer:
+    """What came over one link, or over the links of one instance.
+
+    Args:
+        sources: What it offers.
+        topics: The same by topic (dicts, for their order).
+        routes: Those that were asked for or are open.
+        next_route: The next one's id.
+        nodes: How many sources each of its nodes has.
+        away: Whether it has no link, and may come back.
+        doubtful: What it offered over its last link and has not offered again since.
+    """
+
+    sources: dict[Source, Import] = field(default_factory=dict)
+    topics: dict[str, dict[Source, None]] = field(default_factory=dict)
+    routes: dict[int, Source] = field(default_factory=dict)
+    next_route: int = 1
+    nodes: Counter[str] = field(default_factory=Counter)
+    away: bool = False
+    doubtful: set[Source] = field(default_factory=set)
 
 
 class Imports:
@@ -118,44 +146,57 @@ class Imports:
         self._rng = rng
         self._contracts = contracts if contracts is not None else Contracts()
         self._position = position
-        self._peers: dict[int, dict[Source, Import]] = {}
-        self._away: set[int] = set()
-        self._routes: dict[int, dict[int, Source]] = {}
-        self._next_route: dict[int, int] = {}
-        self._nodes: dict[int, Counter[str]] = {}
+        self._peers: dict[int, _Peer] = {}
         self._local_types: dict[str, str] = {}
-        self._timed: set[tuple[int, Source]] = set()
+        # (when, serial, peer, source); what no longer is an entry's timer is passed over.
+        self._timers: list[tuple[float, int, int, Source]] = []
+        self._serial = 0
 
     def __iter__(self) -> Iterator[tuple[int, Source, Import]]:
-        """Every known source, with its peer."""
-        for peer, sources in self._peers.items():
-            for source, entry in sources.items():
+        """Every known source, with its peer; what changes meanwhile may or may not be seen."""
+        for peer, known in list(self._peers.items()):
+            for source, entry in list(known.sources.items()):
                 yield peer, source, entry
 
     def get(self, peer: int, source: Source) -> Import | None:
         """One known source."""
-        return self._peers.get(peer, {}).get(source)
+        return known.sources.get(source) if (known := self._peers.get(peer)) is not None else None
 
-    def local_types(self, types: Mapping[str, str]) -> list[Action]:
-        """The types of the topics that local nodes publish; a remote source of another type stays hidden."""
-        if self._local_types == types:
+    def knows(self, source: Source) -> bool:
+        """Whether any peer offers a source."""
+        return any(source in known.sources for known in self._peers.values())
+
+    def offered_by(self, peer: int) -> Collection[str]:
+        """The topics that a peer offers."""
+        return known.topics.keys() if (known := self._peers.get(peer)) is not None else ()
+
+    def local_type(self, topic: str, type_name: str | None) -> list[Action]:
+        """Say the type of a topic that local nodes publish, or ``None`` for one that they do not.
+
+        A remote source of another type stays hidden.
+        """
+        if self._local_types.get(topic) == type_name:
             return []
-        self._local_types = dict(types)
+        if type_name is None:
+            del self._local_types[topic]
+        else:
+            self._local_types[topic] = type_name
         actions: list[Action] = []
-        for peer, source, entry in self:
-            shown = entry.shown
-            actions += self._show_or_hide(peer, source, entry)
-            if shown and not entry.shown:
-                actions += self._report_conflict(peer, source, entry)
+        for peer, known in self._peers.items():
+            for source in known.topics.get(topic, ()):
+                entry = known.sources[source]
+                shown = entry.shown
+                actions += self._show_or_hide(peer, source, entry)
+                if shown and not entry.shown:
+                    actions += self._report_conflict(peer, source, entry)
         return actions
 
     def link_up(self, peer: int) -> list[Action]:
-        """A link is up, perhaps of a peer that was away; its first message will be a full advertisement."""
-        self._away.discard(peer)
-        self._peers.setdefault(peer, {})
-        self._routes[peer] = {}
-        self._next_route[peer] = 1
-        self._nodes.setdefault(peer, Counter())
+        """A link is up, perhaps of a peer that was away; its first message begins a full advertisement."""
+        known = self._peers.setdefault(peer, _Peer())
+        known.away = False
+        known.routes = {}
+        known.next_route = 1
         return []
 
     def link_away(self, peer: int, *, briefly: bool = False) -> tuple[list[Action], bool]:
@@ -170,20 +211,20 @@ class Imports:
             What to do, and whether something waits for the peer: if nothing does, ``link_down`` it.
         """
         actions: list[Action] = []
-        self._away.add(peer)
-        self._routes[peer] = {}
-        for source, entry in list(self._peers[peer].items()):
+        known = self._peers[peer]
+        known.away = True
+        known.routes = {}
+        for source, entry in list(known.sources.items()):
             reliable = entry.contract is not None and entry.contract.reliability is Reliability.RELIABLE
             keep = briefly or (reliable and entry.wanted and entry.state in _LISTENED)
             if entry.route:
                 actions.append(Detach(peer, source, entry.route, keep=keep))
             entry.route = 0
-            self._timed.discard((peer, source))
             if keep:
                 self._suspend(peer, source, entry)
             else:
                 actions += self._drop(peer, source, entry)
-        return actions, bool(self._peers[peer])
+        return actions, bool(known.sources)
 
     def _suspend(self, peer: int, source: Source, entry: Import) -> None:
         """Bring an entry into a state without a link."""
@@ -194,25 +235,29 @@ class Imports:
             self._move(peer, source, entry, RouteState.WAITING)
         entry.timer = None
 
-    def link_down(self, peer: int) -> list[Action]:
-        """A link is gone: all that came over it leaves the local graph."""
-        actions: list[Action] = []
-        sources = self._peers.pop(peer, {})
-        for source, entry in sources.items():
-            self._timed.discard((peer, source))
-            if entry.route:
-                actions.append(Detach(peer, source, entry.route))
-            if entry.shown:
-                actions.append(Retract(peer, source))
-        self._away.discard(peer)
-        self._routes.pop(peer, None)
-        self._next_route.pop(peer, None)
-        self._nodes.pop(peer, None)
-        return actions
+    def link_down(self, peer: int) -> Iterator[Action]:
+        """A peer is gone for good: all that came from it leaves the local graph."""
+        known = self._peers.pop(peer, None)
+        return _gone(peer, known.sources if known is not None else {})
+
+    def portions(self, peer: int, message: Advertise) -> Iterator[Advertise]:
+        """The same as an advertisement says, in portions that ``advertised`` deals with in a moment."""
+        known = self._peers[peer]
+        removed = message.removed
+        if message.full:
+            known.doubtful = set(known.sources)
+        known.doubtful.difference_update(offer.source for offer in message.added)
+        if known.doubtful and not message.more:
+            removed += tuple(sorted(known.doubtful))
+            known.doubtful = set()
+        for begin in range(0, len(removed), limits.LEARNT_AT_ONCE):
+            yield Advertise(removed=removed[begin : begin + limits.LEARNT_AT_ONCE])
+        for begin in range(0, len(message.added), limits.LEARNT_AT_ONCE):
+            yield Advertise(added=message.added[begin : begin + limits.LEARNT_AT_ONCE])
 
     def advertised(self, peer: int, message: Advertise, now: float = 0.0) -> list[Action]:
         """A peer says what it publishes."""
-        known = self._peers[peer]
+        known = self._peers[peer].sources
         removed = list(message.removed)
         if message.full:
             offered = {offer.source for offer in message.added}
@@ -221,27 +266,17 @@ class Imports:
         for source in removed:
             actions += self._forget(peer, source)
         for offer in message.added:
-            actions += self._learn(peer, offer)
-        if message.full:
-            actions += self._go_on(peer, now)
-        return actions
-
-    def _go_on(self, peer: int, now: float) -> list[Action]:
-        """A peer is back: ask again for what its link took away."""
-        actions: list[Action] = []
-        for source, entry in self._peers[peer].items():
-            if entry.state is RouteState.WAITING and entry.timer is None:
-                actions += self._open(peer, source, entry, now)
+            actions += self._learn(peer, offer, now)
         return actions
 
     def opened(self, peer: int, message: Opened, now: float) -> list[Action]:
         """A route that we asked for is open; one that we closed meanwhile is ignored."""
-        source = self._routes[peer].get(message.route)
-        entry = self._peers[peer].get(source) if source is not None else None
+        source = self._peers[peer].routes.get(message.route)
+        entry = self._peers[peer].sources.get(source) if source is not None else None
         if source is None or entry is None or entry.state is not RouteState.OPENING:
             return []
         if message.description.type != entry.type:
-            self._routes[peer].pop(message.route)
+            self._peers[peer].routes.pop(message.route)
             why = f"it is offered as {entry.type}, but its publisher sends {message.description.type}"
             fail = self._fail(peer, source, entry, why, now)
             return [Send(peer, Close(message.route)), Warn("mismatch.type", str(source), f"{source}: {why}"), *fail]
@@ -255,8 +290,8 @@ class Imports:
 
     def closed(self, peer: int, message: Closed, now: float) -> list[Action]:
         """The other side has no such route, or no longer."""
-        source = self._routes[peer].pop(message.route, None)
-        entry = self._peers[peer].get(source) if source is not None else None
+        source = self._peers[peer].routes.pop(message.route, None)
+        entry = self._peers[peer].sources.get(source) if source is not None else None
         if source is None or entry is None:
             return []
         return self._fail(peer, source, entry, message.reason, now)
@@ -289,38 +324,50 @@ class Imports:
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due."""
-        return earliest(*(self._peers[peer][source].timer for peer, source in self._timed))
+        while self._timers and not self._is_due(self._timers[0]):
+            heappop(self._timers)
+        return self._timers[0][0] if self._timers else None
 
     def handle_timer(self, now: float) -> list[Action]:
-        """Do what is due."""
+        """Do what is due, or a part of it: then ``next_timer`` is due again at once."""
         actions: list[Action] = []
-        for peer, source in sorted(self._timed):
-            entry = self._peers[peer][source]
-            if entry.timer is None or entry.timer > now:
-                continue
+        for _ in range(limits.LEARNT_AT_ONCE):
+            if (due := self.next_timer()) is None or due > now:
+                break
+            _, _, peer, source = heappop(self._timers)
+            entry = self._peers[peer].sources[source]
             if entry.state is RouteState.LINGERING:
                 actions += self._close(peer, source, entry)
             elif entry.state is RouteState.OPENING:
-                self._routes[peer].pop(entry.route, None)
+                self._peers[peer].routes.pop(entry.route, None)
                 actions.append(Send(peer, Close(entry.route)))
                 actions += self._fail(peer, source, entry, "the peer has not answered", now)
             elif entry.state is RouteState.WAITING:
                 actions += self._open(peer, source, entry, now)
         return actions
 
-    def _learn(self, peer: int, offer: Offer) -> list[Action]:
-        known = self._peers[peer]
+    def _is_due(self, timer: tuple[float, int, int, Source]) -> bool:
+        """Whether this is still its source's timer."""
+        when, serial, peer, source = timer
+        entry = self.get(peer, source)
+        return entry is not None and entry.timer == when and entry.serial == serial
+
+    def _learn(self, peer: int, offer: Offer, now: float) -> list[Action]:
+        known = self._peers[peer].sources
         source = offer.source
         actions: list[Action] = []
         if source in known:
-            if known[source].type == offer.type:
-                return []
+            entry = known[source]
+            if entry.type == offer.type:
+                # It was offered over a link before this one: ask again for what that took away.
+                waits = entry.state is RouteState.WAITING and entry.timer is None
+                return self._open(peer, source, entry, now) if waits else []
             actions += self._forget(peer, source)
         elif len(known) >= limits.TOPICS_PER_PEER_MAX:
             return [
                 Warn("topics.too_many", str(peer), f"a peer offers more than {limits.TOPICS_PER_PEER_MAX} topics")
             ]
-        nodes = self._nodes[peer]
+        nodes = self._peers[peer].nodes
         if source.node not in nodes and len(nodes) >= limits.NODES_PER_PEER_MAX:
             return [
                 Warn(
@@ -333,6 +380,7 @@ class Imports:
         nodes[source.node] += 1
         backoff = Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng)
         entry = known[source] = Import(offer.type, backoff)
+        self._peers[peer].topics.setdefault(source.topic, {})[source] = None
         actions += self._show_or_hide(peer, source, entry)
         return actions + self._report_conflict(peer, source, entry)
 
@@ -367,18 +415,22 @@ class Imports:
         return why + "rename one of the topics or use one type", True
 
     def _forget(self, peer: int, source: Source) -> list[Action]:
-        entry = self._peers[peer].get(source)
+        entry = self._peers[peer].sources.get(source)
         if entry is None:
             return []
         return self._close(peer, source, entry) + self._drop(peer, source, entry)
 
     def _drop(self, peer: int, source: Source, entry: Import) -> list[Action]:
         actions: list[Action] = [Retract(peer, source)] if entry.shown else []
-        del self._peers[peer][source]
-        nodes = self._nodes[peer]
-        nodes[source.node] -= 1
-        if not nodes[source.node]:
-            del nodes[source.node]
+        known = self._peers[peer]
+        del known.sources[source]
+        known.doubtful.discard(source)
+        del known.topics[source.topic][source]
+        if not known.topics[source.topic]:
+            del known.topics[source.topic]
+        known.nodes[source.node] -= 1
+        if not known.nodes[source.node]:
+            del known.nodes[source.node]
         return actions
 
     def _move(self, peer: int, source: Source, entry: Import, state: RouteState, timer: float | None = None) -> None:
@@ -387,19 +439,20 @@ class Imports:
             raise LocalProtocolError(f"{entry.state.name} does not lead to {state.name}")
         entry.state = state
         entry.timer = timer
-        if timer is None:
-            self._timed.discard((peer, source))
-        else:
-            self._timed.add((peer, source))
+        if timer is not None:
+            self._serial += 1
+            entry.serial = self._serial
+            heappush(self._timers, (timer, self._serial, peer, source))
 
     def _open(self, peer: int, source: Source, entry: Import, now: float) -> list[Action]:
-        if peer in self._away:
+        known = self._peers[peer]
+        if known.away:
             self._move(peer, source, entry, RouteState.OPENING)
             self._move(peer, source, entry, RouteState.WAITING)
             return []
-        route = self._next_route[peer]
-        self._next_route[peer] = route + 1
-        self._routes[peer][route] = source
+        route = known.next_route
+        known.next_route += 1
+        known.routes[route] = source
         entry.route = route
         self._move(peer, source, entry, RouteState.OPENING, now + limits.ROUTE_OPEN_TIMEOUT)
         contract = self._contracts.of(source.topic, entry.type)
@@ -410,7 +463,7 @@ class Imports:
         """Leave a source alone, whatever its state."""
         actions: list[Action] = []
         if entry.route:
-            self._routes[peer].pop(entry.route, None)
+            self._peers[peer].routes.pop(entry.route, None)
             actions += [Send(peer, Close(entry.route)), Detach(peer, source, entry.route)]
         entry.route = 0
         entry.backoff.reset()
@@ -429,3 +482,11 @@ class Imports:
         else:
             self._move(peer, source, entry, RouteState.WAITING, now + entry.backoff.delay())
         return actions
+
+
+def _gone(peer: int, sources: Mapping[Source, Import]) -> Iterator[Action]:
+    for source, entry in sources.items():
+        if entry.route:
+            yield Detach(peer, source, entry.route)
+        if entry.shown:
+            yield Retract(peer, source)

@@ -70,17 +70,25 @@ class Description(msgspec.Struct, frozen=True):
             return f"its publisher names no message type (but {self.type!r})"
         if not _MD5.fullmatch(self.md5):
             return f"its publisher names no md5 sum (but {self.md5!r})"
-        if any(character > "\xff" for character in self.definition):
+        if not self.definition.isascii() and max(self.definition) > "\xff":
             return "its definition has characters that are no bytes"
         return ""
 
 
 class Advertise(msgspec.Struct, frozen=True, tag_field="op", tag="advertise"):
-    """What the sender's graph publishes: all of it (``full``, first on each link) or what changed."""
+    """What the sender's graph publishes: all of it, first on each link, or what changed.
+
+    Args:
+        added: New, or of another type.
+        removed: No longer there.
+        full: This begins all of it: what is not offered is not there.
+        more: Further messages go on with that.
+    """
 
     added: tuple[Offer, ...] = ()
     removed: tuple[Source, ...] = ()
     full: bool = False
+    more: bool = False
 
 
 class Open(msgspec.Struct, frozen=True, tag_field="op", tag="open"):

@@ -14,19 +14,15 @@ MIB: Final = 1024 * KIB
 OPEN_FILES: Final = 65_536
 """File descriptors that an agent asks for, as far as the hard limit allows: the usual 1024 are 500 proxies."""
 THREAD_SWITCH: Final = 1e-4
-"""Seconds that a thread keeps the interpreter from one that waits for it. Beside a large XML-RPC call in a thread the
-loop is 3 ms late (p50) with Python's own 5 ms, and 0.16 ms with this."""
+"""Seconds that a thread keeps the interpreter from one that waits for it. Beside a thread that parses XML the loop is
+3 ms late (p50) with Python's own 5 ms, and 0.16 ms with this."""
 COLLECT_LOOK: Final = 0.25
 """Between two looks how much cyclic garbage there may be."""
-COLLECT_LOOK_AGAIN: Final = 0.05
+COLLECT_LOOK_AGAIN: Final = 0.02
 """The same after a look that found enough: messages on their way are gone by then, and many small portions hold the
 loop for less than a large one."""
-COLLECT_YOUNG: Final = 1000
-"""Objects that came to stay since the last collection, for the next: some 70 µs, and what 140 XML-RPC calls leave."""
-COLLECT_YOUNG_MAX: Final = 20_000
-"""The same where the loop never rests: 1.5 ms, and a few MB."""
-COLLECT_LOAD: Final = 0.5
-"""The share of the time that the loop may work and still count as rested."""
+COLLECT_YOUNG: Final = 300
+"""Objects that came to stay since the last collection, for the next: what 40 XML-RPC calls leave, some 0.1 ms."""
 COLLECT_GROWTH: Final = 50_000
 """Memory blocks by which the heap grew, some 5 MB, for a full collection while no data flows."""
 COLLECT_GROWTH_MAX: Final = 500_000
@@ -120,7 +116,7 @@ GREETING_FORGET: Final = 20.0
 SPREAD_INTERVAL: Final = 0.5
 """News of found peers are gathered this long for those that hear no multicast; the first goes out at once."""
 BEACONS_PER_WAKE: Final = 64
-"""Packets handled before the loop gets its turn again: a flood must not delay data."""
+"""Packets handled, 100 microseconds each with data between them, before the loop gets its turn again."""
 BEACONS_PER_SOURCE: Final = 200
 """Packets a second from one address; a host with twenty agents that all start at once stays below."""
 BEACON_SOURCES_MAX: Final = 1024
@@ -364,6 +360,8 @@ ROUTES_PER_LINK_MAX: Final = 8192
 """Open routes that one peer may hold with us."""
 ADVERTISED_AT_ONCE: Final = 64
 """Sources in one advertisement of ours; more follow in the next turn of the loop."""
+ADVERTISED_WAITING_BYTES: Final = 4 * MIB
+"""Advertisements of all peers that wait to be read: some 40,000 topics. Beyond it they are read at once."""
 LEARNT_AT_ONCE: Final = 16
 """Sources of an advertisement that are dealt with at once, some 100 microseconds; then data goes first."""
 RESCANNED_AT_ONCE: Final = 16
@@ -415,6 +413,12 @@ CONTROL_HANDLER_TIMEOUT: Final = 30.0
 """For the agent's own part of a call."""
 CONTROL_PATH_MAX: Final = 107
 """Bytes in a UNIX socket's path: Linux's sun_path less its final zero."""
+DIAGNOSTICS_INTERVAL: Final = 1.0
+"""Between two messages on /diagnostics, as ROS's own publishers have it; the clocks of links are followed as often."""
+DIAGNOSTICS_STALE: Final = 60.0
+"""For this long a peer that is gone, and what came from it, is shown as stale on /diagnostics."""
+DIAGNOSTICS_QUEUE: Final = 10
+"""Messages waiting for a slow reader of /diagnostics: each holds everything that the one before it did."""
 
 # --- logging --------------------------------------------------------------------------------------------------
 LOG_INTERVAL: Final = 5.0

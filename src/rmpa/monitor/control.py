@@ -9,12 +9,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
+from rmpa.monitor.json_pieces import json_pieces
+
+if TYPE_CHECKING:
+    from rmpa.core.breathing import Breathing
 
 
 class Request(msgspec.Struct, frozen=True):
@@ -81,14 +85,17 @@ class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
         except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
             raise RemoteProtocolError(f"not a control reply: {error}") from None
 
-    def serialize(self) -> bytes:
+    def serialize(self, breathing: Breathing = iter) -> bytes:
         """One line.
+
+        Args:
+            breathing: For the pieces of a large one, some 50 microseconds each.
 
         Raises:
             LocalProtocolError: A handler returned something that JSON cannot say, or too much of it.
         """
         try:
-            line = msgspec.json.encode(self) + b"\n"
+            line = b"".join((*breathing(json_pieces(self)), b"\n"))
         except (TypeError, ValueError, RecursionError) as error:
             raise LocalProtocolError(f"a handler's value is not JSON: {error}") from None
         if len(line) > limits.CONTROL_REPLY_MAX:

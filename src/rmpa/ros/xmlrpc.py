@@ -123,8 +123,8 @@ class _BoundedUnmarshaller(Unmarshaller):
         super().end(tag)
 
 
-class _Document:
-    """A document that comes piece by piece; what is wrong with it is a ``RemoteProtocolError``."""
+class _Reader:
+    """A document that is read piece by piece, for who has something else to do in between."""
 
     def __init__(self) -> None:
         self._unmarshaller = _BoundedUnmarshaller()
@@ -136,6 +136,12 @@ class _Document:
         self._token = 0
 
     def feed(self, data: bytes) -> None:
+        """Take the next piece.
+
+        Raises:
+            RemoteProtocolError: It is malformed, too deep or too large, declares entities, or holds an integer beyond
+                32 bits.
+        """
         self._size += len(data)
         if self._size > limits.HTTP_BODY_MAX:
             raise LimitExceeded("XML-RPC body", self._size, limits.HTTP_BODY_MAX)
@@ -147,11 +153,17 @@ class _Document:
             self._give()
         self._token = self._size - self._expat.CurrentByteIndex
 
-    def close(self) -> tuple[str | None, tuple[XmlRpcValue, ...]]:
+    def abandon(self) -> None:
+        """Read no more: breaks a reference cycle, which nobody else does while the collector is off."""
+        with contextlib.suppress(Exception):
+            self._parser.close()
+
+    def _end(self) -> tuple[str | None, tuple[XmlRpcValue, ...]]:
         """The method's name, if it is a call, and the values.
 
         Raises:
             Fault: It is a fault.
+            RemoteProtocolError: As for ``feed``, or it is not whole.
         """
         with self._errors():
             self._give()
@@ -169,9 +181,7 @@ class _Document:
         try:
             yield
         except BaseException as error:
-            # Closing breaks a reference cycle, which nobody else does while the collector is off.
-            with contextlib.suppress(Exception):
-                self._parser.close()
+            self.abandon()
             if isinstance(error, Fault):
                 raise
             if isinstance(error, DefusedXmlException):
@@ -187,25 +197,17 @@ class _Document:
             raise
 
 
-class CallReader:
-    """Reads a ``methodCall`` document piece by piece, for who has something else to do in between.
-
-    Both methods raise:
-        RemoteProtocolError: It is malformed, too deep or too large, declares entities, or holds an integer beyond
-            32 bits.
-    """
-
-    def __init__(self) -> None:
-        self._document = _Document()
-
-    def feed(self, data: bytes) -> None:
-        """Take the next piece."""
-        self._document.feed(data)
+class CallReader(_Reader):
+    """Reads a ``methodCall`` document."""
 
     def close(self) -> tuple[str, tuple[XmlRpcValue, ...]]:
-        """The method's name and its parameters, once all pieces are there."""
+        """The method's name and its parameters, once all pieces are there.
+
+        Raises:
+            RemoteProtocolError: As for ``feed``, it is not whole, or no call.
+        """
         try:
-            method, params = self._document.close()
+            method, params = self._end()
         except Fault as fault:
             raise RemoteProtocolError("an XML-RPC fault came where a call was expected") from fault
         if not method:
@@ -213,35 +215,39 @@ class CallReader:
         return method, params
 
 
-def parse_call(data: bytes) -> tuple[str, tuple[XmlRpcValue, ...]]:
-    """Read a whole ``methodCall`` document; the errors are those of ``CallReader``.
+class ResponseReader(_Reader):
+    """Reads a ``methodResponse`` document."""
 
-    Returns:
-        The method's name and its parameters.
-    """
+    def close(self) -> XmlRpcValue:
+        """The value, once all pieces are there.
+
+        Raises:
+            RosFault: The response is a fault.
+            RemoteProtocolError: As for ``feed``, it is not whole, or there is not exactly one value.
+        """
+        try:
+            method, params = self._end()
+        except Fault as fault:
+            if not isinstance(fault.faultCode, int):
+                raise RemoteProtocolError(f"XML-RPC fault with code {brief(fault.faultCode)}") from fault
+            raise RosFault(fault.faultCode, str(fault.faultString)) from fault
+        if method is not None or len(params) != 1:
+            raise RemoteProtocolError(f"XML-RPC response with {len(params)} values; there must be one")
+        return params[0]
+
+
+def parse_call(data: bytes) -> tuple[str, tuple[XmlRpcValue, ...]]:
+    """Read a whole ``methodCall`` document; returns and raises as ``CallReader``."""
     reader = CallReader()
     reader.feed(data)
     return reader.close()
 
 
 def parse_response(data: bytes) -> XmlRpcValue:
-    """Read a ``methodResponse`` document.
-
-    Raises:
-        RosFault: The response is a fault.
-        RemoteProtocolError: As for ``CallReader``, or there is not exactly one value.
-    """
-    document = _Document()
-    try:
-        document.feed(data)
-        method, params = document.close()
-    except Fault as fault:
-        if not isinstance(fault.faultCode, int):
-            raise RemoteProtocolError(f"XML-RPC fault with code {brief(fault.faultCode)}") from fault
-        raise RosFault(fault.faultCode, str(fault.faultString)) from fault
-    if method is not None or len(params) != 1:
-        raise RemoteProtocolError(f"XML-RPC response with {len(params)} values; there must be one")
-    return params[0]
+    """Read a whole ``methodResponse`` document; returns and raises as ``ResponseReader``."""
+    reader = ResponseReader()
+    reader.feed(data)
+    return reader.close()
 
 
 def call_pieces(method: str, params: Sequence[XmlRpcValue]) -> Iterator[bytes]:

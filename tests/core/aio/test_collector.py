@@ -51,22 +51,22 @@ async def until_no_more_than(knots: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("young", "grown", "load", "quiet", "due"),
+    ("young", "grown", "quiet", "due"),
     [
-        (0, 0, 0.0, True, Due.NOTHING),
-        (limits.COLLECT_YOUNG - 1, 0, 0.0, True, Due.NOTHING),
-        (limits.COLLECT_YOUNG, 0, 0.0, True, Due.YOUNG),
-        (limits.COLLECT_YOUNG, 0, 0.0, False, Due.YOUNG),
-        (limits.COLLECT_YOUNG, 0, 0.9, False, Due.NOTHING),
-        (limits.COLLECT_YOUNG_MAX, 0, 0.9, False, Due.YOUNG),
-        (0, limits.COLLECT_GROWTH, 0.0, False, Due.NOTHING),
-        (0, limits.COLLECT_GROWTH, 0.0, True, Due.FULL),
-        (0, limits.COLLECT_GROWTH_MAX, 0.9, False, Due.FULL),
-        (limits.COLLECT_YOUNG, -10, 0.0, True, Due.YOUNG),
+        (0, 0, True, Due.NOTHING),
+        (limits.COLLECT_YOUNG - 1, 0, True, Due.NOTHING),
+        (limits.COLLECT_YOUNG, 0, True, Due.YOUNG),
+        (limits.COLLECT_YOUNG, 0, False, Due.YOUNG),
+        (limits.COLLECT_YOUNG, -10, True, Due.YOUNG),
+        (0, limits.COLLECT_GROWTH, False, Due.NOTHING),
+        (limits.COLLECT_YOUNG, limits.COLLECT_GROWTH, False, Due.YOUNG),
+        (0, limits.COLLECT_GROWTH - 1, True, Due.NOTHING),
+        (0, limits.COLLECT_GROWTH, True, Due.FULL),
+        (0, limits.COLLECT_GROWTH_MAX, False, Due.FULL),
     ],
 )
-def test_what_is_due(young: int, grown: int, load: float, quiet: bool, due: Due) -> None:
-    assert what_is_due(young, grown, load, quiet=quiet) is due
+def test_what_is_due(young: int, grown: int, quiet: bool, due: Due) -> None:
+    assert what_is_due(young, grown, quiet=quiet) is due
 
 
 async def test_it_takes_over_and_gives_back(collector: Collector) -> None:
@@ -120,27 +120,9 @@ async def test_cycles_of_control_work_are_collected_in_small_portions(
     # 2 to 4 tracked objects a knot; some 10,000 knots a second.
     assert counters["collector.young"] >= 5
     assert counters["collector.full"] == 0
-    assert highest < 6000
+    assert highest < 5000
     assert set(pauses.generations) == {0}
     assert collector.longest_pause < 0.1
-
-
-async def test_a_loop_that_never_rests_is_left_alone_up_to_a_bound(
-    collector: Collector, counters: Counters, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(limits, "COLLECT_LOAD", 0.0)
-    monkeypatch.setattr(limits, "COLLECT_LOOK", 0.01)
-    monkeypatch.setattr(limits, "COLLECT_YOUNG_MAX", 3000)
-    gc.collect()
-    collector.start()
-    for _ in range(500):
-        Knot()
-    await asyncio.sleep(0.1)
-    assert counters.as_dict() == {}
-    for _ in range(3000):
-        Knot()
-    await until_no_more_than(0)
-    assert counters["collector.young"] == 1
 
 
 async def test_garbage_that_grew_old_is_collected_when_no_data_flows(

@@ -211,6 +211,7 @@ class Kernel:
             resource.RLIMIT_MEMLOCK: (65536, 65536),
         }
         self.privileged = False
+        self.filtered = False
         self.priority = 0
         self.slack = 50_000
         self.locked: list[int] = []
@@ -231,7 +232,9 @@ class Kernel:
 
     def _schedule(self, _: int, policy: int, param: os.sched_param) -> None:
         assert policy == os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-        if param.sched_priority > self.limits[resource.RLIMIT_RTPRIO][0] and not self.privileged:
+        allowed = self.limits[resource.RLIMIT_RTPRIO][0]
+        too_high = allowed != INFINITY and param.sched_priority > allowed
+        if self.filtered or (too_high and not self.privileged):
             raise PermissionError(errno.EPERM, "Operation not permitted")
         self.priority = param.sched_priority
 
@@ -242,7 +245,8 @@ class Kernel:
         return self.slack
 
     def mlockall(self, flags: int) -> int:
-        if self.limits[resource.RLIMIT_MEMLOCK][0] != INFINITY and not self.privileged:
+        limited = self.limits[resource.RLIMIT_MEMLOCK][0] != INFINITY
+        if self.filtered or (limited and not self.privileged):
             self.lock_error = errno.EPERM
             return -1
         self.locked.append(flags)
@@ -272,8 +276,9 @@ def test_a_limit_of_priority_is_used_up(kernel: Kernel) -> None:
     assert kernel.priority == 20
 
 
-def test_a_hard_limit_above_the_soft_one_is_enough(kernel: Kernel) -> None:
-    kernel.limits[resource.RLIMIT_RTPRIO] = (0, 99)
+@pytest.mark.parametrize("hard", [99, INFINITY])
+def test_a_hard_limit_above_the_soft_one_is_enough(kernel: Kernel, hard: int) -> None:
+    kernel.limits[resource.RLIMIT_RTPRIO] = (0, hard)
     assert ask()["SCHED_FIFO"] == Wish("SCHED_FIFO", True, "priority 50")
     assert kernel.priority == 50
 
@@ -306,6 +311,16 @@ def test_a_control_group_without_real_time_is_told(
     wish = ask()["SCHED_FIFO"]
     assert not wish.granted
     assert needed in wish.remedy
+
+
+def test_a_filter_is_suspected_where_the_limits_allow_it(kernel: Kernel) -> None:
+    kernel.filtered = True
+    kernel.limits[resource.RLIMIT_RTPRIO] = (99, 99)
+    kernel.limits[resource.RLIMIT_MEMLOCK] = (INFINITY, INFINITY)
+    wishes = ask()
+    assert "although" in wishes["SCHED_FIFO"].text
+    assert "RestrictRealtime=no" in wishes["SCHED_FIFO"].remedy
+    assert "although" in wishes["memory lock"].text
 
 
 def test_memory_is_locked_in_two_steps_only_where_nothing_limits_it(kernel: Kernel) -> None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
+from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import actions as act
 from rmpa.bridge.aio.inbound import Inbound
@@ -29,6 +30,7 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.policy import OWN_NODE, is_own
 from rmpa.bridge.proxy_names import LOOPBACK, proxy_prefix
 from rmpa.core import limits
+from rmpa.core.aio.loop import breathe
 from rmpa.core.contract import Priority
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import RemoteProtocolError
@@ -47,6 +49,7 @@ if TYPE_CHECKING:
     from rmpa.ros.aio.core import RosCore
 
 _log = logging.getLogger(__name__)
+_ADVERTISE: Final = b'{"op":"advertise"'
 
 
 @dataclass(slots=True)
@@ -91,8 +94,20 @@ class Bridge:
         self._rescan: asyncio.Handle | None = None
         self._closed = False
         self._types: dict[Source, str] = {}
+        # Topics of the local graph to look at, advertisements to learn, and what is to be done: each is worked off a
+        # little at a time, so that a graph of thousands delays no message.
+        self._changed: dict[str, None] = {}
+        self._learning: deque[tuple[Attached, bytes | Iterator[Advertise]]] = deque()
+        self._learning_bytes = 0
+        self._actions: deque[act.Action] = deque()
+        self._acting = False
         self._mismatches: dict[Source, dict[str, str]] = {}
         self._refusals = RefusalLog(_log, self.counters)
+
+    @property
+    def node(self) -> SlaveNode:
+        """The agent's own node in the local graph."""
+        return self._node
 
     @property
     def exports(self) -> Exports:
@@ -126,7 +141,7 @@ class Bridge:
         self._loop = asyncio.get_running_loop()
         await self._node.start()
         self._core.on_change(self._graph_changed)
-        self._scan()
+        self._scan_all()
         self._reconciler = self._loop.call_later(limits.RECONCILE_INTERVAL, self._reconcile)
 
     async def close(self) -> None:
@@ -153,6 +168,7 @@ class Bridge:
             self._by_link[link] = back
             self._act(self._imports.link_up(back.peer))
             self._act(self._exports.link_up(back.peer))
+            self._schedule()
             return
         peer = next(self._numbers)
         prefix = proxy_prefix(link.identity, {attached.inbound.prefix for attached in self._by_number.values()})
@@ -168,6 +184,7 @@ class Bridge:
         self._by_number[peer] = self._by_link[link] = attached
         self._act(self._imports.link_up(peer))
         self._act(self._exports.link_up(peer))
+        self._schedule()
 
     def link_down(self, link: MeshLink) -> None:
         """A link is gone: retract what came over it, but for what a reliable route brings back."""
@@ -175,6 +192,8 @@ class Bridge:
         if attached is None:
             return
         attached.inbound.link_down()
+        self._learning = deque(lesson for lesson in self._learning if lesson[0] is not attached)
+        self._learning_bytes = sum(len(lesson) for _, lesson in self._learning if isinstance(lesson, bytes))
         exports, _ = self._exports.link_away(attached.peer)
         self._act(exports)
         if link.silent:
@@ -230,8 +249,17 @@ class Bridge:
             RemoteProtocolError: It is not a message that belongs here; the link is to be closed.
         """
         attached = self._by_link.get(link)
-        if attached is not None:
+        if attached is None:
+            return
+        if payload[: len(_ADVERTISE)] != _ADVERTISE:
             self._dispatch(attached, decode(payload))
+            return
+        # It takes long to read, and no data waits for it: this is a reader of data, so not now.
+        self._learning.append((attached, bytes(payload)))
+        self._learning_bytes += len(payload)
+        self._schedule()
+        while self._learning_bytes > limits.ADVERTISED_WAITING_BYTES:
+            self._learn(*self._learning.popleft())
 
     def data(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
         """A data frame came: the hot path. One for a route that was closed meanwhile is dropped."""
@@ -259,10 +287,8 @@ class Bridge:
         peer, now = attached.peer, self._loop.time()
         match message:
             case Advertise():
-                if message.added or message.removed:
-                    changes = (len(message.added), len(message.removed))
-                    _log.info("< %s publishes %d more topics, %d less", attached.link.name, *changes)
-                self._act(self._imports.advertised(peer, message, now))
+                for portion in self._portions(attached, message):
+                    self._act(self._imports.advertised(peer, portion, now))
             case Open():
                 self._act(self._exports.opened(peer, message))
             case Opened():
@@ -298,7 +324,7 @@ class Bridge:
         self._by_number.pop(attached.peer, None)
         self._by_link.pop(attached.link, None)
         for action in self._exports.link_down(attached.peer):
-            self._do(action)
+            self._act([action])
         self._imports.link_down(attached.peer)  # its actions are what closing the inbound side does at once
         task = asyncio.create_task(attached.inbound.close(), name=f"retract {attached.inbound.prefix}")
         self._closing.add(task)
@@ -325,29 +351,74 @@ class Bridge:
                 self._types.pop(source, None)
             elif is_type_name(change.type):
                 self._types[source] = change.type
+        if change.kind is not Kind.SERVICE:
+            self._changed[change.name] = None
+            self._schedule()
+
+    def _schedule(self) -> None:
         if self._rescan is None and not self._closed:
             self._rescan = self._loop.call_soon(self._scan)
 
+    def _scan_all(self) -> None:
+        self._changed |= dict.fromkeys((*self._exports.topics, *self._core.state().publishers))
+        self._schedule()
+
     def _scan(self) -> None:
+        """Do a part of what has to be done since graphs have changed, the local one or a peer's."""
         self._rescan = None
-        state = self._core.state()
-        sources = {
-            source: LocalSource(self._types.get(source) or state.types.get(source.topic, "*"), uri)
-            for topic, nodes in state.publishers.items()
-            for node, uri in nodes.items()
-            if not is_own((source := Source(topic, node)).node)
-        }
-        self._act(self._exports.graph(sources))
-        self._act(self._imports.local_types({source.topic: local.type for source, local in sources.items()}))
-        known = {*self._exports.offered, *(source for _, source, _ in self._imports)}
-        for source in [source for source in self._mismatches if source not in known]:
-            del self._mismatches[source]
+        for _ in range(min(len(self._changed), limits.RESCANNED_AT_ONCE)):
+            topic = next(iter(self._changed))
+            del self._changed[topic]
+            self._look_at(topic)
+        self._act(self._exports.tell())
+        if self._learning:
+            self._learn(*self._learning.popleft())
+        if self._changed or self._learning or self._exports.untold:
+            self._schedule()
+        elif self._mismatches:
+            for source in [s for s in self._mismatches if s not in self._exports.offered]:
+                if not self._imports.knows(source):
+                    del self._mismatches[source]
+
+    def _learn(self, attached: Attached, lesson: bytes | Iterator[Advertise]) -> None:
+        """Read an advertisement, or take in the next portion of one that was read."""
+        if isinstance(lesson, bytes):
+            self._learning_bytes -= len(lesson)
+        if attached.peer not in self._by_number:
+            return
+        if isinstance(lesson, bytes):
+            try:
+                message = decode(lesson)
+            except RemoteProtocolError as error:
+                text = f"{attached.link.name} broke the protocol: {error}"
+                self._warn("link.malformed", attached.link.remote_endpoint[0], text)
+                attached.link.abort(text)
+                return
+            if isinstance(message, Advertise):
+                self._learning.appendleft((attached, self._portions(attached, message)))
+        elif (portion := next(lesson, None)) is not None:
+            self._learning.appendleft((attached, lesson))
+            self._act(self._imports.advertised(attached.peer, portion, self._loop.time()))
+
+    def _portions(self, attached: Attached, message: Advertise) -> Iterator[Advertise]:
+        if message.added or message.removed:
+            changes = (len(message.added), len(message.removed))
+            _log.info("< %s publishes %d more topics, %d less", attached.link.name, *changes)
+        return self._imports.portions(attached.peer, message)
+
+    def _look_at(self, topic: str) -> None:
+        nodes = {node: uri for node, uri in self._core.publishers(topic).items() if not is_own(node)}
+        said = self._core.type_of(topic) if nodes else ""
+        local = {node: LocalSource(self._types.get(Source(topic, node)) or said, uri) for node, uri in nodes.items()}
+        self._act(self._exports.graph(topic, local))
+        self._act(self._imports.local_type(topic, next((one.type for one in reversed(local.values())), None)))
 
     def _reconcile(self) -> None:
         self._reconciler = self._loop.call_later(limits.RECONCILE_INTERVAL, self._reconcile)
-        self._scan()
+        self._scan_all()
         publishers = self._core.state().publishers
-        for attached in self._by_number.values():
+        for attached in list(self._by_number.values()):
+            breathe()
             if again := attached.inbound.reconcile(publishers):
                 self.counters.add("proxy.registered_again", again)
 
@@ -378,8 +449,21 @@ class Bridge:
     # --- carrying out ------------------------------------------------------------------------------------------
 
     def _act(self, actions: list[act.Action]) -> None:
+        """Do these behind those that are being done: in between data may come first, and bring more of them."""
         for action in actions:
-            self._do(action)
+            if isinstance(action, act.Describe):
+                self._do(action)  # now: data may be right behind it, and nothing that waits belongs before it
+            else:
+                self._actions.append(action)
+        if self._acting:
+            return
+        self._acting = True
+        try:
+            while self._actions:
+                self._do(self._actions.popleft())
+                breathe()
+        finally:
+            self._acting = False
         self._set_timer()
 
     def _do(self, action: act.Action) -> None:
@@ -404,7 +488,9 @@ class Bridge:
             case act.SuspendRoute():
                 self._outbound.suspend_route(action)
             case act.AddRoute():
-                self._outbound.add_route(action, self._by_number[action.peer].link)
+                attached = self._by_number.get(action.peer)
+                if attached is not None:
+                    self._outbound.add_route(action, attached.link)
             case act.RemoveRoute():
                 self._outbound.remove_route(action)
                 attached = self._by_number.get(action.peer)

@@ -257,10 +257,10 @@ def breathe() -> None:
         loop.poll_data()
 
 
-def breathing(items: Iterable[_T], /) -> Iterator[_T]:
-    """Pass on items one after the other, and breathe now and then (``core.breathing.Breathing``)."""
+def breathing(items: Iterable[_T], /, every: int = _ITEMS) -> Iterator[_T]:
+    """Pass on items one after the other, and breathe at each one out of ``every`` (``core.breathing.Breathing``)."""
     for number, item in enumerate(items):
-        if number % _ITEMS == 0:
+        if number % every == 0:
             breathe()
         yield item
 

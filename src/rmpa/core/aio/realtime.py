@@ -137,7 +137,7 @@ def _schedule(priority: int) -> Wish:
 def _schedule_lower(name: str, priority: int, error: OSError) -> Wish:
     """Take what RLIMIT_RTPRIO allows, if that is anything."""
     _, allowed = resource.getrlimit(resource.RLIMIT_RTPRIO)
-    lower = min(allowed, priority)  # infinity would have granted it before
+    lower = priority if allowed == resource.RLIM_INFINITY else min(allowed, priority)
     if lower > 0:
         with contextlib.suppress(OSError, ValueError):
             resource.setrlimit(resource.RLIMIT_RTPRIO, (allowed, allowed))
@@ -145,16 +145,22 @@ def _schedule_lower(name: str, priority: int, error: OSError) -> Wish:
             if lower == priority:
                 return Wish(name, True, f"priority {priority}")
             return Wish(name, True, f"priority {lower}, the limit, in place of {priority}", _priority_ways(priority))
-    if not _has_capability(_CAP_SYS_NICE):
-        return Wish(name, False, f"{error.strerror}", _priority_ways(priority))
-    # Allowed to us, and yet refused: by the kernel as a whole or for our control group.
+    if lower > 0 or _has_capability(_CAP_SYS_NICE):
+        return _forbidden(name, error)
+    return Wish(name, False, f"{error.strerror}", _priority_ways(priority))
+
+
+def _forbidden(name: str, error: OSError) -> Wish:
+    """Explain a refusal to one who has the right: it is the whole kernel, the control group or a filter."""
     if _RT_RUNTIME.is_file() and _RT_RUNTIME.read_text(encoding="ascii").strip() == "0":
-        return Wish(name, False, "this kernel has real time switched off", "sysctl kernel.sched_rt_runtime_us=950000")
+        remedy = "sudo sysctl kernel.sched_rt_runtime_us=950000"
+        return Wish(name, False, "this kernel has real time switched off", remedy)
     return Wish(
         name,
         False,
-        f"{error.strerror} although we have CAP_SYS_NICE: our control group has no real time, or a filter forbids it",
-        "write 950000 to cpu.rt_runtime_us of the group and of those above it; Docker: --cpu-rt-runtime=950000",
+        f"{error.strerror}, although we have the right: our control group has no real time, or a filter forbids it",
+        "write 950000 to cpu.rt_runtime_us of the group, after those above it (Docker: --cpu-rt-runtime=950000); "
+        "systemd: RestrictRealtime=no",
     )
 
 
@@ -200,6 +206,8 @@ def _lock_memory() -> Wish:
         failed = _lock_all()
     if not failed:
         return Wish(name, True, f"{_resident()} MB and all that comes ({before} MB before)")
+    if soft == resource.RLIM_INFINITY:
+        return Wish(name, False, f"{failed}, although nothing limits it: a filter forbids it, or RAM is short")
     text = f"{failed}; {soft // limits.KIB} KiB may be locked (ulimit -l), and it takes unlimited"
     remedy = _ways(
         "LimitMEMLOCK=infinity",

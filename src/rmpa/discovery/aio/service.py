@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
 from rmpa.core.aio.clock import SystemClock
+from rmpa.core.aio.loop import breathe
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.discovery.aio import sockets
 from rmpa.discovery.aio.intake import Intake
@@ -186,9 +187,10 @@ class Discovery:
         return sock
 
     def _readable(self, sock: socket.socket, *, multicast: bool) -> None:
-        """Take a bounded number of packets, so that a flood never keeps the loop from data."""
+        """Take a bounded number of packets, with data between them: a flood must not delay it."""
         now = self._clock.now()
         for _ in range(limits.BEACONS_PER_WAKE):
+            breathe()
             try:
                 data, source, index = sockets.receive(sock)
             except (BlockingIOError, InterruptedError):
@@ -266,6 +268,7 @@ class Discovery:
                     self._send(outputs)
                     continue
                 for event in events:
+                    breathe()
                     self._tell(event)
         finally:
             self._flushing = False
@@ -273,6 +276,7 @@ class Discovery:
 
     def _send(self, outputs: list[Output]) -> None:
         for output in outputs:
+            breathe()
             data = output.beacon.serialize()
             if isinstance(output, SendMulticast):
                 _log.debug("> group: %s", output.beacon)

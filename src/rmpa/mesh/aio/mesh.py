@@ -389,7 +389,7 @@ class Mesh:
             try:
                 sock = await self._connect(link.remote_endpoint, Lane.EXPRESS, limits.REDIAL_TIMEOUT)
             except OSError as error:
-                _log.debug("! %s: silent, and not to be reached: %s", link.name, error or "no answer")
+                _log.debug("! %s: silent, and not to be reached: %s", link.name, str(error) or "no answer")
                 await asyncio.sleep(limits.REDIAL_PAUSE)
                 continue
             if self._alive(link.id) or not unacknowledged(link.sock):

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import inspect
 import logging
 import os
 import socket
 from collections.abc import Awaitable, Callable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
+from rmpa.core.aio.loop import breathing
 from rmpa.core.config_values import did_you_mean
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import RemoteProtocolError, RmpaError, StartError
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _log = logging.getLogger(__name__)
+_breathing: Final = functools.partial(breathing, every=1)
 
 Handler = Callable[[dict[str, object]], Awaitable[object] | object]
 
@@ -165,7 +168,7 @@ class ControlServer:
 
     async def _send(self, writer: asyncio.StreamWriter, reply: Reply) -> bool:
         try:
-            line = reply.serialize()
+            line = reply.serialize(_breathing)
         except RmpaError as error:
             _log.exception("! control reply")
             line = Reply(ok=False, error=str(error)).serialize()

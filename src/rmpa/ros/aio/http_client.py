@@ -19,8 +19,9 @@ from urllib.parse import urlsplit
 import h11
 
 from rmpa.core import limits
+from rmpa.core.aio.loop import breathe, breathing
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, UnreachableError
-from rmpa.ros.xmlrpc import Reply, RosFault, XmlRpcValue, brief, parse_response, serialize_call
+from rmpa.ros.xmlrpc import Reply, ResponseReader, RosFault, XmlRpcValue, brief, call_pieces
 
 __all__ = ["RosFault", "call", "call_api", "connect", "is_own_name", "split_uri"]
 
@@ -177,7 +178,7 @@ async def call(
         LocalProtocolError: A parameter cannot be said in XML-RPC.
     """
     host, port, path = split_uri(uri)
-    http, request = _request(host, port, path, serialize_call(method, params))
+    http, request = _request(host, port, path, b"".join(breathing(call_pieces(method, params), every=1)))
     if _log.isEnabledFor(logging.DEBUG):
         _log.debug("> %s %s%s", uri, method, brief(params))
     try:
@@ -197,7 +198,22 @@ async def call(
         raise UnreachableError("XML-RPC server", uri, f"{problem}; is that program running?") from error
     except h11.RemoteProtocolError as error:
         raise RemoteProtocolError(f"{uri} does not speak HTTP: {error}") from error
-    return parse_response(body)
+    return await _read(body)
+
+
+async def _read(body: bytes) -> XmlRpcValue:
+    reader = ResponseReader()
+    try:
+        for begin in range(0, len(body), limits.XMLRPC_SLICE):
+            reader.feed(body[begin : begin + limits.XMLRPC_SLICE])
+            if begin >= limits.HTTP_BODY_INLINE:
+                await asyncio.sleep(0)
+            else:
+                breathe()
+    except asyncio.CancelledError:
+        reader.abandon()
+        raise
+    return reader.close()
 
 
 async def call_api(

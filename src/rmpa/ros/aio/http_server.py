@@ -7,7 +7,6 @@ h11 speaks HTTP/1.1 (RFC 9112), ``ros.xmlrpc`` reads the bodies. Made for client
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import errno
 import logging
 import socket
@@ -167,9 +166,8 @@ class XmlRpcServer:
             method, params = reader.close()
         except RemoteProtocolError as error:
             return self._malformed(error, connection)
-        except BaseException:
-            with contextlib.suppress(RemoteProtocolError):
-                reader.close()
+        except asyncio.CancelledError:
+            reader.abandon()
             raise
         answer = self._dispatch(method, params, connection)
         return answer if isinstance(answer, bytes) else await answer

@@ -1,0 +1,173 @@
+"""How the agent, its links and what comes over them are: snapshots judged by REP 107's levels.
+
+STALE is what was there and is not any more: a peer that is gone, and what came from it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.monitor.health_values import agent_values, link_values, number, route_values
+from rmpa.ros.diagnostic_array import Level, Status
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rmpa.monitor.snapshot import PeerInfo, RouteInfo, Snapshot, TopicInfo
+
+HERE: Final = "rmpa: this module"
+"""The agent's own status."""
+_LINKED: Final = "linked"
+_LOST, _RESTORED, _DEADLINE = "liveliness_lost", "liveliness_restored", "deadline_missed"
+_MISSES: Final = {
+    "lost": "lost",
+    "late": "late",
+    "expired": "beyond their lifespan",
+    "dropped": "dropped for a slow receiver",
+    _DEADLINE: "deadlines missed",
+}
+
+
+class Health:
+    """Judges one snapshot after the other; remembers the last one, for what is new in this."""
+
+    def __init__(self) -> None:
+        self._counts: dict[str, Counter[str]] = {}
+        self._linked: dict[str, float] = {}
+        """When each peer was last linked, by name; forgotten after ``limits.DIAGNOSTICS_STALE``."""
+        self._topics: dict[str, set[str]] = {}
+        """The names of the statuses of what came from each of these."""
+
+    def judge(self, snapshot: Snapshot, now: float) -> Iterator[Status]:
+        """One status for the agent, one for each peer, and one for each topic that comes from one.
+
+        Args:
+            snapshot: All of it.
+            now: Monotonic seconds.
+        """
+        here = snapshot.agent.name
+        counts: dict[str, Counter[str]] = {}
+        peers = _by_name(snapshot.peers)
+        yield _agent(snapshot)
+        for name, info in peers.items():
+            if info.state == _LINKED:
+                self._linked[name] = now
+                self._topics[name] = set()
+            counts[name] = Counter(dropped=info.link.dropped if info.link else 0)
+            yield _peer(name, here, info, self._new(name, counts[name]), was_linked=name in self._linked)
+        for name, topic, route in _named(snapshot.topics):
+            counts[name] = _missing(route)
+            self._topics.setdefault(route.peer, set()).add(name)
+            yield _route(name, here, topic, route, self._new(name, counts[name]))
+        yield from self._stale(peers, here, now)
+        self._counts = counts
+
+    def _new(self, name: str, counts: Counter[str]) -> Counter[str]:
+        """What was counted since the snapshot before; nothing for who was not in it."""
+        return counts - self._counts.get(name, counts)
+
+    def _stale(self, peers: dict[str, PeerInfo], here: str, now: float) -> Iterator[Status]:
+        """Peers that are gone, and what came from those that are not linked."""
+        for name, last in list(self._linked.items()):
+            info = peers.get(name)
+            if info is not None and info.state == _LINKED:
+                continue
+            if now - last > limits.DIAGNOSTICS_STALE:
+                del self._linked[name]
+                self._topics.pop(name, None)
+                continue
+            text = f"{name} is gone" if info is None else f"no link to {name}"
+            values = {"linked before (s)": number(now - last)}
+            if info is None:
+                yield Status(Level.STALE, f"rmpa: {name}", text, here, values)
+            for topic in sorted(self._topics.get(name, ())):
+                yield Status(Level.STALE, topic, text, here, values)
+
+
+def _by_name(peers: tuple[PeerInfo, ...]) -> dict[str, PeerInfo]:
+    """Peers by unique names; the ghost of one that is back under another GUID is left out."""
+    found: dict[str, PeerInfo] = {}
+    for info in sorted(peers, key=lambda info: (info.state != _LINKED, info.guid)):
+        if info.name not in found:
+            found[info.name] = info
+        elif info.state in (_LINKED, "conflict"):
+            found[f"{info.name} ({info.guid})"] = info
+    return found
+
+
+def _named(topics: tuple[TopicInfo, ...]) -> Iterator[tuple[str, TopicInfo, RouteInfo]]:
+    """What comes from peers, each with its status's name, which must be unique."""
+    for topic in topics:
+        sources = [route for route in topic.routes if route.direction == "in"]
+        several = Counter(route.peer for route in sources)
+        taken: Counter[str] = Counter()
+        for route in sources:
+            name = f"rmpa: {route.peer}: {topic.name}" + (f" ({route.node})" if several[route.peer] > 1 else "")
+            taken[name] += 1
+            yield name if taken[name] == 1 else f"{name} #{taken[name]}", topic, route
+
+
+def _missing(route: RouteInfo) -> Counter[str]:
+    return Counter(
+        lost=route.lost,
+        late=route.late,
+        expired=route.expired,
+        dropped=route.dropped,
+        deadline_missed=route.events.get(_DEADLINE, 0),
+    )
+
+
+def _agent(snapshot: Snapshot) -> Status:
+    linked = sum(info.state == _LINKED for info in snapshot.peers)
+    text = "; ".join(snapshot.notes) or f"{linked} of {len(snapshot.peers)} known peers linked"
+    return Status(
+        Level.WARN if snapshot.notes else Level.OK, HERE, text, snapshot.agent.name, agent_values(snapshot, linked)
+    )
+
+
+def _peer(name: str, here: str, info: PeerInfo, new: Counter[str], *, was_linked: bool) -> Status:
+    link = info.link
+    if info.state == _LINKED and link is not None:
+        level, text = Level.OK, "linked" + (f", round trip {link.rtt * 1e3:.2f} ms" if link.rtt is not None else "")
+        if new["dropped"]:
+            level, text = Level.WARN, f"{new['dropped']} messages dropped: the link takes them too slowly"
+    elif info.state in ("conflict", "refused"):
+        level, text = Level.ERROR, "; ".join((*info.conflicts, info.last_error)).strip("; ") or info.state
+    else:
+        level = Level.STALE if was_linked else Level.WARN
+        text = info.state + (f": {info.last_error}" if info.last_error else "")
+    return Status(level, f"rmpa: {name}", text, here, link_values(info))
+
+
+def _route(name: str, here: str, topic: TopicInfo, route: RouteInfo, new: Counter[str]) -> Status:
+    level, text = _judged(topic, route, new)
+    return Status(level, name, text, here, route_values(route))
+
+
+def _judged(topic: TopicInfo, route: RouteInfo, new: Counter[str]) -> tuple[Level, str]:
+    """The worst that is true of a route now, or since the last look."""
+    if route.state == "hidden":
+        return Level.ERROR, route.problem or "hidden"
+    if route.events.get(_LOST, 0) > route.events.get(_RESTORED, 0):
+        return Level.ERROR, next((e.text for e in reversed(route.recent) if e.kind == _LOST), "does not live")
+    if topic.mismatches:
+        return Level.ERROR, "; ".join(topic.mismatches)
+    if route.problem:
+        return Level.WARN, route.problem
+    deadline = route.contract.get("deadline")
+    if isinstance(deadline, float) and route.age is not None and route.age > deadline:
+        return Level.WARN, f"no message for {route.age:.3g} s; deadline {deadline:.3g} s"
+    if any(new.values()):
+        return Level.WARN, ", ".join(f"{count} {_MISSES[kind]}" for kind, count in new.items() if count)
+    return Level.OK, _flowing(route)
+
+
+def _flowing(route: RouteInfo) -> str:
+    if route.state == "idle":
+        return "nobody here listens"
+    if route.rate is None:
+        return f"{route.state}, last message {route.age:.3g} s ago" if route.age is not None else route.state
+    latency = f", {route.latency.p50 * 1e3:.2f} ms" if route.latency is not None else ""
+    return f"{route.rate:.1f} Hz{latency}"

@@ -1,0 +1,176 @@
+"""Snapshots judged by the levels of REP 107."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from rmpa.core import limits
+from rmpa.monitor.health import HERE, Health
+from rmpa.monitor.snapshot import EventInfo, PeerInfo, RouteInfo, Snapshot
+from rmpa.ros.diagnostic_array import Level, Status
+from tests.monitor.samples import SNAPSHOT
+
+CMD = "rmpa: joystick: /cmd"
+JOYSTICK, PC = SNAPSHOT.peers
+(ROUTE,) = SNAPSHOT.topics[0].routes
+HEALTHY = msgspec.structs.replace(ROUTE, events={}, recent=(), contract={})
+
+
+def with_routes(*routes: RouteInfo, peers: tuple[PeerInfo, ...] = SNAPSHOT.peers, **topic: object) -> Snapshot:
+    info = msgspec.structs.replace(SNAPSHOT.topics[0], routes=routes, **topic)
+    return msgspec.structs.replace(SNAPSHOT, topics=(info,), peers=peers)
+
+
+def judged(health: Health, snapshot: Snapshot, now: float = 0.0) -> dict[str, Status]:
+    statuses = list(health.judge(snapshot, now))
+    found = {status.name: status for status in statuses}
+    assert len(found) == len(statuses), "names are unique"
+    return found
+
+
+def level(snapshot: Snapshot, name: str = CMD) -> tuple[Level, str]:
+    status = judged(Health(), snapshot)[name]
+    return status.level, status.message
+
+
+def test_one_status_for_the_agent_each_peer_and_each_topic_from_a_peer() -> None:
+    found = judged(Health(), with_routes(HEALTHY))
+    assert list(found) == [HERE, "rmpa: joystick", "rmpa: pc", CMD]
+    assert {status.hardware_id for status in found.values()} == {"base"}
+    assert found[CMD].level is Level.OK
+    assert found[CMD].message == "10.0 Hz, 0.41 ms"
+    values = found[CMD].values
+    assert {key: values[key] for key in ("rate (Hz)", "latency p99 (ms)", "jitter (ms)", "lost")} == {
+        "rate (Hz)": "10",
+        "latency p99 (ms)": "0.79",
+        "jitter (ms)": "0.82",
+        "lost": "3",
+    }
+    assert found["rmpa: joystick"].values["clock error (± ms)"] == "0.216"
+    assert found[HERE].values["count beacon.malformed"] == "1"
+    assert all(found[name].values[key] for name in found for key in found[name].values)
+
+
+def test_what_goes_out_is_the_receivers_to_judge() -> None:
+    assert list(judged(Health(), msgspec.structs.replace(SNAPSHOT, topics=SNAPSHOT.topics[1:]))) == [
+        HERE,
+        "rmpa: joystick",
+        "rmpa: pc",
+    ]
+
+
+def test_the_agents_notes_are_a_warning() -> None:
+    assert level(SNAPSHOT, HERE) == (Level.WARN, "no multicast on eth0")
+    quiet = msgspec.structs.replace(SNAPSHOT, notes=())
+    assert level(quiet, HERE) == (Level.OK, "1 of 2 known peers linked")
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected", "text"),
+    [
+        ({"state": "idle", "rate": None}, Level.OK, "nobody here listens"),
+        ({"rate": None, "age": None}, Level.OK, "open"),
+        ({"rate": None, "age": 90.0}, Level.OK, "open, last message 90 s ago"),
+        ({"latency": None}, Level.OK, "10.0 Hz"),
+        ({"state": "hidden", "problem": "another type"}, Level.ERROR, "another type"),
+        ({"state": "waiting", "problem": "no answer"}, Level.WARN, "no answer"),
+        ({"contract": {"deadline": 0.2}, "age": 0.15}, Level.OK, "10.0 Hz, 0.41 ms"),
+        ({"contract": {"deadline": 0.2}, "age": 0.5}, Level.WARN, "no message for 0.5 s; deadline 0.2 s"),
+        ({"events": {"liveliness_lost": 1}}, Level.ERROR, "does not live"),
+        ({"events": {"liveliness_lost": 1, "liveliness_restored": 1}}, Level.OK, "10.0 Hz, 0.41 ms"),
+        (
+            {
+                "events": {"liveliness_lost": 1},
+                "recent": (EventInfo(kind="liveliness_lost", count=1, text="no link for 2 s", ago=1.0),),
+            },
+            Level.ERROR,
+            "no link for 2 s",
+        ),
+    ],
+)
+def test_levels_of_a_topic(changes: dict[str, object], expected: Level, text: str) -> None:
+    assert level(with_routes(msgspec.structs.replace(HEALTHY, **changes))) == (expected, text)
+
+
+def test_a_subscriber_that_was_refused_is_an_error() -> None:
+    assert level(with_routes(HEALTHY, mismatches=("another md5",))) == (Level.ERROR, "another md5")
+
+
+def test_what_went_missing_is_told_when_it_does_and_only_then() -> None:
+    health = Health()
+    assert judged(health, with_routes(HEALTHY))[CMD].level is Level.OK  # the three lost ones were before our time
+    more = msgspec.structs.replace(HEALTHY, lost=5, expired=5, events={"deadline_missed": 1})
+    status = judged(health, with_routes(more))[CMD]
+    assert (status.level, status.message) == (
+        Level.WARN,
+        "2 lost, 1 beyond their lifespan, 1 deadlines missed",
+    )
+    assert judged(health, with_routes(more))[CMD].level is Level.OK
+    again = msgspec.structs.replace(HEALTHY, lost=0)  # the route was opened anew
+    assert judged(health, with_routes(again))[CMD].level is Level.OK
+
+
+def test_sources_of_one_topic_have_names_of_their_own() -> None:
+    other = msgspec.structs.replace(HEALTHY, node="/other")
+    found = judged(Health(), with_routes(HEALTHY, other, HEALTHY))
+    assert [name for name in found if "/cmd" in name] == [
+        f"{CMD} (/joy_node)",
+        f"{CMD} (/other)",
+        f"{CMD} (/joy_node) #2",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("change", "expected", "text"),
+    [
+        ({}, Level.OK, "linked, round trip 0.43 ms"),
+        ({"state": "linking", "link": None}, Level.WARN, "linking"),
+        ({"state": "refused", "link": None, "last_error": "another domain"}, Level.ERROR, "another domain"),
+        ({"state": "conflict", "link": None, "conflicts": ("one GUID",)}, Level.ERROR, "one GUID"),
+    ],
+)
+def test_levels_of_a_peer(change: dict[str, object], expected: Level, text: str) -> None:
+    peer = msgspec.structs.replace(JOYSTICK, **change)
+    assert level(with_routes(peers=(peer,)), "rmpa: joystick") == (expected, text)
+
+
+def test_a_link_that_drops_is_a_warning() -> None:
+    health = Health()
+    judged(health, with_routes(peers=(JOYSTICK,)))
+    assert JOYSTICK.link is not None
+    slow = msgspec.structs.replace(JOYSTICK, link=msgspec.structs.replace(JOYSTICK.link, dropped=7))
+    status = judged(health, with_routes(peers=(slow,)))["rmpa: joystick"]
+    assert (status.level, status.message) == (Level.WARN, "5 messages dropped: the link takes them too slowly")
+
+
+def test_who_was_there_is_stale_for_a_while_with_all_that_came_from_it() -> None:
+    health = Health()
+    judged(health, with_routes(HEALTHY, peers=(JOYSTICK,)), 0.0)
+    lost = msgspec.structs.replace(JOYSTICK, state="linking", link=None, last_error="silent")
+    found = judged(health, with_routes(peers=(lost,)), 1.0)
+    assert (found["rmpa: joystick"].level, found["rmpa: joystick"].message) == (Level.STALE, "linking: silent")
+    assert (found[CMD].level, found[CMD].message) == (Level.STALE, "no link to joystick")
+    gone = with_routes(peers=())
+    found = judged(health, gone, 2.0)
+    assert [found[name].level for name in ("rmpa: joystick", CMD)] == [Level.STALE] * 2
+    assert found["rmpa: joystick"].values == {"linked before (s)": "2"}
+    assert list(judged(health, gone, limits.DIAGNOSTICS_STALE + 1)) == [HERE]
+    back = judged(health, with_routes(HEALTHY, peers=(JOYSTICK,)), 100.0)
+    assert [back[name].level for name in ("rmpa: joystick", CMD)] == [Level.OK] * 2
+
+
+def test_a_topic_whose_publisher_ended_is_forgotten_at_once() -> None:
+    health = Health()
+    judged(health, with_routes(HEALTHY))
+    assert CMD not in judged(health, with_routes())
+
+
+def test_the_ghost_of_a_peer_that_is_back_is_left_out() -> None:
+    ghost = msgspec.structs.replace(JOYSTICK, guid="10.0.0.2:40002#0", state="linking", link=None)
+    twin = msgspec.structs.replace(JOYSTICK, guid="10.0.0.9:40002#1")
+    found = judged(Health(), with_routes(peers=(ghost, JOYSTICK, twin)))
+    assert {name: found[name].level for name in found if "joystick" in name} == {
+        "rmpa: joystick": Level.OK,
+        "rmpa: joystick (10.0.0.9:40002#1)": Level.OK,
+    }
