@@ -414,7 +414,7 @@ CONTROL_HANDLER_TIMEOUT: Final = 30.0
 CONTROL_PATH_MAX: Final = 107
 """Bytes in a UNIX socket's path: Linux's sun_path less its final zero."""
 DIAGNOSTICS_INTERVAL: Final = 1.0
-"""Between two messages on /diagnostics, as ROS's own publishers have it; the clocks of links are followed as often."""
+"""Between two messages on /diagnostics, as ROS's own publishers have it; the links' clocks are followed as often."""
 DIAGNOSTICS_STALE: Final = 60.0
 """For this long a peer that is gone, and what came from it, is shown as stale on /diagnostics."""
 DIAGNOSTICS_QUEUE: Final = 10
