@@ -179,7 +179,11 @@ def opens_of_one(link: Link) -> None:
 
 
 def many_nodes(link: Link) -> None:
+    """Offer too much, and stay until it was taken in: that goes a little at a time."""
     link.send(Kind.CONTROL, encode(Advertise(tuple(Offer("/many", f"/n{n}", "a/B") for n in range(16_000)))))
+    for _ in range(40):
+        link.outlives()
+        time.sleep(0.05)
 
 
 ATTACKS: tuple[tuple[Callable[[Link], None], bool | None], ...] = (
