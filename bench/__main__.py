@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from rich.console import Console
 
-from bench import bed, crosstraffic, idle, load, path, period, startup, storm, throughput
+from bench import bed, crosstraffic, idle, load, path, peers, period, scale, startup, storm, throughput
 from tests.interop import namespaces
 
 if TYPE_CHECKING:
@@ -41,6 +41,8 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     "load": Measurement("a command while every core is busy", load.measure),
     "storm": Measurement("a stream while the core is asked 200 times a second", storm.measure),
     "storm_realtime": Measurement("the same, nodes and agents under SCHED_FIFO", storm.measure_realtime),
+    "scale": Measurement("what more peers and more topics cost one stream", scale.measure),
+    "peers": Measurement("who else carries bytes, in the same run", peers.measure, needs=()),  # likewise
     "throughput": Measurement("how much goes through", throughput.measure),
     "startup": Measurement("how soon the first message arrives", startup.measure),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING, Any, Final
 
 from bench.samples import percentile
@@ -61,16 +62,21 @@ def tails(image: Path, panels: Mapping[str, Series], unit: str, limit: float | N
     return _draw(image, panels, draw, unit)
 
 
-def bars(image: Path, groups: Mapping[str, Mapping[str, float]], unit: str) -> bool:
-    """Draw one bar a line of each group side by side; return whether it was drawn."""
+def lines(image: Path, panels: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]], unit: str) -> bool:
+    """Draw figures over what grows, from points of (how much, figure); return whether it was drawn."""
 
     def draw(panel: Panel, title: str, samples: Sequence[float]) -> None:
-        at = len(panel.containers)
-        panel.bar([at], samples, label=title)
-        panel.set_xticks([])
+        panel.plot(samples[::2], samples[1::2], marker="o", label=title, linewidth=1.2)
+        panel.set_xscale("log")
+        panel.set_xticks(samples[::2], [f"{step:g}" for step in samples[::2]])
+        panel.minorticks_off()
+        panel.set_ylim(bottom=0.0, auto=True)  # the next line may be higher
 
-    panels = {group: {title: [value] for title, value in values.items()} for group, values in groups.items()}
-    return _draw(image, panels, draw, unit)
+    flat = {
+        name: {title: [*itertools.chain(*points)] for title, points in series.items()}
+        for name, series in panels.items()
+    }
+    return _draw(image, flat, draw, unit)
 
 
 def _draw(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -35,14 +34,14 @@ class PeersView:
         links = {attached.link.guid: attached for attached in self._bridge.attached()}
         roster = {view.identity.guid: view for view in station.discovery.peers()}
         statuses = {status.identity.guid: status for status in station.mesh.peers()}
-        offered = Counter(peer for peer, _ in {(peer, source.topic) for peer, source, _ in self._bridge.imports})
         ours = len({source.topic for source in self._bridge.exports.offered})
         infos = []
         for guid in {*roster, *statuses, *links}:
             attached = links.get(guid)
             info = self._peer(roster.get(guid), statuses.get(guid), attached, now)
             if attached is not None:
-                info = msgspec.structs.replace(info, topics_in=offered[attached.peer], topics_out=ours)
+                theirs = len(self._bridge.imports.offered_by(attached.peer))
+                info = msgspec.structs.replace(info, topics_in=theirs, topics_out=ours)
             infos.append(info)
         return tuple(sorted(infos, key=lambda info: (info.name, info.guid)))
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from rmpa.bridge.imports import RouteState
 from rmpa.bridge.policy import Policy, is_own
 from rmpa.core.aio.clock import SystemClock
-from rmpa.core.aio.loop import breathe
+from rmpa.core.aio.loop import breathe, breathing_sorted
 from rmpa.core.contract import KEYS, Contract, Contracts
 from rmpa.monitor.snapshot import EventInfo, LatencyInfo, RouteInfo, Spread, TopicInfo
 
@@ -64,7 +64,7 @@ class TopicsView:
                 tuple(routes.get(name, ())),
                 tuple(mismatches.get(name, ())),
             )
-            for name in sorted(names)
+            for name in breathing_sorted(names)
             if wanted is None or name in wanted
         )
 

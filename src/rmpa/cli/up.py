@@ -10,6 +10,7 @@ import sys
 
 import click
 
+from rmpa.core.aio.log_writer import LogWriter
 from rmpa.core.config_sources import Flags, load_settings
 from rmpa.core.config_values import LOG_LEVELS
 from rmpa.core.log import configure_logging
@@ -81,11 +82,15 @@ def up(
         realtime,
     )
     loaded = load_settings(flags, os.environ, host_name=socket.gethostname())
-    configure_logging(loaded.settings.log_level, sys.stderr, as_json=loaded.settings.log_json)
+    writer = LogWriter(sys.stderr.fileno())
+    configure_logging(loaded.settings.log_level, writer, as_json=loaded.settings.log_json)
     for note in loaded.notes:
         _log.warning("%s", note)
     # Nothing that an import makes is garbage: a third less time until the agent is there. It is on again then.
     gc.disable()
     from rmpa.agent import run
 
-    return run(loaded.settings)
+    try:
+        return run(loaded.settings)
+    finally:
+        writer.close()

@@ -421,6 +421,12 @@ DIAGNOSTICS_QUEUE: Final = 10
 """Messages waiting for a slow reader of /diagnostics: each holds everything that the one before it did."""
 
 # --- logging --------------------------------------------------------------------------------------------------
+LOG_WAITING: Final = 10_000
+"""Lines that wait for a reader of the log who has stopped: some 1 MB. The newest are lost beyond it."""
+LOG_GATHER: Final = 0.01
+"""Lines are gathered for this long before they are written: a burst costs one system call."""
+LOG_BATCH: Final = 1000
+"""Lines in one such call."""
 LOG_INTERVAL: Final = 5.0
 """A refusal of one kind from one address is logged at most once in this time; the rest are counted."""
 LOG_LINES_MAX: Final = 20

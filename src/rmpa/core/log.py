@@ -6,7 +6,10 @@ import codecs
 import json
 import logging
 from datetime import UTC, datetime
-from typing import Final, TextIO
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
 
 # Looked up now: its module is a file, and a line about having no file descriptors left was lost for want of one.
 _ESCAPE: Final = codecs.getencoder("unicode_escape")
@@ -20,6 +23,8 @@ def room_of(logger: str) -> str:
 
 def _one_line(text: str) -> str:
     """Text from outside must not forge lines or move the terminal's cursor."""
+    if text.isprintable():
+        return text
     return "".join(c if c.isprintable() or c == "\t" else _ESCAPE(c)[0].decode("ascii") for c in text)
 
 
@@ -53,12 +58,12 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(fields, ensure_ascii=False)
 
 
-def configure_logging(level: str, stream: TextIO, *, as_json: bool) -> None:
+def configure_logging(level: str, stream: SupportsWrite[str], *, as_json: bool) -> None:
     """Send every record of ``level`` and above to ``stream``, in place of whatever was set up before.
 
     Args:
         level: As in ``Settings.log_level``.
-        stream: Usually stderr: stdout belongs to a command's answer.
+        stream: Usually stderr, for an agent by ``aio.log_writer``: stdout belongs to a command's answer.
         as_json: JSON lines instead of text.
     """
     handler = logging.StreamHandler(stream)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core.aio.loop import AgentLoop, DirectSelector, breathe, breathing
+from rmpa.core.aio.loop import AgentLoop, DirectSelector, breathe, breathing, breathing_sorted
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Iterator
@@ -323,6 +323,12 @@ def test_who_goes_through_many_things_breathes_now_and_then(pair: tuple[socket.s
         loop.remove_reader(one.fileno())
 
     run(main())
+
+
+@pytest.mark.parametrize("count", [0, 1, 255, 256, 257, 5000])
+def test_sorting_breathes_and_sorts(count: int) -> None:
+    words = [f"/{(index * 7919) % 4999}" for index in range(count)]
+    assert list(breathing_sorted(words)) == sorted(words)
 
 
 def test_breathing_elsewhere_does_nothing() -> None:

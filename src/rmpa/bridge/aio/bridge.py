@@ -7,6 +7,7 @@ import itertools
 import logging
 from collections import deque
 from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import actions as act
@@ -99,6 +100,7 @@ class Bridge:
         self._changed: dict[str, None] = {}
         self._learning: deque[tuple[Attached, bytes | Iterator[Advertise]]] = deque()
         self._learning_bytes = 0
+        self._forgetting: deque[Iterator[act.Action]] = deque()
         self._actions: deque[act.Action] = deque()
         self._acting = False
         self._mismatches: dict[Source, dict[str, str]] = {}
@@ -325,7 +327,9 @@ class Bridge:
         self._by_link.pop(attached.link, None)
         for action in self._exports.link_down(attached.peer):
             self._act([action])
-        self._imports.link_down(attached.peer)  # its actions are what closing the inbound side does at once
+        # Its actions are what closing the inbound side does at once.
+        self._forgetting.append(self._imports.link_down(attached.peer))
+        self._schedule()
         task = asyncio.create_task(attached.inbound.close(), name=f"retract {attached.inbound.prefix}")
         self._closing.add(task)
         task.add_done_callback(self._closing.discard)
@@ -373,7 +377,9 @@ class Bridge:
         self._act(self._exports.tell())
         if self._learning:
             self._learn(*self._learning.popleft())
-        if self._changed or self._learning or self._exports.untold:
+        if self._forgetting and not tuple(islice(self._forgetting[0], limits.LEARNT_AT_ONCE)):
+            self._forgetting.popleft()
+        if self._changed or self._learning or self._forgetting or self._exports.untold:
             self._schedule()
         elif self._mismatches:
             for source in [s for s in self._mismatches if s not in self._exports.offered]:

@@ -15,12 +15,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import heapq
 import logging
 import math
 import select
 import selectors
 import time
 from collections import deque
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple, cast
 
 if TYPE_CHECKING:
@@ -34,6 +36,8 @@ _EPOLL_RESOLUTION: Final = 1e-3
 _LOOK: Final = 64
 _ITEMS: Final = 64
 """Steps of some work between two breaths, of a microsecond or less each."""
+_RUN: Final = 256
+"""Items that are sorted at once, some 50 microseconds."""
 _T = TypeVar("_T")
 _Ts = TypeVarTuple("_Ts")
 _READ: Final = ~select.EPOLLOUT
@@ -263,6 +267,16 @@ def breathing(items: Iterable[_T], /, every: int = _ITEMS) -> Iterator[_T]:
         if number % every == 0:
             breathe()
         yield item
+
+
+def breathing_sorted(items: Iterable[str]) -> Iterator[str]:
+    """The same as ``sorted`` would give, without its milliseconds for thousands."""
+    rest = iter(items)
+    runs = []
+    while run := sorted(islice(rest, _RUN)):
+        runs.append(run)
+        breathe()
+    return heapq.merge(*runs)
 
 
 class _Turnstile(deque[asyncio.Handle]):

@@ -1,0 +1,75 @@
+"""Where an agent's log lines go: to a thread, so that whoever does not read them holds up nobody but the log."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections import deque
+
+from rmpa.core import limits
+
+_log = logging.getLogger(__name__)
+
+
+class LogWriter:
+    """The text stream of a log handler.
+
+    A pipe that nobody reads (a stopped pager, a hanging journal) blocks who writes to it. What then waits is bounded;
+    the newest lines are lost, and their number is said when the reader goes on.
+
+    Args:
+        fd: Where the lines go; not closed here.
+    """
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self._waiting: deque[str] = deque()
+        self._news = threading.Event()
+        self._closed = False
+        self.lost = 0
+        """Lines that were lost and not yet said to be."""
+        self._thread = threading.Thread(target=self._work, name="log", daemon=True)
+        self._thread.start()
+
+    def write(self, text: str) -> int:
+        """Take a line or more; never blocks."""
+        if len(self._waiting) >= limits.LOG_WAITING:
+            self.lost += 1
+        else:
+            self._waiting.append(text)
+            self._news.set()
+        return len(text)
+
+    def flush(self) -> None:
+        """Do nothing: the thread writes as soon as it can."""
+
+    def close(self) -> None:
+        """Wait until all is written, but no longer than ``limits.DRAIN_TIMEOUT``."""
+        self._closed = True
+        self._news.set()
+        self._thread.join(limits.DRAIN_TIMEOUT)
+
+    def _work(self) -> None:
+        while not self._closed or self._waiting:
+            self._news.wait()
+            if not self._closed:
+                time.sleep(limits.LOG_GATHER)  # one call for the lines of a burst
+            self._news.clear()
+            while self._waiting:
+                self._write()
+            if self.lost:
+                lost, self.lost = self.lost, 0
+                _log.warning("! %d log lines were lost: whoever reads the log has stopped for a while", lost)
+
+    def _write(self) -> None:
+        lines = [self._waiting.popleft() for _ in range(min(len(self._waiting), limits.LOG_BATCH))]
+        rest = memoryview("".join(lines).encode(errors="backslashreplace"))
+        while rest:
+            try:
+                rest = rest[os.write(self._fd, rest) :]
+            except BlockingIOError:
+                time.sleep(limits.LOG_GATHER)  # somebody made it non-blocking
+            except OSError:
+                return  # nobody will ever read it
