@@ -8,6 +8,7 @@ from rmpa.bridge.messages import Advertise, Close, Closed, Description, Offer, O
 from rmpa.bridge.policy import Decision, Policy
 from rmpa.core import limits
 from rmpa.core.config import PolicySettings
+from rmpa.core.contract import Contract
 
 CMD = Source("/cmd", "/joy")
 JOY = LocalSource("sensor_msgs/Joy", "http://127.0.0.1:4000/")
@@ -77,9 +78,9 @@ def test_nothing_is_connected_before_somebody_asks_and_one_connection_serves_all
     assert exports.opened(2, Open(9, "/cmd", "/joy")) == []
     assert exports.described(CMD, ABOUT) == [
         Send(1, Opened(7, ABOUT)),
-        AddRoute(CMD, 1, 7),
+        AddRoute(CMD, 1, 7, Contract()),
         Send(2, Opened(9, ABOUT)),
-        AddRoute(CMD, 2, 9),
+        AddRoute(CMD, 2, 9, Contract()),
     ]
     assert exports.flowing(CMD) == (1, 2)
     assert exports.closed(1, Close(7)) == [RemoveRoute(CMD, 1, 7)]
@@ -93,7 +94,7 @@ def test_a_late_peer_gets_the_known_description_at_once(exports: Exports) -> Non
     exports.link_up(2)
     exports.opened(1, Open(1, "/cmd", "/joy"))
     exports.described(CMD, ABOUT)
-    assert exports.opened(2, Open(1, "/cmd", "/joy")) == [Send(2, Opened(1, ABOUT)), AddRoute(CMD, 2, 1)]
+    assert exports.opened(2, Open(1, "/cmd", "/joy")) == [Send(2, Opened(1, ABOUT)), AddRoute(CMD, 2, 1, Contract())]
 
 
 @pytest.mark.parametrize("topic", ["/nothing", "/secret", "/rosout"])
@@ -158,7 +159,7 @@ def test_a_peer_gets_one_copy_of_a_source_however_often_it_asks(exports: Exports
         assert isinstance(action, Send)
         assert isinstance(action.message, Closed)
         assert action.message.route == route
-    assert exports.described(CMD, ABOUT) == [Send(1, Opened(7, ABOUT)), AddRoute(CMD, 1, 7)]
+    assert exports.described(CMD, ABOUT) == [Send(1, Opened(7, ABOUT)), AddRoute(CMD, 1, 7, Contract())]
     exports.closed(1, Close(7))
     assert exports.opened(1, Open(10, "/cmd", "/joy")) == [Connect(CMD, JOY.type, JOY.uri)]
 

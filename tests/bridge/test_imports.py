@@ -10,6 +10,7 @@ from rmpa.bridge.messages import Advertise, Close, Closed, Description, Mismatch
 from rmpa.bridge.policy import Policy
 from rmpa.core import limits
 from rmpa.core.config import PolicySettings
+from rmpa.core.contract import Contract
 
 CMD = Source("/cmd", "/joy")
 OFFER = Offer("/cmd", "/joy", "sensor_msgs/Joy")
@@ -48,7 +49,7 @@ def test_the_way_of_a_route(imports: Imports) -> None:
     imports.advertised(1, Advertise(added=(OFFER,)))
     assert imports.demand(1, CMD, 0.0, wanted=True) == [Send(1, Open(1, "/cmd", "/joy"))]
     assert imports.demand(1, CMD, 0.0, wanted=True) == []
-    assert imports.opened(1, Opened(1, ABOUT), 0.0) == [Describe(1, CMD, 1, ABOUT)]
+    assert imports.opened(1, Opened(1, ABOUT), 0.0) == [Describe(1, CMD, 1, ABOUT, Contract())]
     assert imports.demand(1, CMD, 10.0, wanted=False) == []
     assert state(imports) is RouteState.LINGERING
     assert imports.next_timer() == 10.0 + limits.ROUTE_LINGER

@@ -22,26 +22,56 @@ from rmpa.bridge.messages import (
     encode,
 )
 from rmpa.core import limits
+from rmpa.core.contract import Contract, Durability, History, Liveliness, Priority, Reliability
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 
+DEFAULT = (
+    b'"contract":{"reliability":"best_effort","durability":"volatile","history":"keep_last","depth":1000,'
+    b'"deadline":null,"lifespan":null,"liveliness":"automatic","liveliness_lease":null,"priority":"normal",'
+    b'"max_rate":null}'
+)
+STRICT = Contract(
+    Reliability.RELIABLE,
+    Durability.TRANSIENT_LOCAL,
+    History.KEEP_ALL,
+    depth=5,
+    deadline=0.5,
+    lifespan=2.0,
+    liveliness=Liveliness.MANUAL_BY_TOPIC,
+    liveliness_lease=1.0,
+    priority=Priority.HIGH,
+    max_rate=30.0,
+)
 GOLDEN: list[tuple[Message, bytes]] = [
     (
         Advertise(added=(Offer("/cmd", "/joy", "sensor_msgs/Joy"),), full=True),
         (
             b'{"op":"advertise","added":[{"topic":"/cmd","node":"/joy","type":"sensor_msgs/Joy"}],'
-            b'"removed":[],"full":true}'
+            b'"removed":[],"full":true,"more":false}'
         ),
     ),
     (
         Advertise(removed=(Source("/cmd", "/joy"),)),
-        b'{"op":"advertise","added":[],"removed":[{"topic":"/cmd","node":"/joy"}],"full":false}',
+        b'{"op":"advertise","added":[],"removed":[{"topic":"/cmd","node":"/joy"}],"full":false,"more":false}',
     ),
-    (Open(7, "/cmd", "/joy"), b'{"op":"open","route":7,"topic":"/cmd","node":"/joy"}'),
+    (
+        Open(7, "/cmd", "/joy"),
+        b'{"op":"open","route":7,"topic":"/cmd","node":"/joy",' + DEFAULT + b',"epoch":0,"after":0}',
+    ),
+    (
+        Open(7, "/cmd", "/joy", STRICT, epoch=3, after=4711),
+        (
+            b'{"op":"open","route":7,"topic":"/cmd","node":"/joy","contract":{"reliability":"reliable",'
+            b'"durability":"transient_local","history":"keep_all","depth":5,"deadline":0.5,"lifespan":2.0,'
+            b'"liveliness":"manual_by_topic","liveliness_lease":1.0,"priority":"high","max_rate":30.0},'
+            b'"epoch":3,"after":4711}'
+        ),
+    ),
     (
         Opened(7, Description("sensor_msgs/Joy", "5a9ea5f83505693b71e785041e67a8bb", "Header header\n", True)),
         (
             b'{"op":"opened","route":7,"description":{"type":"sensor_msgs/Joy","md5":"5a9ea5f83505693b71e785041e67a8bb",'
-            b'"definition":"Header header\\n","latching":true}}'
+            b'"definition":"Header header\\n","latching":true},' + DEFAULT + b',"epoch":0,"first":1}'
         ),
     ),
     (Close(7), b'{"op":"close","route":7}'),
@@ -100,6 +130,102 @@ def test_what_is_not_a_message_is_the_peers_error(wire: bytes) -> None:
         decode(wire)
 
 
+OPEN = b'{"op":"open","route":1,"topic":"/a","node":"/b"'
+OPENED = (
+    b'{"op":"opened","route":1,"description":{"type":"a/B","md5":"5a9ea5f83505693b71e785041e67a8bb",'
+    b'"definition":"","latching":false}'
+)
+
+
+@pytest.mark.parametrize("beginning", [OPEN, OPENED], ids=["open", "opened"])
+@pytest.mark.parametrize(
+    "term",
+    [
+        '"depth":0',
+        '"depth":-1',
+        '"depth":100001',
+        '"depth":1e3',
+        '"depth":18446744073709551616',
+        '"depth":null',
+        '"deadline":0',
+        '"deadline":-1.5',
+        '"deadline":0.0009',
+        '"deadline":86401',
+        '"deadline":1e308',
+        '"deadline":1e999',
+        '"deadline":-1e999',
+        '"deadline":NaN',
+        '"deadline":Infinity',
+        '"deadline":"1"',
+        '"lifespan":0',
+        '"lifespan":5e-324',
+        '"lifespan":1e300',
+        '"lifespan":nan',
+        '"liveliness_lease":-0.0',
+        '"liveliness_lease":1e99',
+        '"liveliness_lease":-Infinity',
+        '"max_rate":0',
+        '"max_rate":-30',
+        '"max_rate":5e-324',
+        '"max_rate":0.0009',
+        '"max_rate":1e7',
+        '"max_rate":1e999',
+        '"max_rate":NaN',
+        '"max_rate":true',
+        '"reliability":"sometimes"',
+        '"durability":0',
+        '"history":"RELIABLE"',
+        '"liveliness":null',
+        '"priority":"urgent"',
+    ],
+)
+def test_a_contract_that_no_file_could_have_is_the_peers_error(beginning: bytes, term: str) -> None:
+    with pytest.raises(RemoteProtocolError):
+        decode(beginning + b',"contract":{' + term.encode() + b"}}")
+
+
+@pytest.mark.parametrize(
+    "term",
+    [
+        '"depth":1',
+        '"depth":100000',
+        '"deadline":0.001',
+        '"deadline":86400',
+        '"lifespan":null',
+        '"max_rate":0.001',
+        '"max_rate":1e6',
+        '"later_version":1e999',
+    ],
+)
+def test_a_contract_at_its_bounds_is_taken(term: str) -> None:
+    message = decode(OPEN + b',"contract":{' + term.encode() + b"}}")
+    assert isinstance(message, Open)
+    assert decode(encode(message)) == message
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        OPEN + b',"epoch":-1',
+        OPEN + b',"epoch":4294967296',
+        OPEN + b',"epoch":1,"after":-1',
+        OPEN + b',"epoch":1,"after":4294967296',
+        OPEN + b',"epoch":1,"after":1e999',
+        OPENED + b',"epoch":4294967296',
+        OPENED + b',"epoch":1,"first":-1',
+        OPENED + b',"epoch":1,"first":4294967296',
+        OPENED + b',"epoch":null',
+    ],
+)
+def test_numberings_have_32_bits(numbers: bytes) -> None:
+    with pytest.raises(RemoteProtocolError):
+        decode(numbers + b"}")
+
+
+def test_a_peer_of_before_contracts_gets_the_default_one() -> None:
+    assert decode(OPEN + b"}") == Open(1, "/a", "/b", Contract(), epoch=0, after=0)
+
+
 def test_a_message_beyond_the_limit_is_not_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "CONTROL_PAYLOAD_MAX", 10)
     with pytest.raises(LimitExceeded, match="control message of 24 bytes"):
@@ -121,18 +247,37 @@ _names = st.from_regex(r"/[a-z][a-z0-9_]{0,8}(/[a-z][a-z0-9_]{0,8}){0,3}", fullm
 _types = st.from_regex(r"[a-z][a-z_]{0,8}/[A-Z][A-Za-z]{0,8}", fullmatch=True)
 _md5s = st.from_regex(r"[0-9a-f]{32}", fullmatch=True)
 _routes = st.integers(1, (1 << 32) - 1)
+_numbers = st.integers(0, (1 << 32) - 1)
+_times = st.none() | st.floats(limits.CONTRACT_TIME_MIN, limits.CONTRACT_TIME_MAX)
+_contracts = st.builds(
+    Contract,
+    st.sampled_from(Reliability),
+    st.sampled_from(Durability),
+    st.sampled_from(History),
+    st.integers(1, limits.CONTRACT_DEPTH_MAX),
+    _times,
+    _times,
+    st.sampled_from(Liveliness),
+    _times,
+    st.sampled_from(Priority),
+    st.none() | st.floats(limits.CONTRACT_RATE_MIN, limits.CONTRACT_RATE_MAX),
+)
 _messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(
         Advertise,
         added=st.lists(st.builds(Offer, _names, _names, _types), max_size=5).map(tuple),
         removed=st.lists(st.builds(Source, _names, _names), max_size=5).map(tuple),
         full=st.booleans(),
+        more=st.booleans(),
     ),
-    st.builds(Open, _routes, _names, _names),
+    st.builds(Open, _routes, _names, _names, _contracts, _numbers, _numbers),
     st.builds(
         Opened,
         _routes,
         st.builds(Description, _types, _md5s, st.text(st.characters(max_codepoint=255)), st.booleans()),
+        _contracts,
+        _numbers,
+        _numbers,
     ),
     st.builds(Close, _routes),
     st.builds(Closed, _routes, st.text()),

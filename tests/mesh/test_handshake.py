@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.guid import Guid
-from rmpa.mesh.handshake import HandshakeError, Hello, KnownLink, Refusal, Refuse, judge, judge_welcome
+from rmpa.mesh.handshake import HandshakeError, Hello, KnownLink, Lane, Refusal, Refuse, judge, judge_welcome
 from tests.mesh.worlds import HIGH, LOW
 
 if TYPE_CHECKING:
@@ -73,7 +73,12 @@ REFUSED: list[tuple[Hello, list[KnownLink], Refusal, str]] = [
     (hello_of(replace(HIGH, instance=b"x" * 16)), [], Refusal.DUPLICATE, "--port"),
     (hello_of(LOW), [GHOST], Refusal.DUPLICATE, "--port"),
     (hello_of(LOW, Guid.of("10.0.0.9", 9)), [], Refusal.WRONG_PEER, "changed hands"),
-    (replace(hello_of(LOW), lane=2), [], Refusal.LANE, "same release"),
+    (replace(hello_of(LOW), lane=3), [], Refusal.LANE, "same release"),
+    (replace(hello_of(LOW), lane=0), [], Refusal.LANE, "same release"),
+    (replace(hello_of(LOW), lane=2), [], Refusal.NO_EXPRESS, "belongs to an express one"),
+    (replace(hello_of(LOW), lane=2), [GHOST], Refusal.NO_EXPRESS, "belongs to an express one"),
+    (replace(hello_of(LOW), lane=2), [replace(GHOST, alive=False)], Refusal.NO_EXPRESS, "belongs to an express one"),
+    (replace(hello_of(replace(LOW, domain=3)), lane=2), [], Refusal.DOMAIN, "--domain"),
 ]
 
 
@@ -83,6 +88,16 @@ def test_refused(hello: Hello, links: list[KnownLink], code: Refusal, advice: st
     assert verdict is not None
     assert verdict.code == code
     assert advice in verdict.text
+
+
+@pytest.mark.parametrize("dialled", [False, True])
+@pytest.mark.parametrize("alive", [False, True])
+def test_a_bulk_lane_is_welcome_beside_its_express_lane_whoever_dialled_that(dialled: bool, alive: bool) -> None:
+    there = KnownLink(LOW.guid, LOW.instance, dialled=dialled, alive=alive)
+    assert judge(replace(hello_of(LOW), lane=Lane.BULK), HIGH, [there]) is None
+    assert judge(replace(hello_of(LOW), lane=Lane.BULK), HIGH, [there], busy=True) is None
+    mirrored = KnownLink(HIGH.guid, HIGH.instance, dialled=dialled, alive=alive)
+    assert judge(replace(hello_of(HIGH), lane=Lane.BULK), LOW, [mirrored]) is None
 
 
 def test_busy_only_for_strangers() -> None:

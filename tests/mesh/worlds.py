@@ -1,4 +1,4 @@
-"""Peers, links in pairs and a scheduler that tries every interleaving, for the tests of this room."""
+"""Peers, links in pairs and what comes on them, for the tests of this room."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from dataclasses import dataclass, field
 
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
-from rmpa.mesh.link import Event, Link, Role
+from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.mesh.handshake import Lane
+from rmpa.mesh.link import Event, Link, Role, State
 
 LOW = Identity(Guid.of("10.0.0.1", 40001, 1), b"L" * 16, "low")
 HIGH = Identity(Guid.of("10.0.0.2", 40002, 1), b"H" * 16, "high")
@@ -21,9 +23,27 @@ class Side:
     link: Link
     events: list[Event] = field(default_factory=list)
     data: list[tuple[int, int, int, bytes]] = field(default_factory=list)
+    parts: list[tuple[int, int, int, int, bytes]] = field(default_factory=list)
 
     def last(self) -> Event:
         return self.events[-1]
+
+    def messages(self) -> list[tuple[int, int, int, bytes]]:
+        """What came in parts, put together; every part must have its place."""
+        whole: list[tuple[int, int, int, bytes]] = []
+        begun: dict[int, tuple[int, int, bytes]] = {}
+        for route, sequence, stamp, flags, part in self.parts:
+            if flags & FIRST:
+                assert route not in begun
+                begun[route] = (sequence, stamp, b"")
+            assert begun[route][:2] == (sequence, stamp)
+            begun[route] = (sequence, stamp, begun[route][2] + part)
+            if flags & LAST:
+                message = (route, *begun.pop(route))
+                if not flags & ABORT:
+                    whole.append(message)
+        assert not begun
+        return whole
 
 
 class Time:
@@ -37,9 +57,18 @@ class Time:
         return WALL + round(self.now * 1e9) + self.offset_ns
 
 
-def side(role: Role, ours: Identity, time: Time, *, expected: Guid | None = None, lease: float = 1.0) -> Side:
+def side(
+    role: Role,
+    ours: Identity,
+    time: Time,
+    *,
+    expected: Guid | None = None,
+    lease: float = 1.0,
+    lane: Lane = Lane.EXPRESS,
+) -> Side:
     events: list[Event] = []
     data: list[tuple[int, int, int, bytes]] = []
+    parts: list[tuple[int, int, int, int, bytes]] = []
     link = Link(
         role,
         ours,
@@ -47,10 +76,12 @@ def side(role: Role, ours: Identity, time: Time, *, expected: Guid | None = None
         wall_ns=time.wall_ns,
         on_event=events.append,
         on_data=lambda route, seq, stamp, view: data.append((route, seq, stamp, bytes(view))),
+        on_part=lambda route, seq, stamp, flags, view: parts.append((route, seq, stamp, flags, bytes(view))),
         expected=expected,
+        lane=lane,
         lease=lease,
     )
-    return Side(link, events, data)
+    return Side(link, events, data, parts)
 
 
 def deliver(data: bytes, target: Link, now: float, chunk: int = 1 << 30) -> None:
@@ -60,3 +91,21 @@ def deliver(data: bytes, target: Link, now: float, chunk: int = 1 << 30) -> None
         kept += data[start : start + chunk]
         consumed, _ = target.receive(memoryview(kept), now)
         kept = kept[consumed:]
+
+
+def pair(time: Time, *, lease: float = 1.0, lane: Lane = Lane.EXPRESS) -> tuple[Side, Side]:
+    """A dialler and an acceptor, both up."""
+    dialler = side(Role.DIALLER, LOW, time, expected=HIGH.guid, lease=lease, lane=lane)
+    acceptor = side(Role.ACCEPTOR, HIGH, time, lease=lease)
+    deliver(dialler.link.take_output(), acceptor.link, time.now)
+    acceptor.link.accept(time.now)
+    exchange(dialler, acceptor, time)
+    assert dialler.link.state is State.UP
+    assert acceptor.link.state is State.UP
+    return dialler, acceptor
+
+
+def exchange(one: Side, other: Side, time: Time, chunk: int = 1 << 30) -> None:
+    while one.link.has_output or other.link.has_output:
+        deliver(one.link.take_output(), other.link, time.now, chunk)
+        deliver(other.link.take_output(), one.link, time.now, chunk)

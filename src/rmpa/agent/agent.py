@@ -24,6 +24,7 @@ from rmpa.core.aio.loop import AgentLoop
 from rmpa.core.aio.notify import notify_service_manager
 from rmpa.core.aio.sockets import raise_file_limit
 from rmpa.core.config_values import did_you_mean
+from rmpa.core.contract import Contracts
 from rmpa.core.counters import Counters
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
 from rmpa.monitor.aio.control_server import ControlServer
@@ -54,7 +55,9 @@ class Agent:
             {"snapshot": self._snapshot, "ping": self._ping},
         )
         self.core = RosCore(settings.core_host, settings.core_port)
-        self.bridge = Bridge(self.core, Policy(settings.policy), rng=random.random)
+        self.bridge = Bridge(
+            self.core, Policy(settings.policy), rng=random.random, contracts=Contracts(settings.contracts)
+        )
         self.station: Station | None = None
         self._moving: asyncio.Task[None] | None = None
         counters = Counters()

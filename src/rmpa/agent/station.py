@@ -19,6 +19,7 @@ from rmpa.core.identity import Identity
 from rmpa.discovery.aio.interfaces import choose, further_addresses, list_interfaces, pick_address
 from rmpa.discovery.aio.service import Discovery
 from rmpa.discovery.events import Conflict, PeerChanged, PeerFound, PeerLost, PeerRestarted
+from rmpa.mesh.aio.link import Takers
 from rmpa.mesh.aio.mesh import Mesh
 
 if TYPE_CHECKING:
@@ -73,7 +74,8 @@ class Station:
             on_link_up=self._link_up,
             on_link_down=self._link_down,
             on_control=bridge.control,
-            on_data=bridge.data,
+            takers=Takers(bridge.data, bridge.part, bridge.mark, bridge.clock, bridge.lane_lost),
+            lanes=settings.lanes,
             clock=clock,
         )
         self.discovery = Discovery(

@@ -89,6 +89,6 @@ class PeersView:
             bytes_in=link.bytes_in,
             bytes_out=link.bytes_out,
             queued=link.queue_bytes,
-            dropped=link.dropped.total(),
+            dropped=link.dropped,
             heard_ago=now - link.heard_at,
         )

@@ -10,7 +10,7 @@ from rmpa.bridge.policy import Policy, is_own
 from rmpa.core.aio.clock import SystemClock
 from rmpa.core.aio.loop import breathe, breathing_sorted
 from rmpa.core.contract import KEYS, Contract, Contracts
-from rmpa.monitor.snapshot import LatencyInfo, RouteInfo, Spread, TopicInfo
+from rmpa.monitor.snapshot import EventInfo, LatencyInfo, RouteInfo, Spread, TopicInfo
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -93,7 +93,7 @@ class TopicsView:
 
     def _inbound(self, wanted: Collection[str] | None) -> Iterator[tuple[Source, RouteInfo, list[str]]]:
         """Each source of a peer, its route, and what did not fit it."""
-        attached = {at.peer: at for at in self._bridge.attached()}
+        attached = {at.peer: at for at in self._bridge.everyone()}
         clocks = {at.peer: (at.link.clock_offset, at.link.clock_error) for at in attached.values()}
         for peer, source, entry in list(self._bridge.imports):
             if wanted is not None and source.topic not in wanted:
@@ -123,6 +123,16 @@ class TopicsView:
             bytes=quality.bytes if quality else 0,
             dropped=publication.dropped if publication else 0,
             lost=flow.lost if flow else 0,
+            late=flow.late + flow.stale if flow else 0,
+            expired=flow.expired if flow else 0,
+            lane=flow.lane if flow else "",
+            events={kind.value: count for kind, count in flow.watch.counts.items()} if flow else {},
+            recent=tuple(
+                EventInfo(kind=event.kind.value, count=event.count, text=event.text, ago=now - event.now)
+                for event in flow.watch.recent
+            )
+            if flow
+            else (),
             age=quality.age if quality else None,
             rate=_known(quality.rate) if quality else None,
             bandwidth=_known(quality.bandwidth) if quality else None,
@@ -130,7 +140,7 @@ class TopicsView:
             jitter=_known(quality.jitter) if quality else None,
             latency=_latency(quality) if quality else None,
             latched=latched,
-            contract=_contract(self._contracts.of(source.topic, entry.type)),
+            contract=_contract(entry.contract or self._contracts.of(source.topic, entry.type)),
             problem=entry.hidden or (entry.problem if entry.state is not RouteState.OPEN else ""),
         )
 
@@ -143,13 +153,15 @@ class TopicsView:
             breathe()
             yield source, None, list(self._bridge.mismatches(source))
             for peer in list(self._bridge.exports.flowing(source)):
-                yield source, self._export(source, local, names.get(peer, "")), []
+                yield source, self._export(source, local, peer, names.get(peer, "")), []
 
-    def _export(self, source: Source, local: LocalSource, peer: str) -> RouteInfo:
+    def _export(self, source: Source, local: LocalSource, peer: int, name: str) -> RouteInfo:
         about = self._bridge.exports.description(source)
         flow = self._bridge.outbound.flows.get(source)
+        leg = flow.by_peer.get(peer) if flow else None
+        contract = self._bridge.exports.contract(source, peer)
         return RouteInfo(
-            peer=peer,
+            peer=name,
             node=source.node,
             direction="out",
             state="open",
@@ -159,7 +171,8 @@ class TopicsView:
             bytes=flow.bytes if flow else 0,
             dropped=flow.dropped if flow else 0,
             latched=about.latching if about else False,
-            contract=_contract(self._contracts.of(source.topic, local.type)),
+            lane=leg.lane if leg else "",
+            contract=_contract(contract or self._contracts.of(source.topic, local.type)),
         )
 
 

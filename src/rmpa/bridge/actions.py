@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rmpa.bridge.messages import Description, Message, Source
+    from rmpa.core.contract import Contract
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +42,24 @@ class Disconnect:
 
 @dataclass(frozen=True, slots=True)
 class AddRoute:
-    """Send a source's messages to a peer from now on; first its latched one, where there is one."""
+    """Send a source's messages to a peer from now on; first its latched one, where there is one.
+
+    Args:
+        source: Which.
+        peer: To whom.
+        route: The route's id.
+        contract: What holds for it.
+        epoch: Names the numbering of a reliable route.
+        after: The peer has all up to this message of the epoch already, and a suspended route goes on; ``None``: a
+            new one.
+    """
 
     source: Source
     peer: int
     route: int
+    contract: Contract
+    epoch: int = 0
+    after: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +69,14 @@ class RemoveRoute:
     source: Source
     peer: int
     route: int
+
+
+@dataclass(frozen=True, slots=True)
+class SuspendRoute:
+    """The peer's link is gone; keep what it has not acknowledged, and what comes, until it is back or given up."""
+
+    source: Source
+    peer: int
 
 
 # --- inbound: from a peer to the local graph -------------------------------------------------------------------
@@ -85,15 +107,26 @@ class Describe:
     source: Source
     route: int
     description: Description
+    contract: Contract
+    epoch: int = 0
+    first: int = 1
 
 
 @dataclass(frozen=True, slots=True)
 class Detach:
-    """No more data comes on this route; forget the latched message (a new route brings it again)."""
+    """No more data comes on this route; forget the latched message (a new route brings it again).
+
+    Args:
+        peer: Whose.
+        source: Which.
+        route: The route's id.
+        keep: The link is gone, and a new one will go on behind the last message that came.
+    """
 
     peer: int
     source: Source
     route: int
+    keep: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,4 +138,6 @@ class Warn:
     text: str
 
 
-Action = Send | Connect | Disconnect | AddRoute | RemoveRoute | Publish | Retract | Describe | Detach | Warn
+Outgoing = Connect | Disconnect | AddRoute | SuspendRoute | RemoveRoute
+Incoming = Publish | Retract | Describe | Detach
+Action = Send | Outgoing | Incoming | Warn

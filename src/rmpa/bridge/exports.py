@@ -9,7 +9,8 @@ A source is connected while at least one peer wants it::
       ▲               │ refused, lost          │ lost, restarted, gone
       └───────────────┴────────────────────────┘  every route of it: Closed(reason)
 
-Who lost a route asks again: the one that wants the data is the one that retries.
+Who lost a route asks again: the one that wants the data is the one that retries. A reliable route outlives its
+link: it is suspended, its source stays connected, and the peer's next ``Open`` goes on where it was (``link_away``).
 
 A change of the graph costs what changed, however large the graph is; what peers are to hear of it is gathered, and
 told a bounded number of sources at a time.
@@ -21,7 +22,9 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Final
 
-from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, Warn
+import msgspec
+
+from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, SuspendRoute, Warn
 from rmpa.bridge.messages import (
     Advertise,
     Close,
@@ -35,6 +38,7 @@ from rmpa.bridge.messages import (
     is_crossing_type,
 )
 from rmpa.core import limits
+from rmpa.core.contract import Contract, Contracts, Durability, Reliability, combine
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -51,13 +55,36 @@ class LocalSource:
 
 
 @dataclass(slots=True)
+class _Route:
+    """One peer's wish for a source.
+
+    Args:
+        contract: What holds for it.
+        live: Whether data goes there yet.
+        epoch: Of a reliable route, else 0.
+        after: Where a suspended one goes on.
+    """
+
+    contract: Contract
+    live: bool = False
+    epoch: int = 0
+    after: int | None = None
+
+
+@dataclass(slots=True)
 class _Flow:
     """A source that some peer wants."""
 
     uri: str
-    routes: dict[tuple[int, int], bool] = field(default_factory=dict)
-    """(peer, route), and whether data goes there yet."""
+    routes: dict[tuple[int, int], _Route] = field(default_factory=dict)
+    """By (peer, route)."""
+    away: dict[int, _Route] = field(default_factory=dict)
+    """Suspended, by peer."""
     description: Description | None = None
+
+    @property
+    def wanted(self) -> bool:
+        return bool(self.routes or self.away)
 
 
 @dataclass(slots=True)
@@ -80,10 +107,12 @@ class _Peer:
     Args:
         news: Sources that it is to hear of, and the type by which it knows each, empty if it does not.
         routes: What it has open.
+        beginning: Whether it has not heard everything once yet.
     """
 
     news: dict[Source, str]
     routes: dict[int, Source] = field(default_factory=dict)
+    beginning: bool = True
 
 
 _NOTHING: Final = _Topic({})
@@ -94,10 +123,13 @@ class Exports:
 
     Args:
         policy: What may cross.
+        contracts: What our side promises.
     """
 
-    def __init__(self, policy: Policy) -> None:
+    def __init__(self, policy: Policy, contracts: Contracts | None = None) -> None:
         self._policy = policy
+        self._contracts = contracts if contracts is not None else Contracts()
+        self._epochs = 0
         self._topics: dict[str, _Topic] = {}
         self._local: dict[Source, LocalSource] = {}
         self._too_many: dict[Source, LocalSource] = {}
@@ -112,7 +144,12 @@ class Exports:
     def flowing(self, source: Source) -> tuple[int, ...]:
         """The peers that a source goes to now."""
         flow = self._flows.get(source)
-        return tuple(peer for (peer, _), live in flow.routes.items() if live) if flow else ()
+        return tuple(peer for (peer, _), route in flow.routes.items() if route.live) if flow else ()
+
+    def contract(self, source: Source, peer: int) -> Contract | None:
+        """What holds for a source's route to a peer, while there is one."""
+        flow = self._flows.get(source)
+        return next((route.contract for (p, _), route in flow.routes.items() if p == peer), None) if flow else None
 
     def description(self, source: Source) -> Description | None:
         """What is known of a source's messages, while it flows."""
@@ -194,7 +231,8 @@ class Exports:
         """One message for each peer that has not heard everything; call again while ``untold``."""
         actions: list[Action] = []
         for number, peer in self._peers.items():
-            if peer.news and ((message := self._next(peer)).added or message.removed):
+            begins = peer.beginning
+            if peer.news and ((message := self._next(peer)).added or message.removed or begins is not message.more):
                 actions.append(Send(number, message))
         return actions
 
@@ -207,7 +245,8 @@ class Exports:
                 removed.append(source)
             elif local is not None and local.type != known:
                 added.append(Offer(source.topic, source.node, local.type))
-        return Advertise(added=tuple(added), removed=tuple(removed), full=full)
+        peer.beginning = peer.beginning and bool(peer.news)
+        return Advertise(added=tuple(added), removed=tuple(removed), full=full, more=peer.beginning)
 
     def link_up(self, peer: int) -> list[Action]:
         """A link is up: begin to tell all we have; ``tell`` goes on with it."""
@@ -215,12 +254,38 @@ class Exports:
         return [Send(peer, self._next(new, full=True))]
 
     def link_down(self, peer: int) -> list[Action]:
-        """A link is gone, and all its routes."""
+        """A peer is gone for good, and all its routes, suspended ones too."""
         actions: list[Action] = []
         gone = self._peers.pop(peer, None)
         for route, source in gone.routes.items() if gone is not None else ():
             actions += self._remove(source, peer, route)
+        for source, flow in list(self._flows.items()):
+            if flow.away.pop(peer, None) is not None:
+                actions += [RemoveRoute(source, peer, 0), *self._disconnect(source, flow)]
         return actions
+
+    def link_away(self, peer: int) -> tuple[list[Action], bool]:
+        """A link is gone, but its peer may come back.
+
+        Returns:
+            What to do, and whether a reliable route waits for the peer: if none does, ``link_down`` it.
+        """
+        actions: list[Action] = []
+        gone = self._peers.pop(peer, None)
+        for number, source in gone.routes.items() if gone is not None else ():
+            flow = self._flows.get(source)
+            route = flow.routes.get((peer, number)) if flow is not None else None
+            if flow is None or route is None or not (route.live and route.epoch):
+                actions += self._remove(source, peer, number)
+                continue
+            del flow.routes[peer, number]
+            flow.away[peer] = route
+            actions.append(SuspendRoute(source, peer))
+        return actions, self.waits_for(peer)
+
+    def waits_for(self, peer: int) -> bool:
+        """Whether a reliable route waits for a peer without a link."""
+        return any(peer in flow.away for flow in self._flows.values())
 
     def opened(self, peer: int, message: Open) -> list[Action]:
         """A peer asks for a source."""
@@ -240,14 +305,25 @@ class Exports:
             # One copy a peer: more would let it multiply what we send at will.
             return [Send(peer, Closed(message.route, f"{source} is open on another route of this link"))]
         routes[message.route] = source
+        route = self._route(message, local, flow.away.pop(peer, None) if flow is not None else None)
         if flow is None:
             flow = self._flows[source] = _Flow(local.uri)
-            flow.routes[peer, message.route] = False
+            flow.routes[peer, message.route] = route
             return [Connect(source, local.type, local.uri)]
-        flow.routes[peer, message.route] = False
+        flow.routes[peer, message.route] = route
         if flow.description is None:
             return []
         return self._start(source, flow, flow.description)
+
+    def _route(self, message: Open, local: LocalSource, away: _Route | None) -> _Route:
+        """The wish of a peer; it goes on where a suspended one was if it names that one's epoch."""
+        contract = combine(self._contracts.of(message.topic, local.type), message.contract)
+        if contract.reliability is not Reliability.RELIABLE:
+            return _Route(contract)
+        if away is not None and away.epoch == message.epoch:
+            return _Route(contract, epoch=away.epoch, after=message.after)
+        self._epochs += 1
+        return _Route(contract, epoch=self._epochs)
 
     def closed(self, peer: int, message: Close) -> list[Action]:
         """A peer wants no more of a route; one that is not open is none of our worry (it crossed ours)."""
@@ -268,33 +344,45 @@ class Exports:
 
     def _start(self, source: Source, flow: _Flow, description: Description) -> list[Action]:
         actions: list[Action] = []
-        for (peer, route), live in flow.routes.items():
-            if not live:
-                flow.routes[peer, route] = True
-                actions += [Send(peer, Opened(route, description)), AddRoute(source, peer, route)]
+        for (peer, number), route in flow.routes.items():
+            if route.live:
+                continue
+            route.live = True
+            about = description
+            if route.contract.durability is Durability.TRANSIENT_LOCAL and not about.latching:
+                about = msgspec.structs.replace(about, latching=True)
+            actions += [
+                Send(peer, Opened(number, about, route.contract, route.epoch)),
+                AddRoute(source, peer, number, route.contract, route.epoch, route.after),
+            ]
         return actions
 
     def _remove(self, source: Source, peer: int, route: int) -> list[Action]:
         flow = self._flows.get(source)
         if flow is None:
             return []
-        live = flow.routes.pop((peer, route), False)
-        actions: list[Action] = [RemoveRoute(source, peer, route)] if live else []
-        if not flow.routes:
-            del self._flows[source]
-            actions.append(Disconnect(source))
-        return actions
+        gone = flow.routes.pop((peer, route), None)
+        actions: list[Action] = [RemoveRoute(source, peer, route)] if gone is not None and gone.live else []
+        return actions + self._disconnect(source, flow)
+
+    def _disconnect(self, source: Source, flow: _Flow) -> list[Action]:
+        """Leave a source that nobody wants any more."""
+        if flow.wanted:
+            return []
+        del self._flows[source]
+        return [Disconnect(source)]
 
     def _end(self, source: Source, reason: str, *, connected: bool = True) -> list[Action]:
         flow = self._flows.pop(source, None)
         if flow is None:
             return []
         actions: list[Action] = []
-        for (peer, route), live in flow.routes.items():
-            self._peers[peer].routes.pop(route, None)
-            if live:
-                actions.append(RemoveRoute(source, peer, route))
-            actions.append(Send(peer, Closed(route, reason)))
+        actions += [RemoveRoute(source, peer, 0) for peer in flow.away]
+        for (peer, number), route in flow.routes.items():
+            self._peers[peer].routes.pop(number, None)
+            if route.live:
+                actions.append(RemoveRoute(source, peer, number))
+            actions.append(Send(peer, Closed(number, reason)))
         if connected:
             actions.append(Disconnect(source))
         return actions

@@ -25,6 +25,7 @@ from rmpa.bridge.actions import Action, Describe, Detach, Publish, Retract, Send
 from rmpa.bridge.messages import Advertise, Close, Closed, Mismatch, Offer, Open, Opened, Source
 from rmpa.core import limits
 from rmpa.core.backoff import Backoff
+from rmpa.core.contract import Contract, Contracts, Reliability
 from rmpa.core.errors import LocalProtocolError
 
 if TYPE_CHECKING:
@@ -75,6 +76,7 @@ class Import:
         description: What its messages are, once known.
         problem: Why the last attempt failed, or empty.
         wanted: Whether somebody local listens.
+        contract: What holds for its route, once it was open.
         serial: Of the timer.
     """
 
@@ -89,12 +91,20 @@ class Import:
     description: Description | None = None
     problem: str = ""
     wanted: bool = False
+    contract: Contract | None = None
     serial: int = 0
+
+
+def _nothing(_peer: int, _source: Source) -> None:
+    """Nothing outlives its link."""
+
+
+_LISTENED: Final = frozenset({RouteState.OPENING, RouteState.OPEN, RouteState.WAITING})
 
 
 @dataclass(slots=True)
 class _Peer:
-    """What came over one link.
+    """What came over one link, or over the links of one instance.
 
     Args:
         sources: What it offers.
@@ -102,6 +112,8 @@ class _Peer:
         routes: Those that were asked for or are open.
         next_route: The next one's id.
         nodes: How many sources each of its nodes has.
+        away: Whether it has no link, and may come back.
+        doubtful: What it offered over its last link and has not offered again since.
     """
 
     sources: dict[Source, Import] = field(default_factory=dict)
@@ -109,6 +121,8 @@ class _Peer:
     routes: dict[int, Source] = field(default_factory=dict)
     next_route: int = 1
     nodes: Counter[str] = field(default_factory=Counter)
+    away: bool = False
+    doubtful: set[Source] = field(default_factory=set)
 
 
 class Imports:
@@ -117,11 +131,21 @@ class Imports:
     Args:
         policy: What may cross; the receiving side judges too.
         rng: Uniform numbers in [0, 1) for the back-off's jitter.
+        contracts: What our side asks for.
+        position: ``(peer, source)``: epoch and last message of a reliable route that outlived its link, or ``None``.
     """
 
-    def __init__(self, policy: Policy, rng: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        policy: Policy,
+        rng: Callable[[], float],
+        contracts: Contracts | None = None,
+        position: Callable[[int, Source], tuple[int, int] | None] = _nothing,
+    ) -> None:
         self._policy = policy
         self._rng = rng
+        self._contracts = contracts if contracts is not None else Contracts()
+        self._position = position
         self._peers: dict[int, _Peer] = {}
         self._local_types: dict[str, str] = {}
         # (when, serial, peer, source); what no longer is an entry's timer is passed over.
@@ -168,12 +192,51 @@ class Imports:
         return actions
 
     def link_up(self, peer: int) -> list[Action]:
-        """A link is up; its first message will be a full advertisement."""
-        self._peers[peer] = _Peer()
+        """A link is up, perhaps of a peer that was away; its first message begins a full advertisement."""
+        known = self._peers.setdefault(peer, _Peer())
+        known.away = False
+        known.routes = {}
+        known.next_route = 1
         return []
 
+    def link_away(self, peer: int, *, briefly: bool = False) -> tuple[list[Action], bool]:
+        """A link is gone, but its peer may come back: what does not need a reliable route leaves the local graph.
+
+        Args:
+            peer: Whose.
+            briefly: Nothing leaves yet: the link fell silent, and most of those are back at once. Called again
+                without this when the time is over.
+
+        Returns:
+            What to do, and whether something waits for the peer: if nothing does, ``link_down`` it.
+        """
+        actions: list[Action] = []
+        known = self._peers[peer]
+        known.away = True
+        known.routes = {}
+        for source, entry in list(known.sources.items()):
+            reliable = entry.contract is not None and entry.contract.reliability is Reliability.RELIABLE
+            keep = briefly or (reliable and entry.wanted and entry.state in _LISTENED)
+            if entry.route:
+                actions.append(Detach(peer, source, entry.route, keep=keep))
+            entry.route = 0
+            if keep:
+                self._suspend(peer, source, entry)
+            else:
+                actions += self._drop(peer, source, entry)
+        return actions, bool(known.sources)
+
+    def _suspend(self, peer: int, source: Source, entry: Import) -> None:
+        """Bring an entry into a state without a link."""
+        entry.problem = "its peer is away"
+        if entry.state is RouteState.LINGERING:
+            self._move(peer, source, entry, RouteState.IDLE)
+        elif entry.state in {RouteState.OPEN, RouteState.OPENING}:
+            self._move(peer, source, entry, RouteState.WAITING)
+        entry.timer = None
+
     def link_down(self, peer: int) -> Iterator[Action]:
-        """A link is gone: all that came over it leaves the local graph.
+        """A peer is gone for good: all that came from it leaves the local graph.
 
         It is forgotten at once; to take the actions frees what it was made of, which takes long for thousands.
         """
@@ -182,16 +245,20 @@ class Imports:
 
     def portions(self, peer: int, message: Advertise) -> Iterator[Advertise]:
         """The same as an advertisement says, in portions that ``advertised`` deals with in a moment."""
+        known = self._peers[peer]
         removed = message.removed
         if message.full:
-            offered = {offer.source for offer in message.added}
-            removed += tuple(source for source in self._peers[peer].sources if source not in offered)
+            known.doubtful = set(known.sources)
+        known.doubtful.difference_update(offer.source for offer in message.added)
+        if known.doubtful and not message.more:
+            removed += tuple(sorted(known.doubtful))
+            known.doubtful = set()
         for begin in range(0, len(removed), limits.LEARNT_AT_ONCE):
             yield Advertise(removed=removed[begin : begin + limits.LEARNT_AT_ONCE])
         for begin in range(0, len(message.added), limits.LEARNT_AT_ONCE):
             yield Advertise(added=message.added[begin : begin + limits.LEARNT_AT_ONCE])
 
-    def advertised(self, peer: int, message: Advertise) -> list[Action]:
+    def advertised(self, peer: int, message: Advertise, now: float = 0.0) -> list[Action]:
         """A peer says what it publishes."""
         known = self._peers[peer].sources
         removed = list(message.removed)
@@ -202,7 +269,7 @@ class Imports:
         for source in removed:
             actions += self._forget(peer, source)
         for offer in message.added:
-            actions += self._learn(peer, offer)
+            actions += self._learn(peer, offer, now)
         return actions
 
     def opened(self, peer: int, message: Opened, now: float) -> list[Action]:
@@ -220,7 +287,9 @@ class Imports:
         entry.problem = ""
         entry.backoff.reset()
         entry.description = message.description
-        return [Describe(peer, source, message.route, message.description)]
+        entry.contract = message.contract
+        terms = (message.contract, message.epoch, message.first)
+        return [Describe(peer, source, message.route, message.description, *terms)]
 
     def closed(self, peer: int, message: Closed, now: float) -> list[Action]:
         """The other side has no such route, or no longer."""
@@ -286,13 +355,16 @@ class Imports:
         entry = self.get(peer, source)
         return entry is not None and entry.timer == when and entry.serial == serial
 
-    def _learn(self, peer: int, offer: Offer) -> list[Action]:
+    def _learn(self, peer: int, offer: Offer, now: float) -> list[Action]:
         known = self._peers[peer].sources
         source = offer.source
         actions: list[Action] = []
         if source in known:
-            if known[source].type == offer.type:
-                return []
+            entry = known[source]
+            if entry.type == offer.type:
+                # It was offered over a link before this one: ask again for what that took away.
+                waits = entry.state is RouteState.WAITING and entry.timer is None
+                return self._open(peer, source, entry, now) if waits else []
             actions += self._forget(peer, source)
         elif len(known) >= limits.TOPICS_PER_PEER_MAX:
             return [
@@ -349,11 +421,13 @@ class Imports:
         entry = self._peers[peer].sources.get(source)
         if entry is None:
             return []
-        actions = self._close(peer, source, entry)
-        if entry.shown:
-            actions.append(Retract(peer, source))
+        return self._close(peer, source, entry) + self._drop(peer, source, entry)
+
+    def _drop(self, peer: int, source: Source, entry: Import) -> list[Action]:
+        actions: list[Action] = [Retract(peer, source)] if entry.shown else []
         known = self._peers[peer]
         del known.sources[source]
+        known.doubtful.discard(source)
         del known.topics[source.topic][source]
         if not known.topics[source.topic]:
             del known.topics[source.topic]
@@ -375,12 +449,18 @@ class Imports:
 
     def _open(self, peer: int, source: Source, entry: Import, now: float) -> list[Action]:
         known = self._peers[peer]
+        if known.away:
+            self._move(peer, source, entry, RouteState.OPENING)
+            self._move(peer, source, entry, RouteState.WAITING)
+            return []
         route = known.next_route
         known.next_route += 1
         known.routes[route] = source
         entry.route = route
         self._move(peer, source, entry, RouteState.OPENING, now + limits.ROUTE_OPEN_TIMEOUT)
-        return [Send(peer, Open(route, source.topic, source.node))]
+        contract = self._contracts.of(source.topic, entry.type)
+        epoch, after = self._position(peer, source) or (0, 0)
+        return [Send(peer, Open(route, source.topic, source.node, contract, epoch, after))]
 
     def _close(self, peer: int, source: Source, entry: Import) -> list[Action]:
         """Leave a source alone, whatever its state."""

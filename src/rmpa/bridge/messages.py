@@ -6,12 +6,14 @@ packet capture. ``docs/design/protocol.md`` lists the messages with examples.
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Final
 
 import msgspec
 
 from rmpa.core import limits
+from rmpa.core.contract import Contract
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.names import is_global_name, is_type_name
 
@@ -74,19 +76,39 @@ class Description(msgspec.Struct, frozen=True):
 
 
 class Advertise(msgspec.Struct, frozen=True, tag_field="op", tag="advertise"):
-    """What the sender's graph publishes: all of it (``full``, first on each link) or what changed."""
+    """What the sender's graph publishes: all of it, first on each link, or what changed.
+
+    Args:
+        added: New, or of another type.
+        removed: No longer there.
+        full: This begins all of it: what is not offered is not there.
+        more: Further messages go on with that.
+    """
 
     added: tuple[Offer, ...] = ()
     removed: tuple[Source, ...] = ()
     full: bool = False
+    more: bool = False
 
 
 class Open(msgspec.Struct, frozen=True, tag_field="op", tag="open"):
-    """Send me this source; its data frames shall bear this route's id, which I chose."""
+    """Send me this source; its data frames shall bear this route's id, which I chose.
+
+    Args:
+        route: The id.
+        topic: The source's topic.
+        node: The source's node.
+        contract: What the receiver asks for.
+        epoch: The numbering that it has a part of, if a link fell in between; else 0.
+        after: The last message of that which it has.
+    """
 
     route: int
     topic: str
     node: str
+    contract: Contract = Contract()
+    epoch: int = 0
+    after: int = 0
 
     @property
     def source(self) -> Source:
@@ -95,10 +117,21 @@ class Open(msgspec.Struct, frozen=True, tag_field="op", tag="open"):
 
 
 class Opened(msgspec.Struct, frozen=True, tag_field="op", tag="opened"):
-    """The route is open; data follows."""
+    """The route is open; data follows.
+
+    Args:
+        route: The id.
+        description: What the messages are.
+        contract: What holds for the route: the stronger of both sides' words.
+        epoch: Names the numbering of a reliable route, else 0.
+        first: The numbering's first sequence.
+    """
 
     route: int
     description: Description
+    contract: Contract = Contract()
+    epoch: int = 0
+    first: int = 1
 
 
 class Close(msgspec.Struct, frozen=True, tag_field="op", tag="close"):
@@ -180,15 +213,38 @@ def _validate(message: Message) -> None:
                 raise RemoteProtocolError(f"{offer.type[:200]!r}, offered for {offer.topic}, is not a message type")
         for source in message.removed:
             _check_names(source.topic, source.node)
-    elif isinstance(message, Open | Mismatch):
+    elif isinstance(message, Open):
         _check_names(message.topic, message.node)
-        if isinstance(message, Mismatch):
-            _check_text(message.subscriber)
-            _check_text(message.text)
+        _check_terms(message)
+    elif isinstance(message, Mismatch):
+        _check_names(message.topic, message.node)
+        _check_text(message.subscriber)
+        _check_text(message.text)
     elif isinstance(message, Closed):
         _check_text(message.reason)
-    elif isinstance(message, Opened) and message.description.problem:
-        raise RemoteProtocolError(f"route {message.route}: {message.description.problem}")
+    elif isinstance(message, Opened):
+        if message.description.problem:
+            raise RemoteProtocolError(f"route {message.route}: {message.description.problem}")
+        _check_terms(message)
+
+
+def _check_terms(message: Open | Opened) -> None:
+    """A contract that a peer sends must be one that our own file could have."""
+    contract = message.contract
+    numbers = (message.epoch, message.after if isinstance(message, Open) else message.first)
+    times = (contract.deadline, contract.lifespan, contract.liveliness_lease)
+    lowest, highest = limits.CONTRACT_TIME_MIN, limits.CONTRACT_TIME_MAX
+    if not 1 <= contract.depth <= limits.CONTRACT_DEPTH_MAX:
+        problem = f"a depth of {contract.depth}"
+    elif any(t is not None and not (math.isfinite(t) and lowest <= t <= highest) for t in times):
+        problem = f"times of {times} seconds"
+    elif contract.max_rate is not None and not 0 < contract.max_rate <= limits.CONTRACT_RATE_MAX:
+        problem = f"a rate of {contract.max_rate}"
+    elif any(not 0 <= number <= _ROUTE_MAX for number in numbers):
+        problem = f"the numbers {numbers}"
+    else:
+        return
+    raise RemoteProtocolError(f"route {message.route}: a contract with {problem} cannot be")
 
 
 def _check_names(topic: str, node: str) -> None:

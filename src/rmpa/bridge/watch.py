@@ -113,6 +113,14 @@ class Watch:
         self._down_since = None
         self._look = now
 
+    def link_gone(self, now: float) -> list[Occurred]:
+        """The source leaves the graph: if its link is down, it is lost now and not only after the lease."""
+        lease = self._contract.liveliness_lease
+        if self._down_since is None or lease is None:
+            return []
+        occurred = self._judge_life(max(now, self._down_since + lease))
+        return [] if occurred is None else [occurred]
+
     def next_timer(self) -> float | None:
         """When ``handle_timer`` has something to do; ``None``: the contract has nothing to watch.
 

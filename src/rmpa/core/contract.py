@@ -82,6 +82,11 @@ class Contract:
     priority: Priority = Priority.NORMAL
     max_rate: float | None = None
 
+    @property
+    def kept(self) -> int:
+        """Messages kept for late subscribers where durability asks for it: one, as latching does, unless said."""
+        return 1 if self.depth == limits.ROUTE_QUEUE_MESSAGES else self.depth
+
 
 KEYS: Final = tuple(item.name for item in fields(Contract))
 """The names of a contract's fields, in order."""
@@ -103,7 +108,7 @@ def combine(offered: Contract, requested: Contract) -> Contract:
         reliability=_either(offered.reliability, requested.reliability, Reliability.RELIABLE),
         durability=_either(offered.durability, requested.durability, Durability.TRANSIENT_LOCAL),
         history=_either(offered.history, requested.history, History.KEEP_ALL),
-        depth=max(offered.depth, requested.depth),
+        depth=_depth(offered.depth, requested.depth),
         deadline=offered.deadline if requested.deadline is None else requested.deadline,
         lifespan=_smaller(offered.lifespan, requested.lifespan),
         liveliness=watched.liveliness,
@@ -111,6 +116,12 @@ def combine(offered: Contract, requested: Contract) -> Contract:
         priority=max(offered.priority, requested.priority, key=_URGENCY.__getitem__),
         max_rate=_smaller(offered.max_rate, requested.max_rate),
     )
+
+
+def _depth(one: int, other: int) -> int:
+    """The larger one, but the default says nothing."""
+    said = [depth for depth in (one, other) if depth != limits.ROUTE_QUEUE_MESSAGES]
+    return max(said, default=limits.ROUTE_QUEUE_MESSAGES)
 
 
 def _either(one: _Word, other: _Word, stronger: _Word) -> _Word:

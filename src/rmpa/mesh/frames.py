@@ -14,9 +14,12 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
+from rmpa.core.outbox import ABORT, FIRST, LAST
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from rmpa.core.outbox import Parcel
 
 Buffer = bytes | bytearray | memoryview
 
@@ -28,10 +31,6 @@ unpack_header: Final = _HEADER.unpack_from
 
 _pack: Final = _HEADER.pack
 
-FIRST: Final = 1
-"""Flag: the first fragment of a message."""
-LAST: Final = 2
-"""Flag: the last fragment of a message."""
 WHOLE: Final = FIRST | LAST
 """The flags of a message in one piece."""
 
@@ -47,6 +46,9 @@ class Kind(IntEnum):
     CONTROL = 6
     DATA = 7
     BYE = 8
+    ACK = 9
+    FENCE = 10
+    FENCED = 11
 
 
 PAYLOAD_MAX: Final[Mapping[int, int]] = MappingProxyType(
@@ -57,8 +59,11 @@ PAYLOAD_MAX: Final[Mapping[int, int]] = MappingProxyType(
         Kind.PING: 0,
         Kind.PONG: _STAMPS.size,
         Kind.CONTROL: limits.CONTROL_PAYLOAD_MAX,
-        Kind.DATA: limits.FRAME_PAYLOAD_MAX,
+        Kind.DATA: limits.DATA_PAYLOAD_MAX,
         Kind.BYE: limits.HELLO_PAYLOAD_MAX,
+        Kind.ACK: 0,
+        Kind.FENCE: 0,
+        Kind.FENCED: 0,
     }
 )
 """The most bytes of payload that a frame of each kind may claim."""
@@ -70,12 +75,17 @@ def pack_data_header(length: int, route: int, sequence: int, stamp_ns: int) -> b
     Raises:
         LocalProtocolError: The message is longer than a frame carries, or a number does not fit its field.
     """
-    if length > limits.FRAME_PAYLOAD_MAX:
-        raise LocalProtocolError(f"a message of {length} bytes exceeds a frame's {limits.FRAME_PAYLOAD_MAX}")
+    if length > limits.DATA_PAYLOAD_MAX:
+        raise LocalProtocolError(f"a message of {length} bytes exceeds a frame's {limits.DATA_PAYLOAD_MAX}")
     try:
         return _pack(length, 7, 3, 0, route, sequence & 0xFFFFFFFF, stamp_ns)
     except struct.error as error:
         raise LocalProtocolError(f"route {route} or stamp {stamp_ns} does not fit its field: {error}") from None
+
+
+def pack_fragment_header(parcel: Parcel, length: int, flags: int) -> bytes:
+    """The 24 bytes in front of a fragment of ``length`` bytes; the parcel's key is the route."""
+    return _pack(length, 7, flags, 0, parcel.key, parcel.sequence & 0xFFFFFFFF, parcel.stamp_ns)
 
 
 def check_header(length: int, kind: int, flags: int) -> None:
@@ -83,15 +93,21 @@ def check_header(length: int, kind: int, flags: int) -> None:
 
     Raises:
         LimitExceeded: The length is beyond what this kind may have.
-        RemoteProtocolError: There is no such kind, or the message is a fragment (not in use yet).
+        RemoteProtocolError: There is no such kind, or it is no fragment that there can be.
     """
     limit = PAYLOAD_MAX.get(kind)
     if limit is None:
         raise RemoteProtocolError(f"frame of unknown kind {kind}")
     if length > limit:
         raise LimitExceeded(f"{Kind(kind).name.lower()} frame", length, limit)
-    if flags & WHOLE != WHOLE:
-        raise RemoteProtocolError(f"{Kind(kind).name.lower()} frame is a fragment, which nobody agreed to")
+    if kind != Kind.DATA:
+        if flags & WHOLE != WHOLE:
+            raise RemoteProtocolError(f"{Kind(kind).name.lower()} frame is a fragment; only data comes in fragments")
+    elif flags & ABORT:
+        if length or flags & WHOLE != LAST:
+            raise RemoteProtocolError(f"data frame that aborts its message has {length} bytes, flags {flags:#x}")
+    elif not length:
+        raise RemoteProtocolError("data frame without data")
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,8 +34,8 @@ class Lane(IntEnum):
     BULK = 2
 
 
-LANES: Final = frozenset({Lane.EXPRESS})
-"""The lanes that this version joins; the others have their place in the handshake only."""
+LANES: Final = frozenset({Lane.EXPRESS, Lane.BULK})
+"""The lanes that this version joins."""
 
 
 class Refusal(IntEnum):
@@ -50,6 +50,7 @@ class Refusal(IntEnum):
     MALFORMED = 7
     BUSY = 8
     LANE = 9
+    NO_EXPRESS = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,6 +245,10 @@ def judge(hello: Hello, ours: Identity, links: Iterable[KnownLink], *, busy: boo
         text = f"you called {hello.expected}, but this is {ours}: the address changed hands, or two have it"
         return Refuse(Refusal.WRONG_PEER, text)
     there = [link for link in links if same_place(link.guid, hello.guid)]
+    if hello.lane == Lane.BULK:
+        if any(link.instance == hello.instance for link in there):
+            return None
+        return Refuse(Refusal.NO_EXPRESS, "a bulk lane belongs to an express one, and there is none yet")
     for link in there:
         if link.instance != hello.instance:
             if link.alive:

@@ -22,9 +22,10 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core import limits
 from rmpa.core.clock import earliest
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
+from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import frames
 from rmpa.mesh.frames import Frame, Kind
-from rmpa.mesh.handshake import HandshakeError, Hello, Refuse, judge_welcome
+from rmpa.mesh.handshake import HandshakeError, Hello, Lane, Refuse, judge_welcome
 from rmpa.mesh.timing import LinkClock
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ _log = logging.getLogger(__name__)
 
 _HEADER: Final = limits.FRAME_HEADER_BYTES
 _DATA: Final = int(Kind.DATA)
+_WHOLE: Final = frames.WHOLE
 
 
 class Role(Enum):
@@ -72,7 +74,9 @@ _NEXT: Final[Mapping[tuple[State, _Act], State]] = MappingProxyType(
     }
 )
 
-_TALK: Final[frozenset[int]] = frozenset({Kind.PING, Kind.PONG, Kind.CONTROL, Kind.DATA, Kind.BYE})
+_TALK: Final[frozenset[int]] = frozenset(
+    {Kind.PING, Kind.PONG, Kind.CONTROL, Kind.DATA, Kind.BYE, Kind.ACK, Kind.FENCE, Kind.FENCED}
+)
 _ALLOWED: Final[Mapping[tuple[Role, State], frozenset[int]]] = MappingProxyType(
     {
         (Role.DIALLER, State.HANDSHAKING): frozenset({int(Kind.WELCOME), int(Kind.REFUSE)}),
@@ -147,9 +151,25 @@ class Closed:
     orderly: bool
 
 
-Event = HelloReceived | Up | ControlReceived | Ponged | Refused | Closed
+@dataclass(frozen=True, slots=True)
+class Marked:
+    """An acknowledgement, a fence or its answer came.
+
+    Args:
+        kind: ``ACK``, ``FENCE`` or ``FENCED``.
+        route: Which route.
+        sequence: Up to which message; the fence's number.
+    """
+
+    kind: Kind
+    route: int
+    sequence: int
+
+
+Event = HelloReceived | Up | ControlReceived | Ponged | Marked | Refused | Closed
 OnEvent = Callable[[Event], None]
 OnData = Callable[[int, int, int, memoryview], None]
+OnPart = Callable[[int, int, int, int, memoryview], None]
 
 
 class Link:
@@ -163,6 +183,8 @@ class Link:
         on_event: Called from within the methods below; it may call any of them but ``receive``.
         on_data: Called with ``(route, sequence, stamp_ns, payload)`` for each data frame; the payload is a view
             into the bytes given to ``receive`` and only valid during the call. An attribute that may be changed.
+        on_part: Called with ``(route, sequence, stamp_ns, flags, part)`` for each part of a message that comes in
+            parts; parts of one message come in order, those of other routes in between. Likewise.
         expected: Dialler: whom we believe we dialled, ``None`` if only the address is known.
         lease: What we promise: seconds after which our silence means that we are dead.
         label: For log lines, until the other side's name is known.
@@ -177,7 +199,9 @@ class Link:
         wall_ns: Callable[[], int],
         on_event: OnEvent,
         on_data: OnData,
+        on_part: OnPart | None = None,
         expected: Guid | None = None,
+        lane: Lane = Lane.EXPRESS,
         lease: float = limits.LINK_LEASE,
         label: str = "?",
     ) -> None:
@@ -188,14 +212,13 @@ class Link:
         self._wall_ns = wall_ns
         self._on_event = on_event
         self.on_data = on_data
+        self.on_part = on_part if on_part is not None else _no_parts
+        self._left = 0
+        self._rest = (0, 0, 0, 0)
         self._expected = expected
-        self._lease = lease
         self._label = label
         self._state = State.HANDSHAKING
-        self._keepalive = lease * limits.KEEPALIVE_INTERVAL / limits.LINK_LEASE
-        if role is Role.ACCEPTOR:
-            # A little later than the dialler's, so that its pongs are all that an idle link needs of it.
-            self._keepalive *= limits.KEEPALIVE_ANSWERED
+        self._promise(lease)
         self._deadline = now + limits.HANDSHAKE_TIMEOUT
         self._reason = ""
         self._heard = now
@@ -204,7 +227,8 @@ class Link:
         self._pinged = now
         self._output = bytearray()
         if role is Role.DIALLER:
-            self._send(Frame(Kind.HELLO, Hello.of(ours, lease=lease, expected=expected).serialize()))
+            hello = Hello.of(ours, lease=lease, expected=expected, lane=lane)
+            self._send(Frame(Kind.HELLO, hello.serialize()))
 
     @property
     def state(self) -> State:
@@ -245,22 +269,32 @@ class Link:
         size = len(view)
         offset = 0
         try:
+            if self._left:
+                offset = self._take_rest(view)
             while size - offset >= _HEADER:
                 length, kind, flags, _, route, sequence, stamp_ns = frames.unpack_header(view, offset)
                 if (kind != _DATA or self._state is not State.UP) and not self._admit(kind):
                     return size, 0
                 # One comparison each on the data path; what is wrong is said by check_header.
-                if kind != _DATA or length > limits.FRAME_PAYLOAD_MAX or flags & 3 != 3:
+                if kind != _DATA or length > limits.DATA_PAYLOAD_MAX or flags != _WHOLE:
                     frames.check_header(length, kind, flags)
                 start = offset + _HEADER
                 end = start + length
                 if end > size:
-                    return offset, end - offset
+                    if kind != _DATA or length <= limits.CUT_THROUGH_BYTES or start == size:
+                        return offset, end - offset
+                    # Handed on as it comes: nobody waits for the end of a large frame, and none is moved about.
+                    self._left = end - size
+                    self._rest = (route, sequence, stamp_ns, flags & LAST)
+                    self.on_part(route, sequence, stamp_ns, flags & FIRST, view[start:])
+                    return size, 0
                 offset = end
-                if kind == _DATA:
+                if kind != _DATA:
+                    self._handle(Kind(kind), view[start:end], route, sequence, stamp_ns, now)
+                elif flags == _WHOLE:
                     self.on_data(route, sequence, stamp_ns, view[start:end])
                 else:
-                    self._handle(Kind(kind), view[start:end], stamp_ns, now)
+                    self.on_part(route, sequence, stamp_ns, flags, view[start:end])
         except RemoteProtocolError as error:
             self._end(f"{self._name} broke the protocol: {error}")
             raise
@@ -273,6 +307,8 @@ class Link:
             LocalProtocolError: There was no hello, or it was answered.
         """
         hello = self._unanswered()
+        if hello.lane == Lane.BULK:
+            self._promise(limits.BULK_LEASE)
         welcome = Hello.of(self._ours, lease=self._lease, expected=hello.guid, lane=hello.lane)
         self._send(Frame(Kind.WELCOME, welcome.serialize()))
         self._raise_up(hello, now)
@@ -374,7 +410,23 @@ class Link:
             raise RemoteProtocolError(f"{what} frame while {self._state.name.lower()}")
         return True
 
-    def _handle(self, kind: Kind, payload: memoryview, stamp_ns: int, now: float) -> None:
+    def _promise(self, lease: float) -> None:
+        self._lease = lease
+        self._keepalive = lease * limits.KEEPALIVE_INTERVAL / limits.LINK_LEASE
+        if self.role is Role.ACCEPTOR:
+            # A little later than the dialler's, so that its pongs are all that an idle link needs of it.
+            self._keepalive *= limits.KEEPALIVE_ANSWERED
+
+    def _take_rest(self, view: memoryview) -> int:
+        """Hand on what has come of a data frame that was begun; return how many bytes that were."""
+        count = min(self._left, len(view))
+        self._left -= count
+        if self._state is State.UP:
+            route, sequence, stamp_ns, last = self._rest
+            self.on_part(route, sequence, stamp_ns, 0 if self._left else last, view[:count])
+        return count
+
+    def _handle(self, kind: Kind, payload: memoryview, route: int, sequence: int, stamp_ns: int, now: float) -> None:
         if _log.isEnabledFor(logging.DEBUG):
             _log.debug("< %s: %s, %d bytes", self._name, kind.name, len(payload))
         if kind is Kind.PING:
@@ -388,6 +440,8 @@ class Link:
                 self._on_event(Ponged(t1, sample.rtt))
         elif kind is Kind.CONTROL:
             self._on_event(ControlReceived(bytes(payload)))
+        elif kind in {Kind.ACK, Kind.FENCE, Kind.FENCED}:
+            self._on_event(Marked(kind, route, sequence))
         elif kind is Kind.BYE:
             self._end(f"{self._name} left: {frames.parse_text(payload)}", orderly=True)
         elif kind is Kind.REFUSE:
@@ -454,6 +508,10 @@ class Link:
         if _log.isEnabledFor(logging.DEBUG):
             _log.debug("> %s: %s", self._name, frame)
         self._output += frame.serialize()
+
+
+def _no_parts(_route: int, _sequence: int, _stamp_ns: int, _flags: int, _part: memoryview) -> None:
+    """Parts of messages on a link whose owner takes none."""
 
 
 def _bye(text: str) -> Frame:

@@ -27,6 +27,8 @@ _log = logging.getLogger(__name__)
 Endpoint = tuple[str, int]
 
 _SLOW: Final = frozenset({Refusal.VERSION, Refusal.DOMAIN, Refusal.DUPLICATE, Refusal.MALFORMED, Refusal.LANE})
+REPLACED: Final = "replaced by a newer link"
+"""Why a link ends whose peer, the same instance, has another one in the same moment."""
 _ELSEWHERE: Final = frozenset({Refusal.MYSELF, Refusal.WRONG_PEER})
 
 
@@ -225,9 +227,7 @@ class Peering:
             self._outputs.append(CloseLink(link_id, "we are linked already; the lower GUID's link stays"))
             return
         if old is not None:
-            reason = (
-                "replaced by a newer link" if old.identity.instance == identity.instance else "the peer restarted"
-            )
+            reason = REPLACED if old.identity.instance == identity.instance else "the peer restarted"
             self._drop(peer, old, reason, close=True)
         if peer.identity.instance != identity.instance:
             peer.identity = identity

@@ -147,6 +147,12 @@ class ReliableSender:
             self._highest = taken[-1].sequence
         return taken
 
+    def untake(self) -> None:
+        """The last one taken cannot be sent now after all: it is the next one again."""
+        message = self._sent.pop()
+        self._under_way_bytes -= len(message.payload)
+        self._unsent.appendleft(message)
+
     def acknowledged(self, sequence: int) -> None:
         """The receiver has everything up to ``sequence``; an old acknowledgement, or one without a link, is ignored.
 

@@ -32,9 +32,11 @@ from rmpa.bridge.policy import OWN_NODE, is_own
 from rmpa.bridge.proxy_names import LOOPBACK, proxy_prefix
 from rmpa.core import limits
 from rmpa.core.aio.loop import breathe
+from rmpa.core.contract import Priority
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.names import is_type_name
+from rmpa.mesh.frames import Kind as FrameKind
 from rmpa.ros.aio.slave_server import SlaveNode
 from rmpa.ros.master.effects import GraphChange, Kind
 
@@ -42,6 +44,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from rmpa.bridge.policy import Policy
+    from rmpa.bridge.watch import Occurred
+    from rmpa.core.contract import Contracts
     from rmpa.mesh.aio.link import MeshLink
     from rmpa.ros.aio.core import RosCore
 
@@ -56,6 +60,8 @@ class Attached:
     peer: int
     link: MeshLink
     inbound: Inbound
+    away: asyncio.TimerHandle | None = None
+    """Runs while the link is gone and reliable routes wait for the peer; ``link`` is the last one."""
 
 
 class Bridge:
@@ -64,13 +70,16 @@ class Bridge:
     Args:
         core: The local core, started.
         policy: What may cross.
+        contracts: What its topics need.
         rng: Uniform numbers in [0, 1) for back-off jitter.
     """
 
-    def __init__(self, core: RosCore, policy: Policy, *, rng: Callable[[], float]) -> None:
+    def __init__(
+        self, core: RosCore, policy: Policy, *, rng: Callable[[], float], contracts: Contracts | None = None
+    ) -> None:
         self._core = core
-        self._exports = Exports(policy)
-        self._imports = Imports(policy, rng)
+        self._exports = Exports(policy, contracts)
+        self._imports = Imports(policy, rng, contracts, self._position)
         self.counters = Counters()
         self._node = SlaveNode(
             OWN_NODE, LOOPBACK, core.uri, counters=self.counters, taps=lambda: self._outbound.connections
@@ -81,6 +90,7 @@ class Bridge:
         self._by_link: dict[MeshLink, Attached] = {}
         self._closing: set[asyncio.Task[None]] = set()
         self._timer: asyncio.TimerHandle | None = None
+        self._ticker: asyncio.TimerHandle | None = None
         self._reconciler: asyncio.TimerHandle | None = None
         self._rescan: asyncio.Handle | None = None
         self._closed = False
@@ -121,7 +131,11 @@ class Bridge:
         return tuple(self._mismatches.get(source, {}).values())
 
     def attached(self) -> Iterator[Attached]:
-        """Every link that is up, for the monitor."""
+        """Every peer whose link is up, for the monitor."""
+        return (attached for attached in self._by_number.values() if attached.away is None)
+
+    def everyone(self) -> Iterator[Attached]:
+        """These, and the peers that are away while reliable routes wait for them."""
         return iter(self._by_number.values())
 
     async def start(self) -> None:
@@ -135,11 +149,11 @@ class Bridge:
     async def close(self) -> None:
         """Retract all that came from elsewhere and leave all local publishers."""
         self._closed = True
-        for timer in (self._timer, self._reconciler, self._rescan):
+        for timer in (self._ticker, self._timer, self._reconciler, self._rescan):
             if timer is not None:
                 timer.cancel()
         for attached in list(self._by_number.values()):
-            self._detach(attached)
+            self._give_up(attached)
         if self._closing:
             await asyncio.gather(*self._closing)
         self._outbound.close()
@@ -148,7 +162,16 @@ class Bridge:
     # --- the mesh's side ---------------------------------------------------------------------------------------
 
     def link_up(self, link: MeshLink) -> None:
-        """A link is up: tell what we have, and let what it has appear."""
+        """A link is up: tell what we have, and let what it has appear, or go on where its last link ended."""
+        back = self._claim(link)
+        if back is not None:
+            _log.info("= %s is back: reliable topics go on", link.name)
+            back.link = link
+            self._by_link[link] = back
+            self._act(self._imports.link_up(back.peer))
+            self._act(self._exports.link_up(back.peer))
+            self._schedule()
+            return
         peer = next(self._numbers)
         prefix = proxy_prefix(link.identity, {attached.inbound.prefix for attached in self._by_number.values()})
         inbound = Inbound(
@@ -157,6 +180,7 @@ class Bridge:
             counters=self.counters,
             on_demand=lambda source, wanted: self._demand(peer, source, wanted=wanted),
             on_mismatch=lambda source, subscriber, text: self._mismatched(peer, source, subscriber, text),
+            on_occurred=lambda source, occurred: self._occurred(peer, source, occurred),
         )
         attached = Attached(peer, link, inbound)
         self._by_number[peer] = self._by_link[link] = attached
@@ -165,10 +189,60 @@ class Bridge:
         self._schedule()
 
     def link_down(self, link: MeshLink) -> None:
-        """A link is gone: retract what came over it."""
+        """A link is gone: retract what came over it, but for what a reliable route brings back."""
+        attached = self._by_link.pop(link, None)
+        if attached is None:
+            return
+        attached.inbound.link_down()
+        self._learning = deque(lesson for lesson in self._learning if lesson[0] is not attached)
+        self._learning_bytes = sum(len(lesson) for _, lesson in self._learning if isinstance(lesson, bytes))
+        exports, _ = self._exports.link_away(attached.peer)
+        self._act(exports)
+        if link.silent:
+            # Most silences end soon, by a new link: until then nobody need notice.
+            attached.away = self._loop.call_later(limits.AWAY_GRACE, self._stay_away, attached)
+            imports, _ = self._imports.link_away(attached.peer, briefly=True)
+            self._act(imports)
+        else:
+            self._stay_away(attached)
+
+    def _stay_away(self, attached: Attached) -> None:
+        """A peer without a link does not come back at once: only what a reliable route needs waits for it."""
+        name = attached.link.name
+        attached.away = self._loop.call_later(limits.RESUME_WINDOW, self._give_up, attached)
+        waited_for = self._exports.waits_for(attached.peer)
+        imports, waiting = self._imports.link_away(attached.peer)
+        self._act(imports)
+        if waited_for or waiting:
+            _log.info("= %s is away: its reliable topics wait for %g s", name, limits.RESUME_WINDOW)
+        else:
+            self._give_up(attached)
+
+    def clock(self, link: MeshLink) -> None:
+        """A link knows its peer's clock better."""
         attached = self._by_link.get(link)
         if attached is not None:
-            self._detach(attached)
+            attached.inbound.time.set(link.clock_offset, link.clock_error)
+
+    def lane_lost(self, link: MeshLink) -> None:
+        """A link has lost its bulk lane's connection, and half a message perhaps on either side."""
+        attached = self._by_link.get(link)
+        if attached is not None:
+            for flow in attached.inbound.flows.values():
+                if flow.contract.priority is not Priority.HIGH:
+                    flow.torn()
+            self._outbound.lane_lost(attached.peer)
+
+    def mark(self, link: MeshLink, kind: FrameKind, route: int, sequence: int) -> None:
+        """An acknowledgement or the answer to a fence came; one for a route that was closed meanwhile is dropped."""
+        attached = self._by_link.get(link)
+        leg = self._outbound.leg(attached.peer, route) if attached is not None else None
+        if leg is None:
+            return
+        if kind is FrameKind.ACK:
+            leg.acknowledged(sequence)
+        elif kind is FrameKind.FENCED:
+            leg.fenced(sequence)
 
     def control(self, link: MeshLink, payload: bytes | bytearray | memoryview) -> None:
         """A control frame came.
@@ -202,12 +276,21 @@ class Bridge:
         else:
             flow.message(sequence, stamp_ns, payload)
 
+    def part(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
+        """A part of a large message came; one for a route that was closed meanwhile is dropped."""
+        attached = self._by_link.get(link)
+        flow = attached.inbound.flows.get(route) if attached is not None else None
+        if flow is None:
+            self.counters.add("route.unknown")
+        else:
+            flow.part(sequence, stamp_ns, flags, part)
+
     def _dispatch(self, attached: Attached, message: Message) -> None:
         peer, now = attached.peer, self._loop.time()
         match message:
             case Advertise():
                 for portion in self._portions(attached, message):
-                    self._act(self._imports.advertised(peer, portion))
+                    self._act(self._imports.advertised(peer, portion, now))
             case Open():
                 self._act(self._exports.opened(peer, message))
             case Opened():
@@ -223,15 +306,27 @@ class Bridge:
                 self._remember(message.source, f"{attached.link.name}{message.subscriber}", message.text)
                 self._warn("mismatch.remote", who, f"{who}: {message.text}")
 
-    def _detach(self, attached: Attached) -> None:
-        del self._by_number[attached.peer]
-        del self._by_link[attached.link]
-        attached.inbound.flows.clear()
+    def _claim(self, link: MeshLink) -> Attached | None:
+        """The peer that was away, if it is this one; another instance in its place shows that it will not come."""
+        for attached in list(self._by_number.values()):
+            if attached.away is None:
+                continue
+            if attached.link.identity.instance == link.identity.instance:
+                attached.away.cancel()
+                attached.away = None
+                return attached
+            if attached.link.guid.place == link.guid.place or attached.link.name == link.name:
+                self._give_up(attached)
+        return None
+
+    def _give_up(self, attached: Attached) -> None:
+        """A peer will not come back: retract all that is left of it."""
+        if attached.away is not None:
+            attached.away.cancel()
+        self._by_number.pop(attached.peer, None)
+        self._by_link.pop(attached.link, None)
         for action in self._exports.link_down(attached.peer):
-            if isinstance(action, act.RemoveRoute):
-                self._outbound.remove_route(action, attached.link)
-            else:
-                self._act([action])
+            self._act([action])
         # Its actions are what closing the inbound side does at once.
         self._forgetting.append(self._imports.link_down(attached.peer))
         self._schedule()
@@ -239,6 +334,16 @@ class Bridge:
         self._closing.add(task)
         task.add_done_callback(self._closing.discard)
         self._set_timer()
+
+    def _position(self, peer: int, source: Source) -> tuple[int, int] | None:
+        attached = self._by_number.get(peer)
+        return attached.inbound.position(source) if attached is not None else None
+
+    def _occurred(self, peer: int, source: Source, occurred: Occurred) -> None:
+        attached = self._by_number.get(peer)
+        if attached is not None:
+            text = f"{attached.link.name}: {source}: {occurred.text}"
+            self._warn(f"contract.{occurred.kind.value}", f"{peer} {source}", text)
 
     # --- the local graph's side --------------------------------------------------------------------------------
 
@@ -299,7 +404,7 @@ class Bridge:
                 self._learning.appendleft((attached, self._portions(attached, message)))
         elif (portion := next(lesson, None)) is not None:
             self._learning.appendleft((attached, lesson))
-            self._act(self._imports.advertised(attached.peer, portion))
+            self._act(self._imports.advertised(attached.peer, portion, self._loop.time()))
 
     def _portions(self, attached: Attached, message: Advertise) -> Iterator[Advertise]:
         if message.added or message.removed:
@@ -325,6 +430,12 @@ class Bridge:
 
     def _demand(self, peer: int, source: Source, *, wanted: bool) -> None:
         self._act(self._imports.demand(peer, source, self._loop.time(), wanted=wanted))
+
+    def _tick(self) -> None:
+        """Wake up now and then while data comes: a link that was silent is told from an agent that slept."""
+        self._ticker = None
+        if not self._closed and any(attached.inbound.flows for attached in self._by_number.values()):
+            self._ticker = self._loop.call_later(limits.STALE_TICK, self._tick)
 
     def _mismatched(self, peer: int, source: Source, subscriber: str, text: str) -> None:
         self._remember(source, subscriber, text)
@@ -363,32 +474,49 @@ class Bridge:
 
     def _do(self, action: act.Action) -> None:
         match action:
-            case act.Connect():
-                self._outbound.connect(action)
-                return
-            case act.Disconnect():
-                self._outbound.disconnect(action.source)
-                return
             case act.Warn():
                 self._warn(action.kind, action.who, action.text)
-                return
+            case act.Send():
+                attached = self._by_number.get(action.peer)
+                if attached is not None and attached.away is None:
+                    attached.link.send_control(encode(action.message))
+            case act.Publish() | act.Retract() | act.Describe() | act.Detach():
+                self._do_inbound(action)
+            case _:
+                self._do_outbound(action)
+
+    def _do_outbound(self, action: act.Outgoing) -> None:
+        match action:
+            case act.Connect():
+                self._outbound.connect(action)
+            case act.Disconnect():
+                self._outbound.disconnect(action.source)
+            case act.SuspendRoute():
+                self._outbound.suspend_route(action)
+            case act.AddRoute():
+                attached = self._by_number.get(action.peer)
+                if attached is not None:
+                    self._outbound.add_route(action, attached.link)
+            case act.RemoveRoute():
+                self._outbound.remove_route(action)
+                attached = self._by_number.get(action.peer)
+                if attached is not None and attached.away is None:
+                    attached.link.close_route(action.route)
+
+    def _do_inbound(self, action: act.Incoming) -> None:
         attached = self._by_number.get(action.peer)
         if attached is None:
             return
         match action:
-            case act.Send():
-                attached.link.send_control(encode(action.message))
-            case act.AddRoute():
-                self._outbound.add_route(action, attached.link)
-            case act.RemoveRoute():
-                self._outbound.remove_route(action, attached.link)
-                attached.link.close_route(action.route)
             case act.Publish():
                 attached.inbound.publish(action)
             case act.Retract():
                 attached.inbound.retract(action)
             case act.Describe():
-                attached.inbound.describe(action)
+                route = action.route
+                if self._ticker is None:
+                    self._ticker = self._loop.call_later(limits.STALE_TICK, self._tick)
+                attached.inbound.describe(action, lambda last: attached.link.mark(FrameKind.ACK, route, last))
             case act.Detach():
                 attached.inbound.detach(action)
 

@@ -1,29 +1,35 @@
 """The data path through the bridge: what happens to each message, and nothing else.
 
 Both flows are called from a socket's read callback with a view of its buffer and hand it on with one system call
-for each receiver. They take routes as commands and share no state with the planning side.
+for each receiver, a large message in parts while it still arrives. They take routes as commands and share no state
+with the planning side.
 """
 
 from __future__ import annotations
 
+import asyncio
 import time
-from dataclasses import dataclass
+from collections import deque
 from typing import TYPE_CHECKING, Final, Protocol
 
+from rmpa.bridge.aio.legs import Leg, ReliableLeg, make_leg
 from rmpa.bridge.quality import Quality
+from rmpa.bridge.watch import Watch
+from rmpa.core import limits
+from rmpa.core.contract import Contract, Durability, Priority, Reliability
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.mesh.reliable import ReliableReceiver
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.bridge.aio.legs import DataLink
     from rmpa.core.aio.stream import Buffer
 
 _SEQUENCE_MASK: Final = (1 << 32) - 1
-
-
-class DataLink(Protocol):
-    """What the data path needs of a link."""
-
-    def send_data(self, route: int, sequence: int, stamp_ns: int, payload: Buffer) -> int:
-        """Send one message; return how many older ones were dropped for it."""
-        ...
+_HALF: Final = 1 << 31
+_LENGTH: Final = 4
 
 
 class Outlet(Protocol):
@@ -33,39 +39,84 @@ class Outlet(Protocol):
         """Send one message, with its length in front, to each subscriber."""
         ...
 
+    def begin(self, size: int) -> None:
+        """Begin a message of ``size`` bytes that come in parts."""
+        ...
 
-@dataclass(slots=True)
-class _Leg:
-    link: DataLink
-    route: int
-    sequence: int = 0
+    def extend(self, part: Buffer) -> None:
+        """Send a part of it to each subscriber that has its beginning."""
+        ...
+
+    def abort(self) -> int:
+        """The rest will not come; return how many subscribers were closed because they have the beginning."""
+        ...
 
 
 class ExportFlow:
-    """From one local publisher to the peers that want it."""
+    """From one local publisher to the peers that want it; a peer has one leg."""
 
-    __slots__ = ("_latched", "_legs", "bytes", "dropped", "latching", "messages")
+    __slots__ = (
+        "_got",
+        "_latched",
+        "_legs",
+        "_size",
+        "_stamp",
+        "_streaming",
+        "_whole",
+        "by_peer",
+        "bytes",
+        "dropped",
+        "large",
+        "latching",
+        "messages",
+    )
 
     def __init__(self) -> None:
-        self._legs: list[_Leg] = []
-        self._latched: tuple[bytes, int] | None = None
+        self.by_peer: dict[int, Leg] = {}
+        self._legs: tuple[Leg, ...] = ()
+        self._latched: deque[tuple[bytes, int]] = deque(maxlen=1)
+        self._streaming: list[Leg] = []
+        self._whole: bytearray | None = None
+        self._size = self._got = self._stamp = 0
         self.latching = False
+        """Whether the last message is kept for peers that come later."""
+        self.large = False
         self.messages = 0
         self.bytes = 0
         self.dropped = 0
 
-    def add(self, link: DataLink, route: int) -> None:
-        """Send to one more peer from now on; first the latched message, if there is one."""
-        leg = _Leg(link, route)
-        if self._latched is not None:
-            framed, stamp = self._latched
-            leg.sequence = 1
-            link.send_data(route, 1, stamp, framed)
-        self._legs = [*self._legs, leg]
+    def keep(self, depth: int) -> None:
+        """Keep the last ``depth`` messages for peers that come later."""
+        self.latching = True
+        if depth > (self._latched.maxlen or 0):
+            self._latched = deque(self._latched, maxlen=min(depth, limits.LATCHED_MAX))
 
-    def remove(self, link: DataLink, route: int) -> None:
+    def add(self, peer: int, link: DataLink, route: int, contract: Contract, epoch: int) -> Leg:
+        """Send to one more peer from now on; first what is kept for it."""
+        self.remove(peer)
+        leg = make_leg(link, route, contract, epoch, large=self.large)
+        if contract.durability is Durability.TRANSIENT_LOCAL:
+            self.keep(contract.kept)
+        for framed, stamp in self._latched:
+            leg.message(stamp, framed)
+        self.by_peer[peer] = leg
+        self._legs = tuple(self.by_peer.values())
+        return leg
+
+    def suspend(self, peer: int) -> None:
+        """A peer's link is gone: keep its messages."""
+        leg = self.by_peer.get(peer)
+        if isinstance(leg, ReliableLeg):
+            leg.suspend()
+
+    def remove(self, peer: int) -> None:
         """Send to that peer no longer."""
-        self._legs = [leg for leg in self._legs if leg.link is not link or leg.route != route]
+        leg = self.by_peer.pop(peer, None)
+        if leg is not None:
+            leg.close()
+            self._legs = tuple(self.by_peer.values())
+            if leg in self._streaming:
+                self._streaming.remove(leg)
 
     def message(self, framed: memoryview) -> None:
         """Hand one message on; ``framed`` has its length in front and is valid during the call only."""
@@ -73,35 +124,365 @@ class ExportFlow:
         self.messages += 1
         self.bytes += len(framed)
         for leg in self._legs:
-            leg.sequence = leg.sequence + 1 & _SEQUENCE_MASK
-            self.dropped += leg.link.send_data(leg.route, leg.sequence, stamp, framed)
+            dropped = leg.message(stamp, framed)
+            if dropped:
+                self.dropped += dropped
         if self.latching:
-            self._latched = (bytes(framed), stamp)
+            self._latched.append((bytes(framed), stamp))
+
+    def begin(self, size: int) -> None:
+        """A message of ``size`` bytes, its length in front, begins to come."""
+        self._stamp = time.time_ns()
+        self._size, self._got = size, 0
+        self.large = True
+        self._streaming = [leg for leg in self._legs if leg.begin(self._stamp, size)]
+        self._whole = bytearray() if self.latching or len(self._streaming) < len(self._legs) else None
+
+    def part(self, part: memoryview) -> None:
+        """Hand a part of it on; valid during the call only."""
+        for leg in self._streaming:
+            self.dropped += leg.part(part)
+        if self._whole is not None:
+            self._whole += part
+        self._got += len(part)
+        if self._got >= self._size:
+            self._complete()
+
+    def abort(self) -> None:
+        """The rest will not come: the publisher hung up."""
+        for leg in self._streaming:
+            leg.abort()
+        self._streaming = []
+        self._whole = None
+
+    def _complete(self) -> None:
+        self.messages += 1
+        self.bytes += self._size
+        streamed, self._streaming = self._streaming, []
+        if self._whole is None:
+            return
+        whole, self._whole = bytes(self._whole), None
+        for leg in self._legs:
+            if leg not in streamed:
+                self.dropped += leg.message(self._stamp, whole)
+        if self.latching:
+            self._latched.append((whole, self._stamp))
+
+
+class LinkTime:
+    """How a link's messages are dated here: one for all of its flows, renewed whenever the link knows better."""
+
+    __slots__ = ("ahead_ns", "error_ns")
+
+    def __init__(self) -> None:
+        self.ahead_ns = 0
+        """The peer's wall clock less ours."""
+        self.error_ns: int | None = None
+        """± bound of that; ``None`` while nothing is known."""
+
+    def set(self, offset: float | None, error: float | None) -> None:
+        """Take a link's estimate, in seconds."""
+        self.ahead_ns = round((offset or 0.0) * 1e9)
+        self.error_ns = None if error is None else round(error * 1e9)
 
 
 class ImportFlow:
-    """From one peer's route to the local subscribers of its proxy."""
+    """From one peer's route to the local subscribers of its proxy.
 
-    __slots__ = ("_expected", "_outlet", "bytes", "last_stamp_ns", "last_wall_ns", "lost", "messages", "quality")
+    Args:
+        outlet: The local end.
+        contract: What holds for the route.
+        time: The link's.
+        on_ack: ``(sequence)``: tell the sender that everything up to this message has come.
+        on_torn: Subscribers were closed in the middle of a message: let them come again.
+    """
 
-    def __init__(self, outlet: Outlet) -> None:
+    def __init__(
+        self,
+        outlet: Outlet,
+        contract: Contract,
+        link_time: LinkTime,
+        *,
+        on_ack: Callable[[int], None] | None = None,
+        on_torn: Callable[[], None] | None = None,
+    ) -> None:
+        self._loop = asyncio.get_running_loop()
+        now = self._loop.time()
         self._outlet = outlet
-        self._expected = 1
+        self.contract = contract
+        self._time = link_time
+        self._on_ack = on_ack
+        self._on_torn = on_torn
+        self._expected = -1  # none: the first one takes the long way, once
+        self._replay: bytes | None = None
+        self._receiver: ReliableReceiver | None = None
+        if contract.reliability is Reliability.RELIABLE:
+            self._receiver = ReliableReceiver()
+        self._epoch = 0
+        self._plain = self._receiver is None
+        self._stale_ns = round((contract.lifespan or limits.STALE_AGE) * 1e9)
+        self._size = self._got = 0
+        self._parts: bytearray | None = None
+        self._sequence: int | None = None
+        self._stale: tuple[int, int, bytes] | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._ack_timer: asyncio.TimerHandle | None = None
+        self.quality = Quality()
+        self.watch = Watch(contract, now)
         self.messages = 0
         self.bytes = 0
         self.lost = 0
+        """Messages that never came: the sender's queue, or a link, lost them."""
+        self.late = 0
+        """Messages that came behind newer ones, or again, and were left out."""
+        self.stale = 0
+        """Best-effort messages that an outage had held up and that gave way to newer ones."""
+        self.expired = 0
+        """Messages that came after their lifespan."""
         self.last_stamp_ns = 0
         self.last_wall_ns = 0
-        self.quality = Quality()
+        self._last_size = 0
+
+    @property
+    def lane(self) -> str:
+        """The lane of its messages: ``express`` or ``bulk``; where size decides, that of the last one."""
+        if self.contract.priority is Priority.NORMAL:
+            return "bulk" if self._last_size > limits.EXPRESS_MESSAGE_MAX else "express"
+        return "express" if self.contract.priority is Priority.HIGH else "bulk"
+
+    @property
+    def position(self) -> tuple[int, int] | None:
+        """Epoch and sequence of the last reliable message, from which a new link goes on."""
+        return self._receiver.position() if self._receiver is not None else None
+
+    def begin_epoch(self, epoch: int, first: int) -> bool:
+        """The sender says which numbering this is; whether nothing is known to be missing."""
+        self._epoch = epoch
+        self._drop_parts()
+        return self._receiver.begin(epoch, first) if self._receiver is not None else True
+
+    def expect_replay(self, latched: bytes | None) -> None:
+        """The subscribers have this latched message already; the new route brings it again, if it is still that."""
+        self._replay = latched
+
+    def rebind(self, on_ack: Callable[[int], None]) -> None:
+        """Go on over another link."""
+        self._on_ack = on_ack
 
     def message(self, sequence: int, stamp_ns: int, framed: memoryview) -> None:
         """Hand one message on; a gap in the sequence is what the sender's queue dropped."""
+        now_ns = time.time_ns()
+        if self._plain:
+            if sequence != self._expected and not self._follows(sequence):
+                return
+            self._expected = sequence + 1 & _SEQUENCE_MASK
+            if self._replay is not None and self._is_replay(framed):
+                return
+            age = now_ns - stamp_ns + self._time.ahead_ns
+            if age > self._stale_ns and self._give_way(sequence, stamp_ns, framed, age):
+                return
+            if self._stale is not None:
+                self._supersede()
+        elif not self._accept(sequence, stamp_ns, len(framed), now_ns):
+            return
         self._outlet.publish_framed(framed)
-        if sequence != self._expected:
-            self.lost += sequence - self._expected & _SEQUENCE_MASK
-        self._expected = sequence + 1 & _SEQUENCE_MASK
+        self._note(stamp_ns, now_ns, len(framed))
+
+    def part(self, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
+        """Take a part of a large message.
+
+        Raises:
+            RemoteProtocolError: The parts do not make one message.
+        """
+        if flags & FIRST:
+            self._begin(sequence, part)
+        elif flags & ABORT:
+            self._drop_parts()
+            return
+        if self._sequence is None:
+            return  # of a message that is left out
+        if self._sequence != sequence:
+            raise RemoteProtocolError(f"a part of message {sequence} comes in the middle of message {self._sequence}")
+        self._got += len(part)
+        if self._got > self._size or (self._got == self._size) != bool(flags & LAST):
+            raise RemoteProtocolError(f"a message of {self._size} bytes came as {self._got}")
+        if self._parts is None:
+            self._outlet.extend(part)
+        else:
+            self._parts += part
+        if flags & LAST:
+            self._complete(sequence, stamp_ns)
+
+    def close(self) -> None:
+        """No data comes any more."""
+        self._drop_parts()
+        self._stale = None
+        for timer in (self._timer, self._ack_timer):
+            if timer is not None:
+                timer.cancel()
+        self._timer = self._ack_timer = None
+
+    def torn(self) -> None:
+        """The connection is gone: half a message must not stay where it is."""
+        self._drop_parts()
+
+    # --- inside ---------------------------------------------------------------------------------------------
+
+    def _note(self, stamp_ns: int, now_ns: int, size: int) -> None:
+        now = self._loop.time()
         self.messages += 1
-        self.bytes += len(framed)
+        self.bytes += size
         self.last_stamp_ns = stamp_ns
-        self.last_wall_ns = time.time_ns()
-        self.quality.arrived(time.monotonic(), self.last_wall_ns, stamp_ns, len(framed))
+        self.last_wall_ns = now_ns
+        self._last_size = size
+        self.watch.last = now
+        self.quality.arrived(now, now_ns, stamp_ns, size)
+
+    def _follows(self, sequence: int) -> bool:
+        """A jump of the sequence: count what is missing; whether the message is not one from before."""
+        expected = 1 if self._expected < 0 else self._expected
+        gap = sequence - expected & _SEQUENCE_MASK
+        if gap >= _HALF:
+            self.late += 1
+            return False
+        if gap:
+            self._missing(gap)
+        return True
+
+    def _is_replay(self, framed: memoryview) -> bool:
+        latched, self._replay = self._replay, None
+        return latched is not None and framed == memoryview(latched)
+
+    def _missing(self, count: int) -> None:
+        self.lost += count
+        self.watch.lost(count, self._loop.time())
+
+    def _give_way(self, sequence: int, stamp_ns: int, framed: memoryview, age: int) -> bool:
+        """A message that is older than the contract, or an outage, allows; whether it is dealt with.
+
+        Without a lifespan it waits a moment for a newer one behind it, and is delivered if none comes: the last
+        command before a cable was pulled still counts.
+        """
+        error = self._time.error_ns
+        if error is None or age <= self._stale_ns + error:
+            return False
+        if self.contract.lifespan is None and age - self._waited_here() <= self._stale_ns + error:
+            return False  # it is not the link that was late, but we
+        if self.contract.lifespan is not None:
+            self.expired += 1
+            self.watch.expired(1, self._loop.time())
+            return True
+        if sequence == 1:
+            return False  # what a latching publisher said before we listened is as old as it is
+        if self._stale is not None:
+            self.stale += 1
+        self._stale = (sequence, stamp_ns, bytes(framed))
+        if self._timer is None:
+            self._timer = self._loop.call_later(limits.STALE_HOLD, self._nothing_newer)
+        return True
+
+    def _waited_here(self) -> int:
+        """Nanoseconds for which the message may have been here already: this process got no CPU, perhaps."""
+        now = self._loop.time()
+        return round((now - getattr(self._loop, "looked_before", now)) * 1e9)
+
+    def _supersede(self) -> None:
+        self._stale = None
+        self.stale += 1
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def _nothing_newer(self) -> None:
+        self._timer = None
+        if self._stale is not None:
+            _, stamp_ns, framed = self._stale
+            self._stale = None
+            self._outlet.publish_framed(framed)
+            self._note(stamp_ns, time.time_ns(), len(framed))
+
+    def _accept(self, sequence: int, stamp_ns: int, size: int, now_ns: int) -> bool:
+        """Judge a reliable message; acknowledge it, handed on or not."""
+        receiver = self._receiver
+        if receiver is None:
+            return False
+        now = self._loop.time()
+        verdict = receiver.accept(sequence, self._epoch, now, size)
+        if self._ack_timer is None:
+            self._acknowledge(receiver, now)
+        elif (due := receiver.next_timer()) is not None and due <= now:
+            self._ack_timer.cancel()
+            self._acknowledge(receiver, now)
+        if verdict.gap:
+            self._missing(verdict.gap)
+        if not verdict.deliver:
+            self.late += 1
+            return False
+        error = self._time.error_ns
+        if self.contract.lifespan is not None and error is not None:
+            age = now_ns - stamp_ns + self._time.ahead_ns
+            if age > self._stale_ns + error:
+                self.expired += 1
+                self.watch.expired(1, now)
+                return False
+        return True
+
+    def _acknowledge(self, receiver: ReliableReceiver, now: float) -> None:
+        self._ack_timer = None
+        sequence = receiver.due_ack(now)
+        if sequence is not None and self._on_ack is not None:
+            self._on_ack(sequence)
+        due = receiver.next_timer()
+        if due is not None:
+            self._ack_timer = self._loop.call_at(due, self._ack_due)
+
+    def _ack_due(self) -> None:
+        self._ack_timer = None
+        if self._receiver is not None:
+            # The loop's clock may round a timer to a moment before it is due.
+            self._acknowledge(self._receiver, self._loop.time() + 0.001)
+
+    def _begin(self, sequence: int, part: memoryview) -> None:
+        """The first part of a message: its length is in front."""
+        self._drop_parts()
+        if len(part) < _LENGTH:
+            raise RemoteProtocolError(f"a first part of {len(part)} bytes has no length")
+        size = _LENGTH + int.from_bytes(part[:_LENGTH], "little")
+        if size > limits.MESSAGE_MAX:
+            raise LimitExceeded("message", size, limits.MESSAGE_MAX)
+        if self._receiver is not None:
+            # One that may come again must not have reached anybody by half.
+            deliver = self._receiver.judge(sequence, self._epoch).deliver
+            self._parts = bytearray()
+            if not deliver:
+                self._accept(sequence, 0, 0, 0)
+                self._parts = None
+                return
+        elif sequence != self._expected and not self._follows(sequence):
+            return
+        else:
+            self._expected = sequence + 1 & _SEQUENCE_MASK
+            self._outlet.begin(size)
+        self._sequence = sequence
+        self._size, self._got = size, 0
+
+    def _complete(self, sequence: int, stamp_ns: int) -> None:
+        parts, self._parts, self._sequence = self._parts, None, None
+        now_ns = time.time_ns()
+        if parts is not None:
+            if not self._accept(sequence, stamp_ns, len(parts), now_ns):
+                return
+            self._outlet.publish_framed(parts)
+        if self._stale is not None:
+            self._supersede()
+        self._note(stamp_ns, now_ns, self._size)
+
+    def _drop_parts(self) -> None:
+        """Half a message came, and nothing more of it will."""
+        if self._sequence is None:
+            return
+        self._sequence = None
+        if self._parts is not None:
+            self._parts = None
+        elif self._outlet.abort() and self._on_torn is not None:
+            self._on_torn()

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rmpa.bridge.actions import Publish
-from rmpa.bridge.aio.flows import ImportFlow
+from rmpa.bridge.aio.flows import ImportFlow, LinkTime
 from rmpa.bridge.proxy_names import LOOPBACK, proxy_name
 from rmpa.core import limits
+from rmpa.core.contract import Durability, Reliability
 from rmpa.core.errors import RmpaError
 from rmpa.ros.aio.publication import Publication
 from rmpa.ros.aio.slave_server import SlaveNode
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.actions import Describe, Detach, Retract
     from rmpa.bridge.messages import Source
+    from rmpa.bridge.watch import Occurred
     from rmpa.core.counters import Counters
     from rmpa.ros.aio.core import RosCore
 
@@ -53,6 +55,7 @@ class Inbound:
         counters: Where refusals at the proxies' ports are counted.
         on_demand: Called with a source and whether somebody local listens to it.
         on_mismatch: Called with a source, the caller id of a refused subscriber and the text it was told.
+        on_occurred: Called with a source and what became of its contract.
     """
 
     def __init__(
@@ -63,7 +66,9 @@ class Inbound:
         counters: Counters | None = None,
         on_demand: Callable[[Source, bool], None],
         on_mismatch: Callable[[Source, str, str], None],
+        on_occurred: Callable[[Source, Occurred], None],
     ) -> None:
+        self._on_occurred = on_occurred
         self.prefix = prefix
         self._core = core
         self._counters = counters
@@ -75,6 +80,9 @@ class Inbound:
         self._task = asyncio.create_task(self._work(), name=f"proxies {prefix}")
         self.flows: dict[int, ImportFlow] = {}
         """Open routes; the data path looks here."""
+        self.time = LinkTime()
+        self._reliable: dict[Source, ImportFlow] = {}
+        self._watches: dict[Source, asyncio.TimerHandle] = {}
 
     def __iter__(self) -> Iterator[tuple[str, Proxy]]:
         """Each remote node and its proxy."""
@@ -95,12 +103,17 @@ class Inbound:
         self._wanted.pop(action.source, None)
         self._jobs.put_nowait(action)
 
-    def describe(self, action: Describe) -> None:
-        """Data of a source will come on a route; its subscribers learn what it is."""
+    def describe(self, action: Describe, on_ack: Callable[[int], None]) -> None:
+        """Data of a source will come on a route; its subscribers learn what it is.
+
+        Args:
+            action: What is known of it.
+            on_ack: Acknowledges the messages of a reliable route.
+        """
         publication = self.publication(action.source)
         if publication is None:
             return
-        self.flows[action.route] = ImportFlow(publication)
+        self.flows[action.route] = self._flow(action, publication, on_ack)
         about = action.description
         text = about.definition.encode("latin-1").decode(errors="surrogateescape")
         if publication.describe(Description(about.type, about.md5, text, about.latching)):
@@ -109,14 +122,87 @@ class Inbound:
             for delay in limits.CALL_BACK_DELAYS:
                 asyncio.get_running_loop().call_later(delay, self._call_back, action.source, publication)
 
+    def position(self, source: Source) -> tuple[int, int] | None:
+        """Where a reliable source goes on that outlived its link."""
+        flow = self._reliable.get(source)
+        return flow.position if flow is not None else None
+
+    def _flow(self, action: Describe, publication: Publication, on_ack: Callable[[int], None]) -> ImportFlow:
+        """The flow of a route: the one from before its link fell, or a new one."""
+        source, contract = action.source, action.contract
+        flow = self._reliable.pop(source, None)
+        if flow is not None and flow.contract == contract:
+            flow.rebind(on_ack)
+            flow.watch.link_up(asyncio.get_running_loop().time())
+            if not flow.begin_epoch(action.epoch, action.first):
+                _log.warning("! %s: %s: messages were lost, it is not known how many", self.prefix, source)
+        else:
+            if flow is not None:
+                self._end(source, flow)
+            flow = ImportFlow(
+                publication,
+                contract,
+                self.time,
+                on_ack=on_ack,
+                on_torn=lambda: self._call_back(source, publication),
+            )
+            flow.begin_epoch(action.epoch, action.first)
+            flow.expect_replay(publication.latched)
+        publication.bound(contract.depth)
+        if contract.durability is Durability.TRANSIENT_LOCAL:
+            publication.keep(contract.kept)
+        if contract.reliability is Reliability.RELIABLE:
+            self._reliable[source] = flow
+        self._watch(source, flow)
+        return flow
+
+    def _watch(self, source: Source, flow: ImportFlow) -> None:
+        """Look at a source's contract when it may be broken next."""
+        timer = self._watches.pop(source, None)
+        if timer is not None:
+            timer.cancel()
+        due = flow.watch.next_timer()
+        if due is not None:
+            loop = asyncio.get_running_loop()
+            self._watches[source] = loop.call_at(due, self._watch_due, source, flow)
+
+    def _watch_due(self, source: Source, flow: ImportFlow) -> None:
+        self._watches.pop(source, None)
+        for occurred in flow.watch.handle_timer(asyncio.get_running_loop().time()):
+            self._on_occurred(source, occurred)
+        self._watch(source, flow)
+
+    def _end(self, source: Source, flow: ImportFlow) -> None:
+        timer = self._watches.pop(source, None)
+        if timer is not None:
+            timer.cancel()
+        flow.close()
+
     def _call_back(self, source: Source, publication: Publication) -> None:
         proxy = self._proxies.get(source.node)
         if proxy is not None and proxy.publications.get(source.topic) is publication:
             self._register(proxy, source.topic)
 
+    def link_down(self) -> None:
+        """The link is gone: what it brought in part is dropped, and nobody says any more that its sources live."""
+        now = asyncio.get_running_loop().time()
+        for flow in self.flows.values():
+            flow.torn()
+            flow.watch.link_down(now)
+
     def detach(self, action: Detach) -> None:
-        """No data comes on a route any more."""
-        self.flows.pop(action.route, None)
+        """No data comes on a route any more, or not until its peer is back."""
+        flow = self.flows.pop(action.route, None)
+        if action.keep:
+            if flow is not None:
+                self._watch(action.source, flow)
+            return
+        flow = self._reliable.pop(action.source, flow)
+        if flow is not None:
+            # Its proxy goes with it, so that the lease is not waited for.
+            for occurred in flow.watch.link_gone(asyncio.get_running_loop().time()):
+                self._on_occurred(action.source, occurred)
+            self._end(action.source, flow)
         publication = self.publication(action.source)
         if publication is not None:
             publication.forget_latched()
@@ -139,6 +225,12 @@ class Inbound:
 
     async def close(self) -> None:
         """Retract everything that is still there."""
+        for flow in {*self.flows.values(), *self._reliable.values()}:
+            flow.close()
+        for timer in self._watches.values():
+            timer.cancel()
+        self._watches.clear()
+        self._reliable.clear()
         self.flows.clear()
         self._jobs.put_nowait(None)
         await self._task

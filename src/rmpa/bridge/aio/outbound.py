@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from rmpa.bridge.aio.flows import DataLink, ExportFlow
+from rmpa.bridge.aio.flows import ExportFlow
+from rmpa.bridge.aio.legs import ReliableLeg
 from rmpa.bridge.messages import Description, Source
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.core import limits
@@ -15,7 +16,8 @@ from rmpa.ros.tcpros import Description as TcprosDescription
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from rmpa.bridge.actions import AddRoute, Connect, RemoveRoute
+    from rmpa.bridge.actions import AddRoute, Connect, RemoveRoute, SuspendRoute
+    from rmpa.bridge.aio.legs import DataLink, Leg
     from rmpa.ros.aio.core import RosCore
     from rmpa.ros.aio.slave_server import SlaveNode
 
@@ -46,6 +48,7 @@ class Outbound:
         self._on_lost = on_lost
         self._connections: dict[Source, PublisherConnection] = {}
         self._flows: dict[Source, ExportFlow] = {}
+        self._legs: dict[tuple[int, int], Leg] = {}
 
     @property
     def flows(self) -> Mapping[Source, ExportFlow]:
@@ -69,6 +72,7 @@ class Outbound:
             action.uri,
             OWN_NODE,
             on_message=flow.message,
+            on_parts=flow,
             on_header=lambda fields: self._header(source, fields),
             on_refused=lambda text: self._gone(source, connection, f"its publisher refuses: {text}"),
             on_lost=lambda reason: self._gone(source, connection, reason),
@@ -85,14 +89,42 @@ class Outbound:
         self._drop(source)
 
     def add_route(self, action: AddRoute, link: DataLink) -> None:
-        """Send a source to one more peer."""
-        self._flows[action.source].add(link, action.route)
+        """Send a source to one more peer, or go on where its last link ended."""
+        flow = self._flows[action.source]
+        leg = flow.by_peer.get(action.peer)
+        if action.after is not None and isinstance(leg, ReliableLeg) and leg.sender.epoch == action.epoch:
+            leg.resume(link, action.route, action.after)
+        else:
+            leg = flow.add(action.peer, link, action.route, action.contract, action.epoch)
+        self._legs[action.peer, action.route] = leg
 
-    def remove_route(self, action: RemoveRoute, link: DataLink) -> None:
+    def suspend_route(self, action: SuspendRoute) -> None:
+        """Keep a source's messages for a peer whose link is gone."""
+        flow = self._flows.get(action.source)
+        if flow is not None:
+            self._forget(flow.by_peer.get(action.peer), action.peer)
+            flow.suspend(action.peer)
+
+    def remove_route(self, action: RemoveRoute) -> None:
         """Send a source to a peer no longer."""
         flow = self._flows.get(action.source)
         if flow is not None:
-            flow.remove(link, action.route)
+            self._forget(flow.by_peer.get(action.peer), action.peer)
+            flow.remove(action.peer)
+
+    def leg(self, peer: int, route: int) -> Leg | None:
+        """One peer's route."""
+        return self._legs.get((peer, route))
+
+    def lane_lost(self, peer: int) -> None:
+        """The connection of a peer's bulk lane is gone."""
+        for (owner, _), leg in list(self._legs.items()):
+            if owner == peer:
+                leg.lane_lost()
+
+    def _forget(self, leg: Leg | None, peer: int) -> None:
+        if leg is not None and self._legs.get((peer, leg.route)) is leg:
+            del self._legs[peer, leg.route]
 
     def close(self) -> None:
         """Leave all publishers."""
@@ -106,7 +138,8 @@ class Outbound:
         if description.problem:
             self._gone(source, self._connections[source], description.problem)
             return
-        self._flows[source].latching = description.latching
+        if description.latching:
+            self._flows[source].keep(1)
         self._on_described(source, description)
 
     def _gone(self, source: Source, connection: PublisherConnection, reason: str) -> None:
@@ -119,5 +152,10 @@ class Outbound:
         self._core.suspect(source.node)
 
     def _drop(self, source: Source) -> None:
-        if self._flows.pop(source, None) is not None and not any(s.topic == source.topic for s in self._flows):
+        flow = self._flows.pop(source, None)
+        if flow is not None:
+            for peer in list(flow.by_peer):
+                self._forget(flow.by_peer[peer], peer)
+                flow.remove(peer)
+        if flow is not None and not any(s.topic == source.topic for s in self._flows):
             self._core.call("unregisterSubscriber", OWN_NODE, source.topic, self._node.uri)

@@ -20,6 +20,7 @@ import logging
 import math
 import select
 import selectors
+import time
 from collections import deque
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple, cast
@@ -55,6 +56,7 @@ class DirectSelector(selectors.BaseSelector):
         self._readers: dict[int, Callable[[], None]] = {}
         self._writers: dict[int, Callable[[], None]] = {}
         self._calling = False
+        self.woke = self.woke_before = time.monotonic()
 
     def call_directly(self, fd: int, reader: Callable[[], None] | None) -> None:
         """Call ``reader`` when ``fd``, which is registered for reading, is readable; ``None``: as usual again."""
@@ -143,6 +145,7 @@ class DirectSelector(selectors.BaseSelector):
             happened = self._epoll.poll(wait, max(len(self._keys), 1))
         except InterruptedError:
             return []
+        self.woke_before, self.woke = self.woke, time.monotonic()
         ready = []
         for fd, event in self._call(happened):
             key = self._keys.get(fd)
@@ -209,6 +212,14 @@ class AgentLoop(asyncio.SelectorEventLoop):
         self._ready: deque[asyncio.Handle] = _Turnstile(self._direct_selector)
         self.poll_data: Final = self._direct_selector.poll_data
         """Let data that has come go first, now; see ``breathe()``."""
+
+    @property
+    def looked_before(self) -> float:
+        """When the sockets were last looked at before what is being read now came, in monotonic seconds.
+
+        What was not there then came later: so long, and no longer, this process may have let it wait.
+        """
+        return self._direct_selector.woke_before
 
     def add_direct_reader(self, fd: int, callback: Callable[[], None]) -> None:
         """Like ``add_reader``, on the short way; ``remove_reader`` ends it.

@@ -1,7 +1,8 @@
 """A connected TCP socket on the data path: one growing read buffer, one ``sendmsg`` a write, a bounded outbox.
 
 asyncio's own transports join or copy what they cannot send at once and have no bound with a policy; this one
-keeps to ``core.outbox`` and costs one system call a message each way.
+keeps to ``core.outbox`` and costs one system call a message each way. A large message is sent in parts while it
+still arrives: ``open`` and ``extend``.
 """
 
 from __future__ import annotations
@@ -15,15 +16,17 @@ from typing import Final, cast
 
 from rmpa.core import limits
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.outbox import URGENT, Outbox
+from rmpa.core.outbox import ABORT, FIRST, LAST, URGENT, Framer, Outbox, Parcel
 
 _log = logging.getLogger(__name__)
 
 _FIRST_BUFFER: Final = 64 * limits.KIB
+_BUSY_BUFFER: Final = 256 * limits.KIB
 _KEPT_BUFFER: Final = 4 * limits.MIB
 _IOV: Final = 64
 _CORK_MESSAGES: Final = 128
-_CORK_BYTES: Final = 64 * limits.KIB
+_CORK_BYTES: Final = 512 * limits.KIB
+_PART: Final = limits.MIB
 
 Buffer = bytes | bytearray | memoryview
 OnBytes = Callable[[memoryview], tuple[int, int]]
@@ -44,22 +47,36 @@ class Stream:
             exception is a bug, is logged, and closes the stream too.
         on_close: Called once, from the loop and never from within a method, when the socket is gone: with
             ``None`` after an orderly end, with the error otherwise. Not called after ``close()``.
-        outbox: The bounds for what waits.
+        outbox: The bounds for what waits; what waits in it already is sent first.
+        frame: Makes the header of each fragment of an opened message; without it its bytes go out as they are.
+            The outbox has the same one.
+        keep: What waits when the socket is gone stays in the outbox, for the next one.
     """
 
-    def __init__(self, sock: socket.socket, *, on_bytes: OnBytes, on_close: OnClose, outbox: Outbox) -> None:
+    def __init__(
+        self,
+        sock: socket.socket,
+        *,
+        on_bytes: OnBytes,
+        on_close: OnClose,
+        outbox: Outbox,
+        frame: Framer | None = None,
+        keep: bool = False,
+    ) -> None:
         self._loop = asyncio.get_running_loop()
         self._sock = sock
         self._on_bytes = on_bytes
         self._on_close = on_close
         self._outbox = outbox
+        self._frame = frame
+        self._keep = keep
         self._buffer = bytearray(_FIRST_BUFFER)
         self._view = memoryview(self._buffer)
         self._filled = 0
         self._wanted = 0
         self._writing = False
         self._finishing = False
-        self._kept: list[tuple[Sequence[Buffer], int]] = []
+        self._kept: list[tuple[Sequence[Buffer], int, bool]] = []
         self._kept_bytes = 0
         self._closed = False
         self._drained: asyncio.Future[None] | None = None
@@ -72,6 +89,8 @@ class Stream:
         # An agent's loop has a short way for the data path; elsewhere (tools, tests) the usual one does.
         add_reader = getattr(self._loop, "add_direct_reader", self._loop.add_reader)
         add_reader(self._fd, self._readable)
+        if outbox:
+            self._wait_for_room()
 
     @property
     def closed(self) -> bool:
@@ -119,7 +138,29 @@ class Stream:
             return 0
         return self._send_now(parts, key)
 
-    def _send_now(self, parts: Sequence[Buffer], key: int) -> int:
+    def send_mark(self, data: bytes, key: int) -> None:
+        """Send a mark behind the messages of a key; unlike those it is never dropped."""
+        if self._closed or self._finishing:
+            return
+        if self._kept:
+            self._uncork()
+        if self._writing:
+            self._outbox.push(data, key, self._loop.time(), pinned=True)
+        else:
+            self._send_now((data,), key)
+
+    def adopt(self, outbox: Outbox, frame: Framer | None) -> None:
+        """Send from another outbox from now on, first what waits in it already; it outlives the stream."""
+        self._uncork()
+        rest = b"".join(self._outbox.head(1 << 20))
+        self._outbox.clear()
+        outbox.prepend(rest)
+        self._outbox = outbox
+        self._frame = frame
+        self._keep = True
+        self.pump()
+
+    def _send_now(self, parts: Sequence[Buffer], key: int, part: bool = False) -> int:
         try:
             sent = self._sock.sendmsg(parts)
         except (BlockingIOError, InterruptedError):
@@ -129,23 +170,99 @@ class Stream:
             return 0
         self.bytes_out += sent
         size = 0
-        for part in parts:
-            size += len(part)
+        for buffer in parts:
+            size += len(buffer)
         if sent == size:
             return 0
-        self._writing = True
-        self._loop.add_writer(self._fd, self._writable)
-        if not sent:
+        self._wait_for_room()
+        if not sent and not part:
             return self._queue(b"".join(parts), key)
         self._outbox.push_rest(_behind(parts, sent), key)
         return 0
 
-    def _cork(self, parts: Sequence[Buffer], key: int) -> None:
+    def _wait_for_room(self) -> None:
+        self._writing = True
+        self._loop.add_writer(self._fd, self._writable)
+
+    # --- messages in parts ----------------------------------------------------------------------------------
+
+    def open(self, key: int, size: int, sequence: int = 0, stamp_ns: int = 0) -> Parcel:
+        """Begin a message of ``size`` bytes whose bytes follow by ``extend``, before the next one of its key."""
+        return Parcel(key, size, sequence, stamp_ns, self._loop.time())
+
+    def extend(self, parcel: Parcel, data: Buffer) -> int:
+        """Send further bytes of a message, or queue what the socket does not take; return as for ``send``.
+
+        ``data`` is not kept after the call. Bytes of a message that was dropped are ignored.
+        """
+        if self._closed or self._finishing or parcel.dropped:
+            return 0
+        view = memoryview(data)
+        dropped = 0
+        while len(view) > _PART:
+            dropped += self._extend(parcel, view[:_PART])
+            view = view[_PART:]
+        return dropped + self._extend(parcel, view)
+
+    def _extend(self, parcel: Parcel, view: memoryview) -> int:
+        if self._writing:
+            return self._outbox.extend(parcel, bytes(view))
+        if self._outbox.waiting(parcel.key):
+            # Its first bytes had to wait, and the outbox counts them.
+            dropped = self._outbox.extend(parcel, bytes(view))
+            self._wait_for_room()
+            self._writable()
+            return dropped
+        parts: list[Buffer] = self._framed(parcel, view) if self._frame is not None else [view]
+        parcel.sent += len(view)
+        if _corked is not None:
+            self._cork(parts, parcel.key, part=True)
+            return 0
+        return self._send_now(parts, parcel.key, part=True)
+
+    def abandon(self, parcel: Parcel) -> bool:
+        """The rest of a message will never come.
+
+        Returns:
+            Whether the other side holds half of it and cannot be told: the connection must be closed.
+        """
+        if self._closed or parcel.sent == parcel.size:
+            return False
+        if self._kept:
+            self._uncork()
+        if not self._writing and parcel.sent and not parcel.dropped and self._frame is not None:
+            parcel.dropped = True
+            self._send_now([self._frame(parcel, 0, LAST | ABORT)], parcel.key)
+            return False
+        torn = self._outbox.abandon(parcel)
+        self.pump()
+        return torn
+
+    def pump(self) -> None:
+        """Send what was put into the outbox from elsewhere."""
+        if self._outbox and not self._writing and not self._closed:
+            self._wait_for_room()
+
+    def _framed(self, parcel: Parcel, view: memoryview) -> list[Buffer]:
+        """The bytes with a header in front of each fragment."""
+        frame = cast("Framer", self._frame)
+        parts: list[Buffer] = []
+        size = len(view)
+        for start in range(0, size, limits.FRAGMENT_BYTES):
+            part = view[start : start + limits.FRAGMENT_BYTES]
+            first = FIRST if parcel.sent + start == 0 else 0
+            last = LAST if parcel.sent + start + len(part) == parcel.size else 0
+            parts += (frame(parcel, len(part), first | last), part)
+        return parts
+
+    # --- the end --------------------------------------------------------------------------------------------
+
+    def _cork(self, parts: Sequence[Buffer], key: int, *, part: bool = False) -> None:
         """Keep a message until the read that it came from is done with; what is kept is sent in one call."""
         cast("list[Stream]", _corked).append(self)
-        self._kept.append((parts, key))
-        for part in parts:
-            self._kept_bytes += len(part)
+        self._kept.append((parts, key, part))
+        for buffer in parts:
+            self._kept_bytes += len(buffer)
         if len(self._kept) >= _CORK_MESSAGES or self._kept_bytes >= _CORK_BYTES:
             self._uncork()
 
@@ -158,7 +275,7 @@ class Stream:
             self._send_now(*kept[0])
             return
         try:
-            sent = self._sock.sendmsg([part for parts, _ in kept for part in parts])
+            sent = self._sock.sendmsg([buffer for parts, _, _ in kept for buffer in parts])
         except (BlockingIOError, InterruptedError):
             sent = 0
         except OSError as error:
@@ -168,17 +285,18 @@ class Stream:
         if sent < size:
             self._keep_rest(kept, sent)
 
-    def _keep_rest(self, kept: list[tuple[Sequence[Buffer], int]], sent: int) -> None:
+    def _keep_rest(self, kept: list[tuple[Sequence[Buffer], int, bool]], sent: int) -> None:
         """Queue what a batch's ``sendmsg`` did not take: the rest of one message perhaps, then whole ones."""
-        self._writing = True
-        self._loop.add_writer(self._fd, self._writable)
-        for parts, key in kept:
+        self._wait_for_room()
+        for parts, key, part in kept:
             length = sum(map(len, parts))
             if sent >= length:
                 sent -= length
             elif sent > 0:
                 self._outbox.push_rest(_behind(parts, sent), key)
                 sent = 0
+            elif part:
+                self._outbox.commit(b"".join(parts))
             else:
                 self._queue(b"".join(parts), key)
 
@@ -213,7 +331,7 @@ class Stream:
         if key == URGENT:
             self._outbox.push_urgent(message)
             return 0
-        return self._outbox.push(message, key)
+        return self._outbox.push(message, key, self._loop.time())
 
     def _shut(self) -> None:
         if self._closed:
@@ -225,7 +343,8 @@ class Stream:
         self._sock.close()
         self._view = memoryview(b"")
         self._buffer = bytearray()
-        self._outbox.clear()
+        if not self._keep:
+            self._outbox.clear()
         self._done_draining()
 
     def _shut_write(self) -> None:
@@ -264,6 +383,8 @@ class Stream:
         self.last_in = self._loop.time()
         self.bytes_in += count
         self._filled += count
+        if self._filled == _FIRST_BUFFER == len(self._buffer):
+            self._reserve(_BUSY_BUFFER)  # more is waiting: large messages, in fewer reads from now on
         if self._filled >= self._wanted or self._filled == len(self._buffer):
             self._deliver()
 
@@ -304,7 +425,8 @@ class Stream:
 
     def _writable(self) -> None:
         try:
-            sent = self._sock.sendmsg(self._outbox.head(_IOV))
+            parts = self._outbox.head(_IOV, self._loop.time())
+            sent = self._sock.sendmsg(parts) if parts else 0  # all that waited may have been too old
         except (BlockingIOError, InterruptedError):
             return
         except OSError as error:

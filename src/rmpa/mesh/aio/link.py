@@ -3,21 +3,36 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core import limits
 from rmpa.core.aio.stream import Stream
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import URGENT, Outbox
-from rmpa.mesh.frames import pack_data_header
-from rmpa.mesh.link import Closed, ControlReceived, Event, HelloReceived, Link, Ponged, Refused, Role, State, Up
+from rmpa.mesh.aio.lane import LaneSender
+from rmpa.mesh.frames import Frame, Kind
+from rmpa.mesh.handshake import Lane
+from rmpa.mesh.link import (
+    Closed,
+    ControlReceived,
+    Event,
+    HelloReceived,
+    Link,
+    Marked,
+    Ponged,
+    Refused,
+    Role,
+    State,
+    Up,
+)
 
 if TYPE_CHECKING:
     import socket
-    from collections import Counter
 
     from rmpa.core.clock import Clock
     from rmpa.core.guid import Guid
@@ -26,8 +41,14 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-Buffer = bytes | bytearray | memoryview
+_SILENCE: Final = frozenset(
+    {errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ENETDOWN, errno.ECONNRESET, errno.EPIPE}
+)
+"""How a connection ends whose other side gave it up after a silence, or whose process died with bytes unread."""
+
 OnLinkData = Callable[["MeshLink", int, int, int, memoryview], None]
+OnLinkPart = Callable[["MeshLink", int, int, int, int, memoryview], None]
+OnLinkMark = Callable[["MeshLink", Kind, int, int], None]
 
 
 class LinkOwner(Protocol):
@@ -49,13 +70,39 @@ class LinkOwner(Protocol):
         """A control frame came."""
         ...
 
+    def link_quiet(self, link: MeshLink) -> None:
+        """Nothing came for ``limits.GHOST_QUIET``; called again from time to time while that lasts."""
+        ...
+
     def link_ended(self, link: MeshLink, reason: str, *, malformed: bool, was_up: bool) -> None:
         """The socket is closed, once a link."""
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class Takers:
+    """Who takes what comes on a link that is used with its peer.
+
+    Args:
+        data: ``(link, route, sequence, stamp_ns, payload)``: a whole message; the payload is only valid during the
+            call.
+        part: ``(link, route, sequence, stamp_ns, flags, part)``: a part of one, likewise.
+        mark: ``(link, kind, route, sequence)``: an acknowledgement, or the answer to a fence.
+        clock: ``(link)``: the peer's clock is known, or known better.
+        lane_lost: ``(link)``: the bulk lane's connection is gone, and what was on its way; the link is not.
+    """
+
+    data: OnLinkData
+    part: OnLinkPart
+    mark: OnLinkMark
+    clock: Callable[[MeshLink], None]
+    lane_lost: Callable[[MeshLink], None]
+
+
 class MeshLink:
-    """One link, as the rooms above see it.
+    """One connection with a peer.
+
+    That of the express lane is the link, as the rooms above see it; it has the bulk lane's while there is one.
 
     Args:
         link_id: The mesh's number for it.
@@ -66,6 +113,7 @@ class MeshLink:
         clock: The time.
         expected: Whom we believe we dialled.
         endpoint: The other end's address and port.
+        lane: What we dial for; of an accepted one the other side's hello says it.
     """
 
     def __init__(
@@ -79,6 +127,7 @@ class MeshLink:
         clock: Clock,
         endpoint: tuple[str, int],
         expected: Guid | None = None,
+        lane: Lane = Lane.EXPRESS,
     ) -> None:
         self.id = link_id
         self.remote_endpoint = endpoint
@@ -93,11 +142,23 @@ class MeshLink:
         self._end: asyncio.Future[None] = self._loop.create_future()
         self._ended = False
         self._leaving = False
+        self._mark_to: Callable[[Kind, int, int], None] | None = None
+        self._of = self
         self._malformed = False
+        self.silent = False
+        """Once it has ended: whether nobody said so; its peer may be there, and the cable is not."""
         self.used = False
         """Whether this is the link that is used with its peer."""
-        self._outbox = Outbox(limits.ROUTE_QUEUE_MESSAGES, limits.LINK_QUEUE_BYTES)
-        self._stream = Stream(sock, on_bytes=self._take, on_close=self._lost, outbox=self._outbox)
+        self.express = LaneSender("express")
+        self.bulk = LaneSender("bulk")
+        self._bulk_link: MeshLink | None = None
+        self._takers: Takers | None = None
+        self._asked = lane
+        self._bulk_before = [0, 0]
+        self.sock = sock
+        self._stream = Stream(
+            sock, on_bytes=self._take, on_close=self._lost, outbox=Outbox(1, limits.LINK_URGENT_BYTES)
+        )
         self._machine = Link(
             role,
             ours,
@@ -106,6 +167,8 @@ class MeshLink:
             on_event=self._event,
             on_data=_ignore,
             expected=expected,
+            lane=lane,
+            lease=limits.BULK_LEASE if lane is Lane.BULK else limits.LINK_LEASE,
             label=f"{endpoint[0]}:{endpoint[1]}",
         )
         self._after()
@@ -149,8 +212,14 @@ class MeshLink:
 
     @property
     def lane(self) -> int:
-        """What the connection is for (``handshake.Lane``); only once it is up."""
-        return self._hello.lane
+        """What the connection is for (``handshake.Lane``); of an accepted one once the other side said it."""
+        remote = self._machine.remote
+        return self._asked if self.dialled or remote is None else remote.lane
+
+    @property
+    def bulk_link(self) -> MeshLink | None:
+        """The bulk lane's connection, while there is one."""
+        return self._bulk_link
 
     @property
     def rtt(self) -> float | None:
@@ -171,44 +240,39 @@ class MeshLink:
 
     @property
     def bytes_in(self) -> int:
-        """Bytes received, headers included."""
-        return self._stream.bytes_in
+        """Bytes received, headers included, by both lanes."""
+        return self._stream.bytes_in + self._bulk_before[0] + (self._bulk_link.bytes_in if self._bulk_link else 0)
 
     @property
     def bytes_out(self) -> int:
-        """Bytes that the kernel took, headers included."""
-        return self._stream.bytes_out
+        """Bytes that the kernel took, headers included, on both lanes."""
+        return self._stream.bytes_out + self._bulk_before[1] + (self._bulk_link.bytes_out if self._bulk_link else 0)
 
     @property
     def queue_bytes(self) -> int:
-        """Bytes that wait for the kernel."""
-        return self._outbox.pending_bytes
+        """Bytes that wait for the kernel, on both lanes."""
+        return self._stream.pending_bytes + self.bulk.outbox.pending_bytes
 
     @property
-    def dropped(self) -> Counter[int]:
-        """Messages dropped so far, by route."""
-        return self._outbox.dropped
+    def dropped(self) -> int:
+        """Messages dropped so far because the peer took them too slowly."""
+        return self.express.outbox.dropped.total() + self.bulk.outbox.dropped.total()
+
+    @property
+    def expired(self) -> int:
+        """Messages dropped so far because they had become too old before the peer took them."""
+        return self.express.outbox.expired.total() + self.bulk.outbox.expired.total()
 
     @property
     def heard_at(self) -> float:
         """Monotonic seconds at which bytes last came."""
         return max(self._machine.heard_at, self._stream.last_in)
 
-    def send_data(self, route: int, sequence: int, stamp_ns: int, payload: Buffer) -> int:
-        """Send one message; what the socket does not take is queued, keep-last, and copied only then.
-
-        Args:
-            route: The route's id, 32 bits.
-            sequence: The message's number on its route; its low 32 bits are sent.
-            stamp_ns: When it was published, wall clock.
-            payload: Its bytes, not kept after the call.
-
-        Returns:
-            How many older messages were dropped to make room. Without effect (0) once the link is leaving.
-        """
-        if self._machine.state is not State.UP:
-            return 0
-        return self._stream.send((pack_data_header(len(payload), route, sequence, stamp_ns), payload), route)
+    def mark(self, kind: Kind, route: int, sequence: int) -> None:
+        """Acknowledge messages of a route, or answer a fence: in front of all data that waits."""
+        if self._machine.state is State.UP:
+            frame = Frame(kind, route=route, sequence=sequence & 0xFFFFFFFF).serialize()
+            self._stream.send((frame,), URGENT)
 
     def send_control(self, payload: bytes) -> None:
         """Send one control frame, before all data that waits; never dropped.
@@ -237,9 +301,8 @@ class MeshLink:
             self._pings.pop(stamp, None)
 
     def close_route(self, route: int) -> int:
-        """Discard what waits of a closed route; return how many messages that were. Its drop count ends too."""
-        self._outbox.dropped.pop(route, None)
-        return self._outbox.discard(route)
+        """Discard what waits of a closed route; return how many messages that were. Its drop counts end too."""
+        return self.express.close_route(route) + self.bulk.close_route(route)
 
     def close(self, reason: str) -> None:
         """Say bye, let the last bytes leave for at most ``limits.DRAIN_TIMEOUT``, and close."""
@@ -254,12 +317,45 @@ class MeshLink:
         """Wait until the socket is closed and the owner knows."""
         await asyncio.shield(self._end)
 
-    def use(self, on_data: OnLinkData | None) -> None:
-        """Whether this is the link that is used with its peer: data goes to ``on_data``, or nowhere."""
-        self.used = on_data is not None
-        self._machine.on_data = _ignore if on_data is None else partial(on_data, self)
+    def use(self, takers: Takers | None) -> None:
+        """Whether this is the link that is used with its peer: data goes to its takers, or nowhere."""
+        self.used = takers is not None
+        self._takers = takers
+        self._listen(self, takers)
+        if self._bulk_link is not None:
+            self._bulk_link._listen(self, takers)  # noqa: SLF001 - its own class
+
+    def attach(self, bulk: MeshLink) -> None:
+        """Carry the bulk lane by this connection from now on; an older one is closed."""
+        if self._bulk_link is not None:
+            old = self._bulk_link
+            self.detach(old)
+            old.close("replaced by a newer bulk lane")
+        self._bulk_link = bulk
+        bulk._listen(self, self._takers)
+        self.bulk.connect(bulk._stream)
+
+    def detach(self, bulk: MeshLink) -> bool:
+        """The bulk lane's connection is gone; whether it was this one."""
+        if self._bulk_link is not bulk:
+            return False
+        self._bulk_link = None
+        self._bulk_before[0] += bulk.bytes_in
+        self._bulk_before[1] += bulk.bytes_out
+        bulk._listen(self, None)
+        self.bulk.disconnect()
+        if self._takers is not None:
+            self._takers.lane_lost(self)
+        return True
 
     # --- inside ---------------------------------------------------------------------------------------------
+
+    def _listen(self, link: MeshLink, takers: Takers | None) -> None:
+        """Hand what comes to the takers, as of ``link``, the peer's express lane."""
+        self._machine.on_data = _ignore if takers is None else partial(takers.data, link)
+        self._machine.on_part = _ignore_part if takers is None else partial(takers.part, link)
+        self._mark_to = None if takers is None else partial(takers.mark, link)
+        self._of = link
 
     @property
     def _hello(self) -> Hello:
@@ -281,9 +377,13 @@ class MeshLink:
     def _event(self, event: Event) -> None:
         if isinstance(event, ControlReceived):
             self._owner.link_control(self, event.payload)
+        elif isinstance(event, Marked):
+            self._marked(event)
         elif isinstance(event, Ponged):
             if (answer := self._pings.get(event.stamp)) is not None and not answer.done():
                 answer.set_result(event.rtt)
+            if self._takers is not None:
+                self._takers.clock(self)
         elif isinstance(event, HelloReceived):
             verdict = self._owner.link_judge(self, event.hello)
             if verdict is None:
@@ -295,11 +395,20 @@ class MeshLink:
             # The welcome leaves before whatever the owner sends now.
             self._after()
             self._arm()
+            if self.lane != Lane.BULK:
+                self.express.connect(self._stream)
             self._owner.link_opened(self)
         elif isinstance(event, Refused):
             self._owner.link_refused(self, event.refuse, by_us=event.by_us)
         elif isinstance(event, Closed):
             self._finish(event.reason)
+
+    def _marked(self, event: Marked) -> None:
+        """A fence is answered on the express lane, whichever it came by; the rest is the takers'."""
+        if event.kind is Kind.FENCE:
+            self._of.mark(Kind.FENCED, event.route, event.sequence)
+        elif self._mark_to is not None:
+            self._mark_to(event.kind, event.route, event.sequence)
 
     def _after(self) -> None:
         """Send what the machine has to say; a link that leaves waits for the other end, or its time."""
@@ -309,14 +418,25 @@ class MeshLink:
         if self._machine.state is State.CLOSING and not self._leaving:
             # Closing at once would turn what the other side still sends into a reset that overtakes our bye.
             self._leaving = True
+            self._end_lanes(f"{self.name}: its express lane ends")
             self._stream.finish()
             self._arm()
 
     def _check_urgent(self) -> None:
-        if self._outbox.urgent_bytes > limits.LINK_URGENT_BYTES:
-            self.abort(f"{self.name} does not read: {self._outbox.urgent_bytes} bytes of control frames wait for it")
+        waiting = self._stream.outbox.urgent_bytes
+        if waiting > limits.LINK_URGENT_BYTES:
+            self.abort(f"{self.name} does not read: {waiting} bytes of control frames wait for it")
+
+    def _end_lanes(self, reason: str) -> None:
+        self.express.end()
+        self.bulk.end()
+        if self._bulk_link is not None:
+            bulk, self._bulk_link = self._bulk_link, None
+            bulk._listen(self, None)  # noqa: SLF001 - its own class
+            bulk.close(reason)
 
     def _lost(self, error: Exception | None) -> None:
+        self.silent = isinstance(error, OSError) and error.errno in _SILENCE
         reason = f"{self.name} closed the connection" if error is None else f"connection to {self.name} lost: {error}"
         self._machine.lost(reason)
 
@@ -324,6 +444,7 @@ class MeshLink:
         if self._ended:
             return
         self._ended = True
+        self._end_lanes(reason)
         if self._timer is not None:
             self._timer.cancel()
         # Not from here: this may be ``receive``, or a ``send`` in the middle of the owner's loop over its links.
@@ -347,10 +468,18 @@ class MeshLink:
         self._timer = None
         # A large message renews the lease while it arrives, long before the machine sees a whole frame of it.
         self._machine.heard(self._stream.last_in)
+        was_up = self._machine.state is State.UP
         self._machine.handle_timer(self._clock.now())
+        self.silent = was_up and self._machine.state is State.CLOSED
+        if was_up and not self.silent and self._clock.now() - self.heard_at > limits.GHOST_QUIET:
+            self._owner.link_quiet(self)
         self._after()
         self._arm()
 
 
 def _ignore(_route: int, _sequence: int, _stamp_ns: int, _payload: memoryview) -> None:
     """Data on a link that is not used (another one with the same peer is)."""
+
+
+def _ignore_part(_route: int, _sequence: int, _stamp_ns: int, _flags: int, _part: memoryview) -> None:
+    """The same for data in parts."""

@@ -15,12 +15,14 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from rmpa.core import limits
 from rmpa.core.aio.clock import SystemClock
+from rmpa.core.backoff import Backoff
+from rmpa.core.config import LaneSettings
 from rmpa.core.counters import Counters, RefusalLog
-from rmpa.mesh.aio.link import MeshLink, OnLinkData
-from rmpa.mesh.aio.sockets import tune_express
-from rmpa.mesh.handshake import Refusal
+from rmpa.mesh.aio.link import MeshLink, Takers
+from rmpa.mesh.aio.sockets import tune_bulk, tune_express, unacknowledged
+from rmpa.mesh.handshake import Lane, Refusal
 from rmpa.mesh.link import Role
-from rmpa.mesh.peering import CloseLink, Dial, LinkDown, LinkRefused, LinkUp, Output, Peering, PeerStatus
+from rmpa.mesh.peering import REPLACED, CloseLink, Dial, LinkDown, LinkRefused, LinkUp, Output, Peering, PeerStatus
 
 if TYPE_CHECKING:
     from rmpa.core.clock import Clock
@@ -32,7 +34,7 @@ _log = logging.getLogger(__name__)
 
 _ACCEPTS: Final = 16
 _NO_ROOM: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
-_ORDINARY: Final = frozenset({Refusal.ALREADY_LINKED, Refusal.MYSELF})
+_ORDINARY: Final = frozenset({Refusal.ALREADY_LINKED, Refusal.MYSELF, Refusal.NO_EXPRESS})
 
 OnLinkUp = Callable[[MeshLink], None]
 OnLinkDown = Callable[[MeshLink, str], None]
@@ -58,7 +60,8 @@ class LinkStatus:
         bytes_in: Received.
         bytes_out: Sent.
         queue_bytes: Waiting for the kernel.
-        dropped: Messages dropped, by route.
+        dropped: Messages dropped because the peer took them too slowly.
+        bulk: Whether it is a bulk lane's connection.
     """
 
     id: int
@@ -75,7 +78,8 @@ class LinkStatus:
     bytes_in: int
     bytes_out: int
     queue_bytes: int
-    dropped: dict[int, int]
+    dropped: int
+    bulk: bool
 
 
 class Mesh:
@@ -90,8 +94,8 @@ class Mesh:
         on_link_up: A peer is linked.
         on_link_down: It is no more, and why.
         on_control: ``(link, payload)``: a control frame came.
-        on_data: ``(link, route, sequence, stamp_ns, payload)``: a message came; the payload is only valid
-            during the call.
+        takers: What takes the messages that come.
+        lanes: What the lanes' sockets are asked for.
         clock: The time; its ``now`` must be the loop's own clock.
         counters: Where refusals and failures are counted.
         rng: Uniform numbers in [0, 1), for jitter.
@@ -105,7 +109,8 @@ class Mesh:
         on_link_up: OnLinkUp,
         on_link_down: OnLinkDown,
         on_control: OnControl,
-        on_data: OnLinkData,
+        takers: Takers,
+        lanes: LaneSettings | None = None,
         clock: Clock | None = None,
         counters: Counters | None = None,
         rng: Callable[[], float] = random.random,
@@ -116,7 +121,8 @@ class Mesh:
         self._on_link_up = on_link_up
         self._on_link_down = on_link_down
         self._on_control = on_control
-        self._on_data = on_data
+        self._takers = takers
+        self._lanes = lanes if lanes is not None else LaneSettings()
         self._clock = clock if clock is not None else SystemClock()
         self._refusals = RefusalLog(_log, self.counters)
         self._peering = Peering(identity, rng=rng, alive=self._alive)
@@ -124,6 +130,10 @@ class Mesh:
         self._pending: set[int] = set()
         self._dialled: dict[int, Guid] = {}
         self._dials: set[asyncio.Task[None]] = set()
+        self._bulk_dials: dict[int, asyncio.Task[None]] = {}
+        self._bulk_backoffs: dict[int, Backoff] = {}
+        self._redials: dict[int, asyncio.Task[None]] = {}
+        self._rng = rng
         self._ids = count(1)
         self._timer: asyncio.TimerHandle | None = None
         self._accept_timer: asyncio.TimerHandle | None = None
@@ -148,7 +158,7 @@ class Mesh:
         for timer in (self._timer, self._accept_timer):
             if timer is not None:
                 timer.cancel()
-        dials = list(self._dials)
+        dials = [*self._dials, *self._bulk_dials.values(), *self._redials.values()]
         for task in dials:
             task.cancel()
         await asyncio.gather(*dials, return_exceptions=True)
@@ -190,6 +200,11 @@ class Mesh:
         """The link that is used with this peer."""
         return next((k for k in self._links.values() if k.used and k.guid == guid), None)
 
+    def _express_of(self, bulk: MeshLink) -> MeshLink | None:
+        """The used link of the peer that a bulk lane's connection belongs to."""
+        instance = bulk.identity.instance
+        return next((k for k in self._links.values() if k.used and k.identity.instance == instance), None)
+
     # --- what links say (LinkOwner) -------------------------------------------------------------------------
 
     def link_judge(self, link: MeshLink, hello: Hello) -> Verdict:  # noqa: ARG002 - the protocol's form
@@ -200,6 +215,9 @@ class Mesh:
         """A handshake ended well."""
         self._pending.discard(link.id)
         self._dialled.pop(link.id, None)
+        if link.lane == Lane.BULK:
+            self._bulk_opened(link)
+            return
         self._peering.link_up(
             link.id, link.identity, self._clock.now(), dialled=link.dialled, endpoint=link.remote_endpoint
         )
@@ -214,6 +232,8 @@ class Mesh:
         elif by_us:
             text = f"refused a link with {link.name} at {link.remote_endpoint[0]}: {refuse.text}"
             self._refusals.refuse(now, f"link.refused.{refuse.label}", link.remote_endpoint[0], text)
+        if link.lane == Lane.BULK:
+            return  # its end, which follows, is what makes us try again
         guid = self._dialled.pop(link.id, None)
         if guid is not None:
             self._peering.dial_refused(guid, refuse, now)
@@ -223,6 +243,13 @@ class Mesh:
         """A control frame came."""
         if link.used:
             self._on_control(link, payload)
+
+    def link_quiet(self, link: MeshLink) -> None:
+        """A link is silent: TCP repeats ever more rarely, so try whether a new connection gets through."""
+        if self._running and link.used and link.dialled and link.id not in self._redials:
+            task = asyncio.get_running_loop().create_task(self._redial(link), name=f"redial {link.name}")
+            self._redials[link.id] = task
+            task.add_done_callback(lambda _: self._redials.pop(link.id, None))
 
     def link_ended(self, link: MeshLink, reason: str, *, malformed: bool, was_up: bool) -> None:
         """A socket is closed."""
@@ -234,6 +261,10 @@ class Mesh:
         elif not was_up and not link.dialled:
             self.counters.add("link.unfinished")
             _log.debug("! %s: %s", link.name, reason)
+        if link.lane == Lane.BULK:
+            self._bulk_ended(link, reason)
+            return
+        self._bulk_backoffs.pop(link.id, None)
         guid = self._dialled.pop(link.id, None)
         if guid is not None:
             self._peering.dial_failed(guid, reason, now)
@@ -267,13 +298,15 @@ class Mesh:
                 link.close(output.reason)
         elif isinstance(output, LinkUp):
             link = self._links[output.link_id]
-            link.use(self._on_data)
+            link.use(self._takers)
             _log.info("= %s: linked (%s)", output.identity, "dialled" if link.dialled else "accepted")
             self._on_link_up(link)
+            self._bulk_wanted(link)
         elif isinstance(output, LinkDown):
             _log.info("= %s: link down: %s", output.identity, output.reason)
             down = self._links.get(output.link_id, ended)
             if down is not None:
+                down.silent = down.silent or output.reason == REPLACED
                 down.use(None)
                 self._on_link_down(down, output.reason)
         elif isinstance(output, LinkRefused):
@@ -296,39 +329,126 @@ class Mesh:
         link = self._links.get(link_id)
         return link is not None and self._clock.now() - link.heard_at < limits.GHOST_QUIET
 
+    # --- bulk lanes -----------------------------------------------------------------------------------------
+
+    def _bulk_wanted(self, link: MeshLink, delay: float = 0.0) -> None:
+        """Dial a link's bulk lane, if it is ours to dial: who reached the other once will do so again."""
+        ours = self._running and link.used and link.dialled
+        if ours and link.bulk_link is None and link.id not in self._bulk_dials:
+            task = asyncio.get_running_loop().create_task(self._dial_bulk(link, delay), name=f"bulk {link.name}")
+            self._bulk_dials[link.id] = task
+            task.add_done_callback(lambda _: self._bulk_dials.pop(link.id, None))
+
+    async def _dial_bulk(self, link: MeshLink, delay: float) -> None:
+        backoff = self._bulk_backoffs.setdefault(
+            link.id, Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng)
+        )
+        await asyncio.sleep(delay)
+        while link.used:
+            try:
+                sock = await self._connect(link.remote_endpoint, Lane.BULK)
+            except OSError as error:
+                self.counters.add("link.bulk_failed")
+                _log.debug("! %s: no bulk lane: %s", link.name, error)
+                await asyncio.sleep(backoff.delay())
+                continue
+            self._open(sock, Role.DIALLER, link.remote_endpoint, link.guid, Lane.BULK)
+            return
+
+    def _bulk_opened(self, bulk: MeshLink) -> None:
+        express = self._express_of(bulk)
+        if express is None:
+            bulk.close("its express lane is gone")
+            return
+        self._bulk_backoffs.pop(express.id, None)
+        tune_bulk(bulk.sock, self._lanes, self.counters)  # an accepted one only now says what it is for
+        express.attach(bulk)
+        _log.debug("= %s: bulk lane (%s)", bulk.name, "dialled" if bulk.dialled else "accepted")
+
+    def _bulk_ended(self, bulk: MeshLink, reason: str) -> None:
+        """A bulk lane's connection is over, or was refused; its link goes on, and gets another."""
+        expected = self._dialled.pop(bulk.id, None)
+        _log.debug("= %s: bulk lane ended: %s", bulk.name, reason)
+        for link in list(self._links.values()):
+            ours = link.detach(bulk)
+            if ours or (link.used and expected is not None and link.guid == expected):
+                if link.used:
+                    self.counters.add("link.bulk_lost")
+                    _log.info("= %s: the bulk lane is gone (%s); small messages go on", link.name, reason)
+                backoff = self._bulk_backoffs.setdefault(
+                    link.id, Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng)
+                )
+                self._bulk_wanted(link, backoff.delay())
+        self._act(bulk)
+
     # --- connections ----------------------------------------------------------------------------------------
+
+    async def _redial(self, link: MeshLink) -> None:
+        """Replace a link whose bytes nobody acknowledges, as soon as the peer can be reached again."""
+        while link.used and not self._alive(link.id):
+            try:
+                sock = await self._connect(link.remote_endpoint, Lane.EXPRESS, limits.REDIAL_TIMEOUT)
+            except OSError as error:
+                _log.debug("! %s: silent, and not to be reached: %s", link.name, str(error) or "no answer")
+                await asyncio.sleep(limits.REDIAL_PAUSE)
+                continue
+            if self._alive(link.id) or not unacknowledged(link.sock):
+                _log.debug("= %s: silent, but not for want of a way to it", link.name)
+                sock.close()
+                return
+            _log.debug("= %s: silent, but it can be reached: a new link", link.name)
+            self._open(sock, Role.DIALLER, link.remote_endpoint, link.guid)
+            return
+
+    async def _connect(
+        self, endpoint: tuple[str, int], lane: Lane, within: float = limits.DIAL_TIMEOUT
+    ) -> socket.socket:
+        sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+        try:
+            (tune_bulk if lane is Lane.BULK else tune_express)(sock, self._lanes, self.counters)
+            async with asyncio.timeout(within):
+                await asyncio.get_running_loop().sock_connect(sock, endpoint)
+        except BaseException:
+            sock.close()
+            raise
+        return sock
 
     async def _dial(self, dial: Dial) -> None:
         host, port = dial.endpoint
         _log.debug("> dialling %s at %s:%d", dial.guid, host, port)
-        sock: socket.socket | None = None
         try:
-            sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
-            tune_express(sock, self.counters)
-            async with asyncio.timeout(limits.DIAL_TIMEOUT):
-                await asyncio.get_running_loop().sock_connect(sock, dial.endpoint)
+            sock = await self._connect(dial.endpoint, Lane.EXPRESS)
         except OSError as error:  # TimeoutError is one, no file descriptor for the socket another
-            if sock is not None:
-                sock.close()
             self.counters.add("link.dial_failed")
             problem = os.strerror(error.errno) if error.errno else f"no answer within {limits.DIAL_TIMEOUT:g} s"
             self._peering.dial_failed(dial.guid, f"{host}:{port}: {problem}", self._clock.now())
             self._act()
-        except BaseException:
-            if sock is not None:
-                sock.close()
-            raise
         else:
             self._open(sock, Role.DIALLER, dial.endpoint, dial.guid)
 
-    def _open(self, sock: socket.socket, role: Role, endpoint: tuple[str, int], expected: Guid | None = None) -> None:
+    def _open(
+        self,
+        sock: socket.socket,
+        role: Role,
+        endpoint: tuple[str, int],
+        expected: Guid | None = None,
+        lane: Lane = Lane.EXPRESS,
+    ) -> None:
         link_id = next(self._ids)
         if expected is not None:
             self._dialled[link_id] = expected
         if role is Role.ACCEPTOR:
             self._pending.add(link_id)
         self._links[link_id] = MeshLink(
-            link_id, sock, role, self.identity, owner=self, clock=self._clock, endpoint=endpoint, expected=expected
+            link_id,
+            sock,
+            role,
+            self.identity,
+            owner=self,
+            clock=self._clock,
+            endpoint=endpoint,
+            expected=expected,
+            lane=lane,
         )
 
     def _acceptable(self) -> None:
@@ -344,7 +464,7 @@ class Mesh:
                 sock.close()
                 continue
             sock.setblocking(False)
-            tune_express(sock, self.counters)
+            tune_express(sock, self._lanes, self.counters)
             self._open(sock, Role.ACCEPTOR, (address[0], address[1]))
 
     def _accept_failed(self, error: OSError) -> None:
@@ -390,5 +510,6 @@ def _status(link: MeshLink) -> LinkStatus:
         link.bytes_in,
         link.bytes_out,
         link.queue_bytes,
-        dict(link.dropped),
+        link.dropped,
+        link.lane == Lane.BULK,
     )

@@ -14,6 +14,7 @@ from rmpa.ros.tcpros import LENGTH, encode_header, error_header, parse_header
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from rmpa.core.outbox import Parcel
     from rmpa.ros.tcpros import Buffer, Header
 
 _log = logging.getLogger(__name__)
@@ -90,6 +91,10 @@ class Inbound:
         self._outbox.set_bounds(queue_messages, queue_bytes)
         self.stream.send([encode_header(header)], URGENT)
 
+    def bound(self, queue_messages: int, queue_bytes: int) -> None:
+        """Change how much may wait for this connection."""
+        self._outbox.set_bounds(queue_messages, queue_bytes)
+
     def refuse(self, text: str) -> None:
         """Answer with an error header and close. For good only: the other side does not ask again by itself."""
         self.stream.send([encode_header(error_header(text))], URGENT)
@@ -99,6 +104,19 @@ class Inbound:
         """Send one message, its length in front; return how many older ones were dropped for it."""
         self.messages += 1
         return self.stream.send([framed], _MESSAGES)
+
+    def begin(self, size: int) -> Parcel:
+        """Begin a message of ``size`` bytes, its length in front, that come in parts."""
+        self.messages += 1
+        return self.stream.open(_MESSAGES, size)
+
+    def extend(self, parcel: Parcel, part: Buffer) -> int:
+        """Send a part of it; return how many older ones were dropped for it."""
+        return self.stream.extend(parcel, part)
+
+    def abandon(self, parcel: Parcel) -> bool:
+        """The rest of it will not come; whether the other side has the beginning, and must be hung up on."""
+        return self.stream.abandon(parcel)
 
     def close(self) -> None:
         """Close at once, without a call of ``on_end``."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import deque
 from typing import TYPE_CHECKING
 
 from rmpa.core import limits
@@ -17,6 +18,7 @@ from rmpa.ros.tcpros import Description, check_subscriber, printable, publisher_
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from rmpa.core.outbox import Parcel
     from rmpa.ros.aio.inbound import Inbound
     from rmpa.ros.tcpros import Buffer
 
@@ -71,7 +73,10 @@ class Publication:
         self._queue_bytes = queue_bytes
         self._held: tuple[Inbound, ...] = ()
         self._open: tuple[Inbound, ...] = ()
-        self._latched: bytes | None = None
+        self._latched: deque[bytes] = deque(maxlen=1)
+        self._parcels: list[tuple[Inbound, Parcel]] = []
+        self._whole: bytearray | None = None
+        self._size = 0
         self._dropped_before = 0
         self._withdrawn = False
         if description is not None:
@@ -81,6 +86,11 @@ class Publication:
     def description(self) -> Description | None:
         """What is published, once it is known."""
         return self._description
+
+    @property
+    def latched(self) -> bytes | None:
+        """The last message that is kept for later subscribers, with its length in front."""
+        return self._latched[-1] if self._latched else None
 
     @property
     def subscribers(self) -> int:
@@ -141,7 +151,7 @@ class Publication:
         reply = publisher_header(self.topic, self.caller_id, description)
         old: tuple[Inbound, ...] = ()
         if self._reply and self._reply != reply:
-            self._latched = None
+            self._latched.clear()
             old, self._open = self._open, ()
             for link in old:
                 self._count_out(link)
@@ -171,15 +181,72 @@ class Publication:
         self.messages += 1
         self.bytes += len(framed)
         if self._description is not None and self._description.latching:
-            self._latched = bytes(framed)
+            self._latched.append(bytes(framed))
         dropped = 0
         for link in self._open:
             dropped += link.send(framed)
         return dropped
 
+    def begin(self, size: int) -> None:
+        """Begin a message of ``size`` bytes, its length in front, whose parts follow.
+
+        Those subscribe too late for it that come before its end.
+        """
+        self._size = size
+        self._parcels = [(link, link.begin(size)) for link in self._open]
+        latching = self._description is not None and self._description.latching
+        self._whole = bytearray() if latching else None
+
+    def extend(self, part: Buffer) -> None:
+        """Send a part of it to all that have its beginning; none waits for another."""
+        for link, parcel in self._parcels:
+            link.extend(parcel, part)
+        self._size -= len(part)
+        if self._whole is not None:
+            self._whole += part
+        if self._size:
+            return
+        self.messages += 1
+        if self._parcels:
+            self.bytes += self._parcels[0][1].size
+        self._parcels = []
+        if self._whole is not None:
+            self._latched.append(bytes(self._whole))
+            self._whole = None
+
+    def abort(self) -> int:
+        """The rest of it will not come.
+
+        Subscribers that have its beginning are closed: TCPROS has no other way to take back half a message.
+
+        Returns:
+            How many that were: if any, the owner should register the topic again.
+        """
+        torn = [link for link, parcel in self._parcels if link.abandon(parcel)]
+        self._parcels = []
+        self._whole = None
+        before = self.subscribers
+        for link in torn:
+            self._count_out(link)
+            link.close()
+        self._open = tuple(link for link in self._open if link not in torn)
+        if before and not self.subscribers:
+            self._on_last()
+        return len(torn)
+
+    def bound(self, messages: int) -> None:
+        """Let at most so many messages wait for one slow subscriber from now on."""
+        self._queue_messages = min(messages, limits.SUBSCRIBER_QUEUE_MESSAGES)
+        for link in self._open:
+            link.bound(self._queue_messages, self._queue_bytes)
+
+    def keep(self, depth: int) -> None:
+        """Where messages are latched, keep the last ``depth`` of them for later subscribers."""
+        self._latched = deque(self._latched, maxlen=min(depth, limits.LATCHED_MAX))
+
     def forget_latched(self) -> None:
         """Keep no message for later subscribers: its source is gone, or will send it again."""
-        self._latched = None
+        self._latched.clear()
 
     async def drained(self, timeout: float = limits.DRAIN_TIMEOUT) -> None:  # noqa: ASYNC109 - for all together
         """Wait until all that was published has left, or ``timeout`` seconds are over."""
@@ -193,13 +260,15 @@ class Publication:
         for link in links:
             self._count_out(link)
             link.close()
-        self._latched = None
+        self._latched.clear()
+        self._parcels = []
+        self._whole = None
 
     def _serve(self, link: Inbound) -> None:
         _log.debug("> %s: serves subscriber %s at %s", self.topic, printable(link.caller_id), link.peer[0])
         link.accept(self._reply, self._queue_messages, self._queue_bytes)
-        if self._latched is not None:
-            link.send(self._latched)
+        for framed in self._latched:
+            link.send(framed)
         if not link.stream.closed:
             self._open += (link,)
 
@@ -215,6 +284,7 @@ class Publication:
         _log.debug("< %s: subscriber %s is gone (%s)", self.topic, printable(link.caller_id), error or "closed")
         before = self.subscribers
         self._count_out(link)
+        self._parcels = [(other, parcel) for other, parcel in self._parcels if other is not link]
         self._held = tuple(other for other in self._held if other is not link)
         self._open = tuple(other for other in self._open if other is not link)
         if before and not self.subscribers and not self._withdrawn:

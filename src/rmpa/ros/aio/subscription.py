@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core import limits
 from rmpa.core.aio.stream import Stream
@@ -39,6 +39,22 @@ def _ignore(*_: object) -> None:
     pass
 
 
+class PartsTaker(Protocol):
+    """Takes a large message while it still arrives."""
+
+    def begin(self, size: int) -> None:
+        """A message of ``size`` bytes, its length in front, begins."""
+        ...
+
+    def part(self, part: memoryview) -> None:
+        """A part of it, valid during the call only."""
+        ...
+
+    def abort(self) -> None:
+        """The rest will not come."""
+        ...
+
+
 class PublisherConnection:
     """Connects to one publisher of one topic, and connects again until it is closed or refused for good.
 
@@ -52,6 +68,8 @@ class PublisherConnection:
         caller_id: Our node's name; a rospy publisher keeps one connection for each (topic, caller id).
         on_message: ``(framed)``: one message with its 4-byte length in front; the view is only valid during the
             call. It must not raise.
+        on_parts: Takes messages above ``limits.CUT_THROUGH_BYTES`` while they still arrive; without it they come
+            whole, too.
         on_header: ``(fields)``: the publisher's reply, before its first message, at each connection.
         on_refused: ``(text)``: the publisher said no, or has another md5 sum; nothing more will happen.
         on_lost: ``(reason)``: the publisher could not be reached or is gone; it is tried again after a while.
@@ -71,6 +89,7 @@ class PublisherConnection:
         caller_id: str,
         *,
         on_message: Callable[[memoryview], None],
+        on_parts: PartsTaker | None = None,
         on_header: Callable[[Header], None] = _ignore,
         on_refused: Callable[[str], None] = _ignore,
         on_lost: Callable[[str], None] = _ignore,
@@ -99,6 +118,8 @@ class PublisherConnection:
             )
         )
         self._on_message = on_message
+        self._parts = on_parts
+        self._left = 0
         self._on_header = on_header
         self._on_refused = on_refused
         self._on_lost = on_lost
@@ -206,6 +227,10 @@ class PublisherConnection:
 
     def _take(self, data: memoryview) -> tuple[int, int]:
         start = 0
+        if self._left and self._parts is not None:
+            start = self._take_part(self._parts, data)
+            if self._left:
+                return start, 0
         if not self.fields:
             fields, start, wanted = parse_header(data)
             if fields is None:
@@ -219,7 +244,22 @@ class PublisherConnection:
             self.messages += 1
             self.bytes += len(message)
             self._on_message(message)
-        return start + consumed, wanted
+        start += consumed
+        if self._parts is not None and wanted > limits.CUT_THROUGH_BYTES and not self._closed:
+            self._left = wanted
+            self._parts.begin(wanted)
+            self._take_part(self._parts, data[start:])
+            return len(data), 0
+        return start, wanted
+
+    def _take_part(self, parts: PartsTaker, data: memoryview) -> int:
+        """Hand on what has come of a large message; return how many bytes that were."""
+        count = min(self._left, len(data))
+        self._left -= count
+        self.bytes += count
+        self.messages += not self._left
+        parts.part(data[:count])
+        return count
 
     def _believe(self, fields: Header) -> bool:
         problem = check_publisher(fields, self._type, self._md5sum)
@@ -245,6 +285,9 @@ class PublisherConnection:
 
     def _drop(self) -> None:
         self.fields = {}
+        if self._left and self._parts is not None:
+            self._left = 0
+            self._parts.abort()
         if self._stream is not None:
             self._stream.close()
             self._stream = None

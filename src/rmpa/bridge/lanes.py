@@ -1,0 +1,96 @@
+"""Which lane a route's messages take, so that their order is kept when it changes.
+
+Sans-I/O. A contract's priority decides, else the size of the messages: one large message moves a topic to the bulk
+lane, a long row of small ones brings it back. Two connections have no common order; so before the first message on
+the other lane a *fence* is sent behind the last one on the present lane, and what comes meanwhile is held until the
+peer has answered it::
+
+    ON(express) ──large──► FENCING(express → bulk) ──fenced──► ON(bulk)
+         ▲                                                        │ small, for long
+         └────fenced──── FENCING(bulk → express) ◄────────────────┘
+
+A new route begins on the express lane, behind the word that opens it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.contract import Priority
+from rmpa.mesh.handshake import Lane
+
+if TYPE_CHECKING:
+    from rmpa.core.contract import Contract
+
+EXPRESS: Final = Lane.EXPRESS
+BULK: Final = Lane.BULK
+
+
+class LaneSwitch:
+    """The lane of one route.
+
+    Args:
+        contract: Its priority counts.
+        large: Whether the source is known to have large messages.
+    """
+
+    __slots__ = ("_fence", "_fixed", "_large_at", "_numbers", "_small", "lane", "target")
+
+    def __init__(self, contract: Contract, *, large: bool = False) -> None:
+        self._fixed = {Priority.HIGH: EXPRESS, Priority.LOW: BULK}.get(contract.priority)
+        self._large_at = 0.0
+        self._small = 0
+        self._numbers = 0
+        self._fence = 0
+        self.lane = EXPRESS
+        """Where messages go now; while fencing, where the last ones went."""
+        self.target = BULK if self._fixed is BULK or (large and self._fixed is None) else EXPRESS
+        """Where they shall go."""
+
+    @property
+    def fencing(self) -> bool:
+        """Whether messages must be held."""
+        return bool(self._fence)
+
+    def judge(self, size: int, now: float) -> bool:
+        """Look at a message of ``size`` bytes; whether it, and what follows, must not go by the present lane."""
+        if self._fixed is None:
+            if size > limits.EXPRESS_MESSAGE_MAX:
+                self._small = 0
+                self._large_at = now
+                self.target = BULK
+            elif self.target is BULK:
+                self._small += 1
+                row = self._small >= limits.EXPRESS_AGAIN_MESSAGES
+                if row and now - self._large_at >= limits.EXPRESS_AGAIN_AFTER:
+                    self.target = EXPRESS
+        return self.target is not self.lane
+
+    def fence(self) -> int:
+        """The number of the fence to be sent on the present lane."""
+        self._numbers += 1
+        self._fence = self._numbers
+        return self._fence
+
+    def fenced(self, number: int) -> bool:
+        """The peer has answered a fence; whether it was the one, and the held messages may go by the target."""
+        if number != self._fence or not number:
+            return False
+        self._fence = 0
+        self.lane = self.target
+        return True
+
+    def lane_lost(self) -> bool:
+        """The bulk lane's connection is gone; whether that leaves nothing to wait for.
+
+        What was on it does not come any more, so nothing can be overtaken.
+        """
+        if self._fence and self.lane is BULK:
+            return self.fenced(self._fence)
+        return False
+
+    def restart(self) -> None:
+        """A new link: its routes begin on the express lane."""
+        self._fence = 0
+        self.lane = EXPRESS
