@@ -110,7 +110,7 @@ class TopicsView:
             yield source, self._import(at, source, entry, clocks[peer]), texts
 
     def _import(self, at: Attached, source: Source, entry: Import, clock: PeerClock) -> RouteInfo:
-        flow = at.inbound.flows.get(entry.route)
+        flow = at.inbound.flow(source, entry.route)
         publication = at.inbound.publication(source)
         latched = entry.description.latching if entry.description else False
         now = self._clock.now()

@@ -191,7 +191,7 @@ class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
         bytes: Likewise.
         dropped: Messages dropped because a receiver was slow.
         lost: Messages that never came, by the gaps in their numbers.
-        late: Messages that came behind newer ones, and were dropped.
+        late: Messages that came behind newer ones, or that an outage held up, and were left out.
         expired: Messages dropped beyond their lifespan.
         age: Seconds since the last message.
         rate: Messages a second.

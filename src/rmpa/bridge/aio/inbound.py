@@ -93,6 +93,10 @@ class Inbound:
         proxy = self._proxies.get(source.node)
         return proxy.publications.get(source.topic) if proxy else None
 
+    def flow(self, source: Source, route: int) -> ImportFlow | None:
+        """What comes of a source: over its open route, or what waits for its peer to come back."""
+        return self.flows.get(route) or self._reliable.get(source)
+
     def publish(self, action: Publish) -> None:
         """Let a source appear; takes a moment."""
         self._wanted[action.source] = action.type
