@@ -213,6 +213,35 @@ def test_an_acknowledgement_may_be_ahead_of_what_the_new_link_has_sent() -> None
     assert machine.pending == 1
 
 
+def test_what_cannot_go_after_all_is_the_next_one_again() -> None:
+    machine = sender(window_bytes=8)
+    fill(machine, 3)
+    assert numbers(machine) == [0, 1]
+    machine.untake()
+    assert machine.under_way == 1
+    assert numbers(machine) == [1]
+    machine.acknowledged(2)
+    with pytest.raises(LocalProtocolError):
+        machine.untake()
+
+
+def test_what_a_lane_lost_is_sent_again_behind_the_last_acknowledgement() -> None:
+    machine = sender(depth=4)
+    fill(machine, 4)
+    machine.take()
+    machine.acknowledged(1)
+    machine.offer(payload(4), 0)
+    machine.offer(payload(5), 0)
+    machine.rewind()
+    assert machine.overflowed == 1
+    assert numbers(machine, 1) == [2]
+    machine.acknowledged(4)  # it was on its way, over the other lane
+    assert numbers(machine) == [4, 5]
+    machine.suspend()
+    machine.rewind()
+    assert machine.take() == []
+
+
 @pytest.mark.parametrize(("depth", "window"), [(0, 1), (1, 0), (-1, 1), (1 << 31, 1), (1, 1 << 31)])
 def test_bounds_that_cannot_be_are_our_own_fault(depth: int, window: int) -> None:
     with pytest.raises(LocalProtocolError):
@@ -517,6 +546,15 @@ class EveryInterleaving(RuleBasedStateMachine):
         self.pair.cut(ghosts)
         if again:
             self.pair.resume()
+
+    @rule()
+    def hesitate(self) -> None:
+        self.pair.hesitate()
+
+    @precondition(lambda self: self.pair.linked and self.pair.data)
+    @rule()
+    def lose_lane(self) -> None:
+        self.pair.lose_lane()
 
     @precondition(lambda self: self.pair.linked)
     @rule()
