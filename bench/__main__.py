@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -27,20 +28,31 @@ class Measurement:
         about: What it finds out, in a few words.
         measure: Takes whether few samples will do, where to print, and a file for the result.
         needs: Each says why it cannot run here, or an empty string.
+        realtime: Takes the same, and measures with nodes and agents under SCHED_FIFO.
     """
 
     about: str
     measure: Measure
     needs: tuple[Callable[[], str], ...] = (bed.why_no_ros, bed.why_no_hosts)
+    realtime: Measure | None = None
 
 
 MEASUREMENTS: Final[dict[str, Measurement]] = {
     "path": Measurement("how late a message is, on every path", path.run, needs=()),  # leaves out what cannot start
-    "period": Measurement("how evenly messages arrive", period.measure),
-    "crosstraffic": Measurement("a command beside images on 100 Mbit/s", crosstraffic.measure),
+    "period": Measurement(
+        "how evenly messages arrive", period.measure, realtime=partial(period.measure, realtime=True)
+    ),
+    "crosstraffic": Measurement(
+        "a command beside images on 100 Mbit/s",
+        crosstraffic.measure,
+        realtime=partial(crosstraffic.measure, realtime=True),
+    ),
     "load": Measurement("a command while every core is busy", load.measure),
-    "storm": Measurement("a stream while the core is asked 200 times a second", storm.measure),
-    "storm_realtime": Measurement("the same, nodes and agents under SCHED_FIFO", storm.measure_realtime),
+    "storm": Measurement(
+        "a stream while the core is asked 200 times a second",
+        storm.measure,
+        realtime=partial(storm.measure, realtime=True),
+    ),
     "scale": Measurement("what more peers and more topics cost one stream", scale.measure),
     "peers": Measurement("who else carries bytes, in the same run", peers.measure, needs=()),  # likewise
     "throughput": Measurement("how much goes through", throughput.measure),
@@ -61,6 +73,12 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="few samples: to see whether it works, not to quote")
     parser.add_argument("--json", type=Path, help="write the result there too (with one measurement)")
     parser.add_argument("--only", default="", help="path: these contenders, comma-separated")
+    parser.add_argument(
+        "--realtime",
+        action="store_true",
+        help=f"{', '.join(name for name, row in MEASUREMENTS.items() if row.realtime)}: "
+        "nodes and agents under SCHED_FIFO, so that other processes of this machine are out of the figures",
+    )
     args = parser.parse_args()
     if unknown := [name for name in args.measurement if name not in MEASUREMENTS]:
         parser.error(f"no such measurement: {', '.join(unknown)}; there are {', '.join(MEASUREMENTS)}")
@@ -75,7 +93,8 @@ def main() -> int:
             plan = path.QUICK if args.quick else path.FULL
             path.measure(replace(plan, only=tuple(args.only.split(","))), console, args.json)
         else:
-            row.measure(args.quick, console, args.json)
+            measure = (args.realtime and row.realtime) or row.measure
+            measure(args.quick, console, args.json)
     return 0
 
 

@@ -76,18 +76,23 @@ class Loaded(schedule.Score):
 Scores = dict[tuple[str, str], Loaded]
 
 
-def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
+def measure(quick: bool, console: Console, json: Path | None = None, *, realtime: bool = False) -> dict[str, object]:
     """Measure, print the tables, write the files; return the result."""
     plan = QUICK if quick else FULL
     host = schedule.HostLateness()
     scores: Scores = {}
     with Bed() as bed:
-        ways = [schedule.direct(bed), schedule.agents(bed, network=1)]
+        ways, fifo, how = schedule.direct_and_agents(bed, realtime=realtime)
+        console.print(how, style="dim")
         for way in ways:
             for shell in (way.here, way.there):
                 shape(shell.host)
         streams = {
-            way.key: (way.stream(bed, "/command"), way.stream(bed, "/image", queue=_IMAGE_QUEUE)) for way in ways
+            way.key: (
+                way.stream(bed, "/command", fifo=fifo),
+                way.stream(bed, "/image", queue=_IMAGE_QUEUE, fifo=fifo and fifo - 1),
+            )
+            for way in ways
         }
         for order in schedule.turns(ways, plan.rounds, console):
             for way in order:
@@ -111,11 +116,19 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
     ]
     result: dict[str, object] = {
         "rows": [_row(key, condition, one, scores) for (key, condition), one in scores.items()],
+        "scheduling": how,
         "targets": show_targets(console, targets),
         **host.finish(console),
     }
-    settings = {**asdict(plan), "bytes": _SIZE, "hz": _RATE, "image_bytes": _IMAGE, "image_hz": _IMAGE_RATE}
-    written = results.write("crosstraffic", {**settings, "link_bits_per_s": _LINK}, result, json)
+    settings = {
+        **asdict(plan),
+        "bytes": _SIZE,
+        "hz": _RATE,
+        "image_bytes": _IMAGE,
+        "image_hz": _IMAGE_RATE,
+        "link_bits_per_s": _LINK,
+    }
+    written = results.write(schedule.named("crosstraffic", realtime=realtime), settings, result, json)
     image = written.with_suffix(".png")
     plot.tails(image, _panels(scores, titles), "from due to there, µs", _DEADLINE)
     console.print(f"written: {written} and {image.name}")

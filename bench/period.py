@@ -98,14 +98,15 @@ def paired(ours: Evenness, base: Evenness) -> float | None:
     return round(statistics.median(ratios), 3) if ratios else None
 
 
-def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
+def measure(quick: bool, console: Console, json: Path | None = None, *, realtime: bool = False) -> dict[str, object]:
     """Measure, print the tables, write the files; return the result."""
     plan = QUICK if quick else FULL
     host = schedule.HostLateness()
     scores: Scores = {}
     with Bed() as bed:
-        ways = [schedule.direct(bed), schedule.agents(bed, network=1)]
-        streams = {way.key: way.stream(bed, "/paced") for way in ways}
+        ways, fifo, how = schedule.direct_and_agents(bed, realtime=realtime)
+        console.print(how, style="dim")
+        streams = {way.key: way.stream(bed, "/paced", fifo=fifo) for way in ways}
         for order in schedule.turns(ways, plan.rounds, console):
             for rate, seconds in plan.seconds.items():
                 for way in order:
@@ -122,10 +123,13 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
     ]
     result: dict[str, object] = {
         "rows": [_row(key, rate, one, scores["direct", rate]) for (key, rate), one in scores.items()],
+        "scheduling": how,
         "targets": show_targets(console, targets),
         **host.finish(console),
     }
-    written = results.write("period", {**asdict(plan), "bytes": _SIZE}, result, json)
+    written = results.write(
+        schedule.named("period", realtime=realtime), {**asdict(plan), "bytes": _SIZE}, result, json
+    )
     image = written.with_suffix(".png")
     plot.shares(image, _panels(scores, titles), "distance from the period that was meant, µs")
     console.print(f"written: {written} and {image.name}")

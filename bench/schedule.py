@@ -257,6 +257,20 @@ def realtime_agents(bed: Bed, *, network: int = 0) -> tuple[Way, str]:
     return way, f"{how}; {', '.join(sorted({_policy(agent.pid) for agent in way.agents}))}"
 
 
+def direct_and_agents(bed: Bed, *, realtime: bool) -> tuple[list[Way], int, str]:
+    """Classic ROS and two agents, each on a network of its own; the nodes' priority (0: none), and how all that ran.
+
+    Args:
+        bed: Where they are.
+        realtime: Whether nodes and agents run under SCHED_FIFO, so that other processes are out of the figures.
+    """
+    if not realtime:
+        return [direct(bed), agents(bed, network=1)], 0, "everything under SCHED_OTHER"
+    way, how = realtime_agents(bed, network=1)
+    way.key = "agents"
+    return [direct(bed), way], NODE_PRIORITY, f"nodes under SCHED_FIFO {NODE_PRIORITY}; agents: {how}"
+
+
 def _policy(pid: int) -> str:
     names = {os.SCHED_OTHER: "SCHED_OTHER", os.SCHED_FIFO: "SCHED_FIFO", os.SCHED_RR: "SCHED_RR"}
     policy = os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK
@@ -314,6 +328,11 @@ class Score:
             "publisher_late_us": asdict(samples.summary(self.source_late)),
             "processes": {name: usage_row(usage, self.messages) for name, usage in self.usage.items()},
         }
+
+
+def named(measurement: str, *, realtime: bool) -> str:
+    """The result's name."""
+    return f"{measurement}_realtime" if realtime else measurement
 
 
 def turns(ways: Sequence[Way], rounds: int, console: Console) -> Iterator[list[Way]]:
