@@ -336,7 +336,7 @@ class ImportFlow:
         self.last_wall_ns = now_ns
         self._last_size = size
         self.watch.last = now
-        self.quality.arrived(now, now_ns, stamp_ns, size - _LENGTH)
+        self.quality.arrived(now, now_ns, stamp_ns, size)
 
     def _follows(self, sequence: int) -> bool:
         """A jump of the sequence: count what is missing; whether the message is not one from before."""
