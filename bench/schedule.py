@@ -22,10 +22,12 @@ from bench.tables import usage_row
 from bench.usage import Meter, Usage, add
 from tests.interop.agents import RMPA
 from tests.interop.processes import Deadline
+from tests.interop.ros import NODES as TEST_NODES
 from tests.interop.ros import compiled
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
 
     from rich.console import Console
 
@@ -201,6 +203,7 @@ class Way:
         here: The publisher's shell.
         there: The receiver's.
         agents: The agents between them; none in classic ROS.
+        relayed: Whether a roscpp relay on each host takes each message on.
     """
 
     key: str
@@ -208,14 +211,24 @@ class Way:
     here: Ros
     there: Ros
     agents: list[Agent] = field(default_factory=list)
+    relayed: bool = False
 
     def stream(self, bed: Bed, topic: str, *, queue: int = 100, fifo: int = 0) -> Stream:
         """Start both nodes of one topic, under SCHED_FIFO if ``fifo`` is a priority."""
         prefix = ["chrt", "-f", str(fifo)] if fifo else []
-        words = ["--topic", topic, "--queue", str(queue), "--nodelay"]
-        target = self.there.start(*prefix, compiled("arrive", NODES), *words, name="arrive", commands=True)
-        source = self.here.start(*prefix, compiled("pace", NODES), *words, name="pace", commands=True)
+
+        def node(shell: Ros, program: str, *words: str, nodes: Path = NODES) -> Process:
+            argv: list[str | Path] = [*prefix, compiled(program, nodes), *words, "--queue", str(queue), "--nodelay"]
+            return shell.start(*argv, name=program, commands=True)
+
         between = {f"agent {number}": agent.process for number, agent in enumerate(self.agents, 1)}
+        end = topic
+        if self.relayed:
+            for number, shell in enumerate((self.here, self.there), 1):
+                begin, end = end, f"{topic}_{number}"
+                between[f"relay {number}"] = node(shell, "echo", "--topic", begin, "--reply", end, nodes=TEST_NODES)
+        target = node(self.there, "arrive", "--topic", end)
+        source = node(self.here, "pace", "--topic", topic)
         made = Stream(bed, source, target, between)
         made.wait_flowing()
         return made
@@ -224,6 +237,11 @@ class Way:
 def direct(bed: Bed, network: int = 0) -> Way:
     """Classic ROS at its best: roscpp with tcpNoDelay across the cable, one master."""
     return Way("direct", "roscpp direct", *bed.classic(network))
+
+
+def relays(bed: Bed, network: int = 0) -> Way:
+    """Classic ROS with a relay in C++ on each host: as many hops as through two agents, each at its best."""
+    return Way("relays", "roscpp, two relays", *bed.classic(network, "relays"), relayed=True)
 
 
 def agents(
