@@ -373,6 +373,7 @@ class Bridge:
         for _ in range(min(len(self._changed), limits.RESCANNED_AT_ONCE)):
             topic = next(iter(self._changed))
             del self._changed[topic]
+            breathe()
             self._look_at(topic)
         self._act(self._exports.tell())
         if self._learning:
