@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from rich.console import Console
 
-from bench import bed, crosstraffic, idle, load, path, peers, period, scale, startup, storm, throughput
+from bench import bed, crosstraffic, idle, load, path, peers, period, profile, scale, startup, storm, throughput
 from tests.interop import namespaces
 
 if TYPE_CHECKING:
@@ -55,6 +55,7 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     ),
     "scale": Measurement("what more peers and more topics cost one stream", scale.measure),
     "peers": Measurement("who else carries bytes, in the same run", peers.measure, needs=()),  # likewise
+    "profile": Measurement("what a relayed message costs an agent, and where that goes", profile.measure),
     "throughput": Measurement("how much goes through", throughput.measure),
     "startup": Measurement("how soon the first message arrives", startup.measure),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),
