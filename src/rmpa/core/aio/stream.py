@@ -24,6 +24,7 @@ _FIRST_BUFFER: Final = 64 * limits.KIB
 _BUSY_BUFFER: Final = 256 * limits.KIB
 _KEPT_BUFFER: Final = 4 * limits.MIB
 _IOV: Final = 64
+_CORK_ABOVE: Final = 512
 _CORK_MESSAGES: Final = 128
 _CORK_BYTES: Final = 512 * limits.KIB
 _PART: Final = limits.MIB
@@ -391,7 +392,9 @@ class Stream:
     def _deliver(self) -> None:
         global _corked  # noqa: PLW0603 - one loop, one thread: whoever reads holds the cork
         outer = _corked
-        _corked = []
+        # A few bytes are one message, or two, and are handed on at once.
+        corked: list[Stream] = []
+        _corked = corked if self._filled > _CORK_ABOVE else None
         try:
             consumed, wanted = self._on_bytes(self._view[: self._filled])
         except RemoteProtocolError as error:
@@ -403,7 +406,7 @@ class Stream:
             return
         finally:
             # Before anything moves in the buffer that the messages are views of.
-            for stream in _corked:
+            for stream in corked:
                 stream._uncork()  # noqa: SLF001 - its own class
             _corked = outer
         if self._closed:
