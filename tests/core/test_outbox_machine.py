@@ -131,8 +131,7 @@ class AgainstModel(RuleBasedStateMachine):
         entry = self.entry(key, size)
         data = whole(key, entry.number, size)
         entry.given = size
-        self.model.outside[key, entry.number] = entry
-        self._take_directly(data, sent)
+        self._take_directly(entry, data, sent)
 
     @precondition(lambda self: not self.box)
     @rule(key=KEYS, sent=st.integers(0, 200), size=st.integers(1, 2 * FRAGMENT))
@@ -153,16 +152,17 @@ class AgainstModel(RuleBasedStateMachine):
             entry.given += length
             size -= length
         entry.begun = True
-        self.model.outside[key, entry.number] = entry
-        self._take_directly(data, sent)
+        self._take_directly(entry, data, sent)
         if entry.given == entry.size:
             del self.open[key]
 
-    def _take_directly(self, data: bytes, sent: int) -> None:
+    def _take_directly(self, entry: Entry, data: bytes, sent: int) -> None:
+        self.model.outside[entry.key, entry.number] = entry
         self.model.read(data[:sent], self.now)
         self.model.sent(len(data[:sent]))
-        self.box.push_rest(data[sent:], 1)
+        self.box.push_rest(data[sent:], entry.key)
         self.model.look(self.now)
+        self.model.outside.clear()
 
     # --- taking out -----------------------------------------------------------------------------------------
 
