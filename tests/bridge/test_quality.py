@@ -10,12 +10,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rmpa.bridge.peer_clock import PeerClock
 from rmpa.bridge.quality import Quality
 from rmpa.core import limits
 from rmpa.core.stats import Summary
 
 SECOND = 1_000_000_000
 WALL = 1_700_000_000 * SECOND
+
+
+def clock(offset: float = 0.0, error: float = 0.0, now: float = 0.0) -> PeerClock:
+    """A clock of which one thing is known."""
+    found = PeerClock()
+    found.told(offset, error, now)
+    return found
 
 
 def feed(
@@ -28,7 +36,7 @@ def feed(
 
 
 def test_nothing_came() -> None:
-    s = Quality().summary(0.0, 0.001, 5.0)
+    s = Quality().summary(clock(), 5.0)
     assert (s.latency, s.latency_last, s.latency_error, s.age, s.messages, s.bytes) == (None, None, None, None, 0, 0)
     assert s.period.count == 0
     assert all(math.isnan(value) for value in (s.rate, s.bandwidth, s.jitter))
@@ -38,7 +46,7 @@ def test_nothing_came() -> None:
 def test_one_message_has_a_latency_and_an_age_but_no_rate() -> None:
     quality = Quality()
     feed(quality, [10.0], latency=0.004)
-    s = quality.summary(0.0, 0.001, 10.5)
+    s = quality.summary(clock(), 10.5)
     assert s.latency is not None
     assert s.latency.p50 == s.latency_last == pytest.approx(0.004)
     assert s.age == pytest.approx(0.5)
@@ -49,7 +57,7 @@ def test_one_message_has_a_latency_and_an_age_but_no_rate() -> None:
 def test_a_steady_stream() -> None:
     quality = Quality()
     feed(quality, [i / 100 for i in range(1001)], latency=0.002)
-    s = quality.summary(0.0, 0.0, 10.0)
+    s = quality.summary(clock(), 10.0)
     assert s.rate == pytest.approx(100)
     assert s.bandwidth == pytest.approx(10_000)
     assert s.period.mean == pytest.approx(0.01)
@@ -61,7 +69,7 @@ def test_a_steady_stream() -> None:
 def test_a_clock_that_is_ahead_is_taken_off() -> None:
     quality = Quality()
     feed(quality, [1.0, 1.1], latency=0.003, ahead=-7200.0)
-    s = quality.summary(-7200.0, 0.0002, 1.1)
+    s = quality.summary(clock(-7200.0, 0.0002, 1.1), 1.1)
     assert s.latency is not None
     assert s.latency.maximum == pytest.approx(0.003, abs=1e-6)
     assert s.latency_error == pytest.approx(0.0002 + 0.1 * limits.CLOCK_DRIFT)
@@ -70,7 +78,7 @@ def test_a_clock_that_is_ahead_is_taken_off() -> None:
 def test_without_the_other_clock_there_is_no_latency() -> None:
     quality = Quality()
     feed(quality, [1.0, 1.1])
-    s = quality.summary(None, None, 1.1)
+    s = quality.summary(None, 1.1)
     assert (s.latency, s.latency_error) == (None, None)
     assert s.rate == pytest.approx(10)
 
@@ -78,10 +86,10 @@ def test_without_the_other_clock_there_is_no_latency() -> None:
 def test_a_stored_message_has_an_age_and_no_latency() -> None:
     quality = Quality()
     quality.arrived(1.0, WALL, WALL - 3600 * SECOND, 10)
-    assert quality.summary(0.0, 0.0, 1.0, latching=True).latency is None
-    assert quality.summary(0.0, 0.0, 1.0).latency_last == pytest.approx(3600)
+    assert quality.summary(clock(), 1.0, latching=True).latency is None
+    assert quality.summary(clock(), 1.0).latency_last == pytest.approx(3600)
     feed(quality, [2.0], latency=0.001)
-    s = quality.summary(0.0, 0.0, 2.0, latching=True)
+    s = quality.summary(clock(), 2.0, latching=True)
     assert s.latency is not None
     assert s.latency.count == 1
     assert s.latency_last == pytest.approx(0.001)
@@ -91,12 +99,12 @@ def test_messages_of_long_ago_do_not_count() -> None:
     quality = Quality()
     feed(quality, [0.0, 1.0, 2.0], latency=0.5)
     feed(quality, [100.0, 100.5, 101.0], latency=0.001)
-    s = quality.summary(0.0, 0.0, 102.0)
+    s = quality.summary(clock(), 102.0)
     assert s.period.count == 2
     assert s.rate == pytest.approx(2 / 2.0)
     assert s.latency is not None
     assert s.latency.maximum == pytest.approx(0.001)
-    late = quality.summary(0.0, 0.0, 1000.0)
+    late = quality.summary(clock(), 1000.0)
     assert late.period.count == 0
     assert late.age == pytest.approx(899.0)
     assert late.latency_last == pytest.approx(0.001)
@@ -105,19 +113,35 @@ def test_messages_of_long_ago_do_not_count() -> None:
 def test_the_rate_of_a_source_that_died_falls() -> None:
     quality = Quality()
     feed(quality, [i / 10 for i in range(11)])
-    assert quality.summary(None, None, 1.05).rate == pytest.approx(10)
-    assert quality.summary(None, None, 11.0).rate == pytest.approx(10 / 11)
+    assert quality.summary(None, 1.05).rate == pytest.approx(10)
+    assert quality.summary(None, 11.0).rate == pytest.approx(10 / 11)
+
+
+def test_each_latency_is_corrected_by_what_was_known_at_its_time() -> None:
+    """Clocks that drift apart by 10 ppm: a minute later the offset is another."""
+    quality, known = Quality(), PeerClock()
+    for second in range(51):
+        ahead = 2.0 + second * 1e-5
+        feed(quality, [second + 0.5], latency=0.001, ahead=ahead + 5e-6)
+        known.told(ahead + 1e-5, 0.0001, second + 1.0)
+    s = quality.summary(known, 51.0)
+    assert s.latency is not None
+    assert s.latency.count == 51
+    assert s.latency.minimum == pytest.approx(0.001, abs=2e-5)
+    assert s.latency.maximum == pytest.approx(0.001, abs=2e-5)
+    assert s.latency_error == pytest.approx(0.0001 + 0.5 * limits.CLOCK_DRIFT)
 
 
 def test_latencies_of_before_a_clock_was_set_are_forgotten() -> None:
-    quality = Quality()
+    quality, known = Quality(), PeerClock()
     feed(quality, [1.0, 2.0], latency=0.001)
-    quality.clock(0.0, 0.0005, 2.5)
-    quality.clock(0.0004, 0.0002, 2.6)  # within both bounds
-    assert quality.summary(0.0, 0.0005, 2.7).latency is not None
-    assert quality.summary(5.0, 0.0005, 3.0).latency is None  # the peer's clock was put five seconds forward
-    feed(quality, [3.5], latency=0.001, ahead=5.0)
-    s = quality.summary(5.0, 0.0005, 3.6)
+    known.told(0.0, 0.0005, 2.5)
+    known.told(0.0004, 0.0002, 3.6)  # within both bounds
+    assert quality.summary(known, 3.7).latency is not None
+    known.told(5.0, 0.0005, 4.0)  # the peer's clock was put five seconds forward
+    assert quality.summary(known, 4.0).latency is None
+    feed(quality, [4.5], latency=0.001, ahead=5.0)
+    s = quality.summary(known, 4.6)
     assert s.latency is not None
     assert s.latency.count == 1
     assert s.latency_last == pytest.approx(0.001)
@@ -127,7 +151,7 @@ def test_latencies_of_before_a_clock_was_set_are_forgotten() -> None:
 def test_stamps_of_a_peer_that_lies_break_nothing(stamp: int) -> None:
     quality = Quality()
     quality.arrived(1.0, WALL, stamp, 4)
-    assert quality.summary(0.0, 0.0, 1.0).latency_last is not None
+    assert quality.summary(clock(), 1.0).latency_last is not None
 
 
 @pytest.mark.parametrize("window", [0, 1, 3, 1000])
@@ -148,7 +172,7 @@ def test_it_agrees_with_a_list_of_everything(messages: list[tuple[float, float, 
         wall = WALL + round(now * SECOND)
         quality.arrived(now, wall, wall - round(latency * SECOND), size)
         kept.append((now, latency, size))
-    s = quality.summary(0.0, 0.0, now)
+    s = quality.summary(clock(), now)
     kept = kept[-window:]
     assert s.latency is not None
     assert s.latency.count == len(kept)

@@ -6,18 +6,23 @@ import argparse
 import sys
 
 from tests.simulation.mesh_scenario import MeshScenario
+from tests.simulation.reliable_scenario import ReliableScenario
 from tests.simulation.scenario import Scenario
 
 
 def main() -> int:
-    """Print the trace and its hash; 1 if the peers do not agree."""
+    """Print the trace and its hash; 1 if the peers do not agree, or a message was lost unseen."""
     parser = argparse.ArgumentParser(prog="python -m tests.simulation", description=__doc__)
     parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--peers", type=int, required=True)
-    parser.add_argument("--kind", choices=["rosters", "mesh"], default="rosters")
+    parser.add_argument("--peers", type=int, default=2, help="not with --kind reliable, where there are always two")
+    parser.add_argument("--kind", choices=["rosters", "mesh", "reliable"], default="rosters")
     arguments = parser.parse_args()
-    make = MeshScenario if arguments.kind == "mesh" else Scenario
-    scenario = make(arguments.seed, arguments.peers, keep=True)
+    scenario: Scenario | ReliableScenario
+    if arguments.kind == "reliable":
+        scenario = ReliableScenario(arguments.seed, keep=True)
+    else:
+        make = MeshScenario if arguments.kind == "mesh" else Scenario
+        scenario = make(arguments.seed, arguments.peers, keep=True)
     problem = ""
     try:
         scenario.play()

@@ -12,6 +12,7 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
+from rmpa.agent.clocks import Clocks
 from rmpa.agent.diagnostics import Diagnostics
 from rmpa.agent.station import Station
 from rmpa.agent.view import View
@@ -62,8 +63,16 @@ class Agent:
         self._moving: asyncio.Task[None] | None = None
         counters = Counters()
         self._collector = Collector(self._carried, counters)
+        self._clocks = Clocks(self.bridge)
         self._view = View(
-            settings, self.core, self.bridge, self._control.counters, counters, started=time.time(), wishes=wishes
+            settings,
+            self.core,
+            self.bridge,
+            self._clocks,
+            self._control.counters,
+            counters,
+            started=time.time(),
+            wishes=wishes,
         )
 
     async def start(self) -> None:
@@ -79,7 +88,7 @@ class Agent:
             undo.push_async_callback(self.core.close)
             await self.bridge.start()
             undo.push_async_callback(self.bridge.close)
-            diagnostics = Diagnostics(self.core, self.bridge, self._view)
+            diagnostics = Diagnostics(self.core, self.bridge, self._view, self._clocks)
             diagnostics.start()
             undo.callback(diagnostics.close)
             await self._join(self._settings.port)

@@ -1,6 +1,6 @@
 """Tells the local graph how the agent, its links and what comes over them are: ``/diagnostics``, once a second.
 
-The agent's own node publishes it, so it stays in this graph. It costs nothing while nobody listens.
+The agent's own node publishes it, so it stays in this graph. Nothing is made while nobody listens.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from rmpa.ros.diagnostic_array import ARRAY_DEFINITION, ARRAY_MD5, ARRAY_TYPE, f
 from rmpa.ros.tcpros import Description
 
 if TYPE_CHECKING:
+    from rmpa.agent.clocks import Clocks
     from rmpa.agent.view import View
     from rmpa.bridge.aio.bridge import Bridge
     from rmpa.ros.aio.core import RosCore
@@ -29,18 +30,20 @@ TOPIC: Final = "/diagnostics"
 
 
 class Diagnostics:
-    """Publishes what the view shows; also tells each route of its link's clock, whether somebody listens or not.
+    """Publishes what the view shows; has the clocks followed, whether somebody listens or not.
 
     Args:
         core: The local core.
         bridge: Its node publishes; started before.
         view: What there is to tell.
+        clocks: Those of the peers.
     """
 
-    def __init__(self, core: RosCore, bridge: Bridge, view: View) -> None:
+    def __init__(self, core: RosCore, bridge: Bridge, view: View, clocks: Clocks) -> None:
         self._core = core
         self._bridge = bridge
         self._view = view
+        self._clocks = clocks
         self._clock = SystemClock()
         self._health = Health()
         self._sequence = 0
@@ -75,18 +78,9 @@ class Diagnostics:
 
     def _look(self) -> None:
         self._again()
-        self._follow_clocks()
+        self._clocks.follow(self._clock.now())
         if self._publication.subscribers:
             self._publish()
-
-    def _follow_clocks(self) -> None:
-        """A clock that was set must be noticed before much is measured by it."""
-        now = self._clock.now()
-        for attached in list(self._bridge.attached()):
-            offset, error = attached.link.clock_offset, attached.link.clock_error
-            if offset is not None and error is not None:
-                for flow in attached.inbound.flows.values():
-                    flow.quality.clock(offset, error, now)
 
     def _publish(self) -> None:
         self._sequence += 1

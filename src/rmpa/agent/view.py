@@ -12,6 +12,7 @@ import psutil
 import rmpa
 from rmpa.agent.view_peers import PeersView
 from rmpa.agent.view_topics import TopicsView
+from rmpa.core import limits
 from rmpa.core.aio.loop import breathe
 from rmpa.core.aio.realtime import refused
 from rmpa.monitor.snapshot import AgentInfo, Snapshot
@@ -19,6 +20,7 @@ from rmpa.monitor.snapshot import AgentInfo, Snapshot
 if TYPE_CHECKING:
     from collections.abc import Collection
 
+    from rmpa.agent.clocks import Clocks
     from rmpa.agent.station import Station
     from rmpa.bridge.aio.bridge import Bridge
     from rmpa.core.aio.realtime import Wish
@@ -34,6 +36,7 @@ class View:
         settings: The agent's settings.
         core: Its ROS core.
         bridge: Its bridge.
+        clocks: Those of its peers.
         counters: Those of its other parts.
         started: Seconds since the epoch.
         wishes: What came of ``--realtime``.
@@ -44,6 +47,7 @@ class View:
         settings: Settings,
         core: RosCore,
         bridge: Bridge,
+        clocks: Clocks,
         *counters: Counters,
         started: float,
         wishes: tuple[Wish, ...] = (),
@@ -55,8 +59,11 @@ class View:
         self._started = started
         self._wishes = wishes
         self._process = psutil.Process()
+        self._process.cpu_percent()  # from here on it counts
+        self._cpu: float | None = None
+        self._cpu_known = time.monotonic()
         self._peers = PeersView(bridge)
-        self._topics = TopicsView(settings, core, bridge)
+        self._topics = TopicsView(settings, core, bridge, clocks)
         self.station: Station | None = None
 
     def snapshot(self, topics: Collection[str] | None = None) -> Snapshot:
@@ -98,10 +105,17 @@ class View:
             pid=os.getpid(),
             started=self._started,
             uptime=time.time() - self._started,
-            cpu=self._process.cpu_percent(),
+            cpu=self._cpu_share(),
             rss=self._process.memory_info().rss,
             addresses=tuple(str(a) for a in (identity.guid.address, *identity.addresses)) if identity else (),
             interfaces=tuple(i.name for i in self.station.discovery.interfaces) if self.station else (),
             config_file=str(self._settings.config_file or ""),
             realtime=tuple(map(str, self._wishes)),
         )
+
+    def _cpu_share(self) -> float | None:
+        """Looked at now and then: between two snapshots that follow each other there is nothing to see."""
+        now = time.monotonic()
+        if now - self._cpu_known >= limits.CPU_INTERVAL:
+            self._cpu, self._cpu_known = self._process.cpu_percent(), now
+        return self._cpu

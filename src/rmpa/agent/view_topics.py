@@ -15,10 +15,12 @@ from rmpa.monitor.snapshot import EventInfo, LatencyInfo, RouteInfo, Spread, Top
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
+    from rmpa.agent.clocks import Clocks
     from rmpa.bridge.aio.bridge import Attached, Bridge
     from rmpa.bridge.exports import LocalSource
     from rmpa.bridge.imports import Import
     from rmpa.bridge.messages import Source
+    from rmpa.bridge.peer_clock import PeerClock
     from rmpa.bridge.quality import QualitySummary
     from rmpa.core.config import Settings
     from rmpa.core.stats import Summary
@@ -36,10 +38,12 @@ class TopicsView:
         settings: The agent's.
         core: Its ROS core.
         bridge: Its bridge.
+        clocks: Those of its peers.
     """
 
-    def __init__(self, settings: Settings, core: RosCore, bridge: Bridge) -> None:
+    def __init__(self, settings: Settings, core: RosCore, bridge: Bridge, clocks: Clocks) -> None:
         self._core = core
+        self._clocks = clocks
         self._bridge = bridge
         self._clock = SystemClock()
         self._policy = Policy(settings.policy)
@@ -94,7 +98,8 @@ class TopicsView:
     def _inbound(self, wanted: Collection[str] | None) -> Iterator[tuple[Source, RouteInfo, list[str]]]:
         """Each source of a peer, its route, and what did not fit it."""
         attached = {at.peer: at for at in self._bridge.everyone()}
-        clocks = {at.peer: (at.link.clock_offset, at.link.clock_error) for at in attached.values()}
+        self._clocks.follow(self._clock.now())
+        clocks = {peer: self._clocks[peer] for peer in attached}
         for peer, source, entry in list(self._bridge.imports):
             if wanted is not None and source.topic not in wanted:
                 continue
@@ -104,14 +109,12 @@ class TopicsView:
             texts += self._bridge.mismatches(source)
             yield source, self._import(at, source, entry, clocks[peer]), texts
 
-    def _import(
-        self, at: Attached, source: Source, entry: Import, clock: tuple[float | None, float | None]
-    ) -> RouteInfo:
+    def _import(self, at: Attached, source: Source, entry: Import, clock: PeerClock) -> RouteInfo:
         flow = at.inbound.flows.get(entry.route)
         publication = at.inbound.publication(source)
         latched = entry.description.latching if entry.description else False
         now = self._clock.now()
-        quality = flow.quality.summary(*clock, now, latching=latched) if flow else None
+        quality = flow.quality.summary(clock, now, latching=latched) if flow else None
         return RouteInfo(
             peer=at.link.name,
             node=source.node,

@@ -7,12 +7,16 @@ from __future__ import annotations
 
 import math
 from array import array
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 from operator import sub
-from typing import Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from rmpa.core import limits
 from rmpa.core.stats import Summary
+
+if TYPE_CHECKING:
+    from rmpa.bridge.peer_clock import PeerClock
 
 _NS: Final = 1e-9
 _Number = TypeVar("_Number", int, float)
@@ -58,7 +62,7 @@ class Quality:
         ValueError: ``window`` is not one.
     """
 
-    __slots__ = ("_clock", "_delays", "_mask", "_sizes", "_times", "_trusted_from", "bytes", "messages")
+    __slots__ = ("_delays", "_mask", "_sizes", "_times", "bytes", "messages")
 
     def __init__(self, window: int = limits.QUALITY_WINDOW) -> None:
         if window < 2 or window & (window - 1):
@@ -67,8 +71,6 @@ class Quality:
         self._times = array("d", bytes(8 * window))
         self._delays = array("d", bytes(8 * window))
         self._sizes = array("I", bytes(4 * window))
-        self._trusted_from = -math.inf
-        self._clock: tuple[float, float, float] | None = None
         self.messages = 0
         """Ever arrived."""
         self.bytes = 0
@@ -96,31 +98,11 @@ class Quality:
         """When the last message came, in monotonic seconds; ``None`` if none did."""
         return self._times[self.messages - 1 & self._mask] if self.messages else None
 
-    def clock(self, offset: float, error: float, now: float) -> None:
-        """Hear what the other side's clock is now: if that contradicts what it was, a clock was set.
-
-        Latencies from before are then forgotten: they would be wrong by as much as the clock was set. To be told
-        every second or so, that this is noticed soon.
-
-        Args:
-            offset: The other side's wall clock less ours, seconds.
-            error: Its bound, ± seconds.
-            now: Monotonic seconds.
-        """
-        if self._clock is not None:
-            old, old_error, then = self._clock
-            if abs(offset - old) > error + old_error + limits.CLOCK_DRIFT * (now - then):
-                self._trusted_from = now
-        self._clock = (offset, error, now)
-
-    def summary(
-        self, offset: float | None, error: float | None, now: float, *, latching: bool = False
-    ) -> QualitySummary:
+    def summary(self, clock: PeerClock | None, now: float, *, latching: bool = False) -> QualitySummary:
         """What the messages of the last ``limits.QUALITY_SPAN`` say, as far as the ring remembers them.
 
         Args:
-            offset: The other side's wall clock less ours in seconds, or ``None`` while it is unknown.
-            error: Its bound, ± seconds.
+            clock: What is known of the other side's clock, if anything.
             now: Monotonic seconds.
             latching: Whether the route's first message was a stored one, whose age is no latency.
         """
@@ -132,11 +114,11 @@ class Quality:
         if periods and silence > period.maximum:
             elapsed += silence
         sizes = self._latest(self._sizes, len(periods))
-        latencies, latency_error = self._latencies(times, offset, error, now, latching=latching)
+        latencies, error = self._latencies(times, clock, latching=latching) if clock is not None else ([], 0.0)
         return QualitySummary(
             latency=Summary.of(latencies) if latencies else None,
             latency_last=latencies[-1] if latencies else None,
-            latency_error=latency_error,
+            latency_error=error if latencies else None,
             period=period,
             jitter=period.p99 - period.p50 if period.count > 1 else math.nan,
             rate=len(periods) / elapsed if elapsed > 0 else math.nan,
@@ -155,21 +137,28 @@ class Quality:
             return times[first:]
         return times
 
-    def _latencies(
-        self, times: array[float], offset: float | None, error: float | None, now: float, *, latching: bool
-    ) -> tuple[list[float], float | None]:
-        """The latencies that can be told, oldest first, and their bound."""
-        if offset is None or error is None:
-            return [], None
-        self.clock(offset, error, now)
-        count = sum(time >= self._trusted_from for time in times)
-        if latching and count == self.messages:
-            count -= 1
-        if count <= 0:
-            return [], None
-        delays = self._latest(self._delays, count)
-        # Since the oldest of them came, the clocks may have drifted apart by so much.
-        return [delay * _NS + offset for delay in delays], error + limits.CLOCK_DRIFT * (now - times[-count])
+    def _latencies(self, times: array[float], clock: PeerClock, *, latching: bool) -> tuple[list[float], float]:
+        """The latencies that can be told, oldest first, and the bound of their errors.
+
+        Each by the first estimate of the other clock from its arrival on; the newest ones by the last.
+        """
+        delays = self._latest(self._delays, len(times))
+        begin = bisect_left(times, clock.trusted_from)
+        if latching and len(times) == self.messages:
+            begin = max(begin, 1)
+        estimates = list(clock)
+        found: list[float] = []
+        worst = 0.0
+        for estimate in estimates:
+            last = estimate is estimates[-1]
+            end = len(times) if last else bisect_right(times, estimate.now)
+            if begin >= end:
+                continue
+            found += [delay * _NS + estimate.offset for delay in delays[begin:end]]
+            apart = max(abs(estimate.now - times[begin]), abs(estimate.now - times[end - 1]))
+            worst = max(worst, estimate.error + limits.CLOCK_DRIFT * apart)
+            begin = end
+        return found, worst
 
     def _latest(self, ring: array[_Number], count: int) -> array[_Number]:
         """The last ``count`` samples of a ring, oldest first."""

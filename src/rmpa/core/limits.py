@@ -390,7 +390,11 @@ QUALITY_WINDOW: Final = 512
 """Messages of a remote source that its figures are made of, a power of two: 10 KB a route, and a 99th percentile that
 five of them exceed."""
 QUALITY_SPAN: Final = 60.0
-"""Older messages tell nothing of how a source is now, and the clocks have drifted since by a millisecond."""
+"""Older messages tell nothing of how a source is now."""
+QUALITY_CLOCKS: Final = 128
+"""Estimates remembered of each link's clock: one or two a second over QUALITY_SPAN."""
+QUALITY_CLOCK_STEP: Final = 0.9
+"""Seconds in which at most two of them are remembered; they come once a second, and whenever somebody asks."""
 
 # --- monitor --------------------------------------------------------------------------------------------------
 CONTROL_REQUEST_MAX: Final = 1 * MIB
@@ -413,6 +417,8 @@ CONTROL_HANDLER_TIMEOUT: Final = 30.0
 """For the agent's own part of a call."""
 CONTROL_PATH_MAX: Final = 107
 """Bytes in a UNIX socket's path: Linux's sun_path less its final zero."""
+CPU_INTERVAL: Final = 1.0
+"""Over at least so long the agent's use of the CPU is measured; the kernel counts it in ticks of 10 ms."""
 DIAGNOSTICS_INTERVAL: Final = 1.0
 """Between two messages on /diagnostics, as ROS's own publishers have it; the links' clocks are followed as often."""
 DIAGNOSTICS_STALE: Final = 60.0

@@ -22,7 +22,7 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
         pid: The agent's process.
         started: Seconds since the epoch.
         uptime: Seconds.
-        cpu: Share of one core since the snapshot before this one (or since the start), in percent.
+        cpu: Share of one core over the last second or longer, in percent.
         rss: Resident memory, bytes.
         addresses: Its numeric IPv4 addresses, best first.
         interfaces: The interfaces that beacons go out on.
