@@ -201,7 +201,7 @@ AWAY_GRACE: Final = 0.5
 contact the next link stands within it, and no node need connect anew."""
 KEEP_ALL_MESSAGES: Final = 1_000_000
 """What "all" means for a contract's history: bytes bound it first."""
-BULK_STALE_AGE: Final = 1.0
+BULK_STALE_AGE: Final = 0.5
 """The same on the bulk lane: of a topic that a slow link cannot carry, the newest goes."""
 REPLAY_BYTES: Final = 64 * MIB
 """Reliable messages of one route that are kept for a peer, at the most; the oldest is given up beyond it."""
