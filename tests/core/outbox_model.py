@@ -13,11 +13,13 @@ if TYPE_CHECKING:
 
 HEADER = 24
 FRAGMENT = 64
+_RING = bytes(range(256))
 
 
-def payload(number: int, size: int) -> bytes:
+def payload(number: int, size: int, offset: int = 0) -> bytes:
     """Bytes that tell whose they are, and where they belong."""
-    return bytes((number * 31 + offset) & 0xFF for offset in range(size))
+    start = (number * 31 + offset) & 0xFF
+    return (_RING * (size // 256 + 2))[start : start + size]
 
 
 def whole(key: int, number: int, size: int) -> bytes:
@@ -58,10 +60,16 @@ class Entry:
 
 @dataclass
 class Reader:
-    """One connection's bytes, read back frame by frame; asserts that they can be."""
+    """One connection's bytes, read back frame by frame; asserts that they can be.
 
+    Args:
+        longest: Bytes of a fragment at the most; a message in one frame may be longer.
+    """
+
+    longest: int = FRAGMENT
     pending: bytes = b""
-    begun: dict[int, tuple[int, int, bytes]] = field(default_factory=dict)
+    begun: dict[int, tuple[int, int, int]] = field(default_factory=dict)
+    """By route: the number and size of the message that is coming, and how much of it has come."""
     last: dict[tuple[int, int], int] = field(default_factory=dict)
 
     def feed(self, data: bytes) -> list[tuple[int, int, int, int, str]]:
@@ -86,17 +94,18 @@ class Reader:
         if flags & FIRST:
             assert route not in self.begun, "a message within a message of its route"
             self._in_order(kind, route, number)
-            self.begun[route] = (number, size, b"")
+            self.begun[route] = (number, size, 0)
         assert self.begun[route][:2] == (number, size), "a fragment of another message"
-        got = self.begun[route][2] + body
+        got = self.begun[route][2]
+        assert body == payload(number, len(body), got)
+        got += len(body)
         self.begun[route] = (number, size, got)
-        assert got == payload(number, size)[: len(got)]
         if flags & ABORT:
             assert not body
             del self.begun[route]
             return "aborted"
-        assert length_fits(flags, len(body))
-        assert (len(got) == size) == bool(flags & LAST)
+        assert 0 < len(body) <= self.longest or flags & (FIRST | LAST) == FIRST | LAST
+        assert (got == size) == bool(flags & LAST)
         if flags & LAST:
             del self.begun[route]
             return "whole"
@@ -106,11 +115,6 @@ class Reader:
         key = (kind if kind == Kind.CONTROL else 0, route)
         assert number > self.last.get(key, 0), "order is kept per key, marks among the messages"
         self.last[key] = number
-
-
-def length_fits(flags: int, length: int) -> bool:
-    """A fragment is not longer than a turn; a whole message may be."""
-    return 0 < length <= FRAGMENT or flags & (FIRST | LAST) == FIRST | LAST
 
 
 class Model:

@@ -139,8 +139,10 @@ KEEPALIVE_ANSWERED: Final = 1.2
 """The acceptor's interval in those of the dialler: the dialler pings, and the pong counts as a sign of life."""
 HANDSHAKE_TIMEOUT: Final = 3.0
 """From connect to welcome; whoever takes longer is a port scanner or stuck."""
+DIAL_ATTEMPTS: Final = (0.3, 0.5, 1.2)
+"""For each of the TCP connects that make a dial."""
 DIAL_TIMEOUT: Final = 2.0
-"""For the TCP connect itself."""
+"""For all of them."""
 DIAL_FALLBACK: Final = 2.0
 """The higher GUID waits this long for the lower one's call, then dials itself (NAT, firewall)."""
 BACKOFF_FIRST: Final = 0.1
