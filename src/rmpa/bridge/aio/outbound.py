@@ -139,7 +139,7 @@ class Outbound:
             self._gone(source, self._connections[source], description.problem)
             return
         if description.latching:
-            self._flows[source].keep(1)
+            self._flows[source].latch()
         self._on_described(source, description)
 
     def _gone(self, source: Source, connection: PublisherConnection, reason: str) -> None:
