@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from rich.console import Console
 
-from bench import bed, crosstraffic, idle, load, path, peers, period, scale, startup, storm, throughput
+from bench import bed, crosstraffic, idle, load, path, peers, period, profile, scale, startup, storm, throughput
 from tests.interop import namespaces
 
 if TYPE_CHECKING:
@@ -27,22 +28,34 @@ class Measurement:
         about: What it finds out, in a few words.
         measure: Takes whether few samples will do, where to print, and a file for the result.
         needs: Each says why it cannot run here, or an empty string.
+        realtime: Takes the same, and measures with nodes and agents under SCHED_FIFO.
     """
 
     about: str
     measure: Measure
     needs: tuple[Callable[[], str], ...] = (bed.why_no_ros, bed.why_no_hosts)
+    realtime: Measure | None = None
 
 
 MEASUREMENTS: Final[dict[str, Measurement]] = {
     "path": Measurement("how late a message is, on every path", path.run, needs=()),  # leaves out what cannot start
-    "period": Measurement("how evenly messages arrive", period.measure),
-    "crosstraffic": Measurement("a command beside images on 100 Mbit/s", crosstraffic.measure),
+    "period": Measurement(
+        "how evenly messages arrive", period.measure, realtime=partial(period.measure, realtime=True)
+    ),
+    "crosstraffic": Measurement(
+        "a command beside images on 100 Mbit/s",
+        crosstraffic.measure,
+        realtime=partial(crosstraffic.measure, realtime=True),
+    ),
     "load": Measurement("a command while every core is busy", load.measure),
-    "storm": Measurement("a stream while the core is asked 200 times a second", storm.measure),
-    "storm_realtime": Measurement("the same, nodes and agents under SCHED_FIFO", storm.measure_realtime),
+    "storm": Measurement(
+        "a stream while the core is asked 200 times a second",
+        storm.measure,
+        realtime=partial(storm.measure, realtime=True),
+    ),
     "scale": Measurement("what more peers and more topics cost one stream", scale.measure),
     "peers": Measurement("who else carries bytes, in the same run", peers.measure, needs=()),  # likewise
+    "profile": Measurement("what a relayed message costs an agent, and where that goes", profile.measure),
     "throughput": Measurement("how much goes through", throughput.measure),
     "startup": Measurement("how soon the first message arrives", startup.measure),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),
@@ -61,6 +74,12 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="few samples: to see whether it works, not to quote")
     parser.add_argument("--json", type=Path, help="write the result there too (with one measurement)")
     parser.add_argument("--only", default="", help="path: these contenders, comma-separated")
+    parser.add_argument(
+        "--realtime",
+        action="store_true",
+        help=f"{', '.join(name for name, row in MEASUREMENTS.items() if row.realtime)}: "
+        "nodes and agents under SCHED_FIFO, so that other processes of this machine are out of the figures",
+    )
     args = parser.parse_args()
     if unknown := [name for name in args.measurement if name not in MEASUREMENTS]:
         parser.error(f"no such measurement: {', '.join(unknown)}; there are {', '.join(MEASUREMENTS)}")
@@ -75,7 +94,8 @@ def main() -> int:
             plan = path.QUICK if args.quick else path.FULL
             path.measure(replace(plan, only=tuple(args.only.split(","))), console, args.json)
         else:
-            row.measure(args.quick, console, args.json)
+            measure = (args.realtime and row.realtime) or row.measure
+            measure(args.quick, console, args.json)
     return 0
 
 

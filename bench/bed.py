@@ -44,9 +44,9 @@ class Bed:
         port = port or (11311 if host.namespace else free_port())
         return self._stack.enter_context(Ros(host, self.home, port))
 
-    def classic(self, network: int = 0) -> tuple[Ros, Ros]:
+    def classic(self, network: int = 0, name: str = "classic") -> tuple[Ros, Ros]:
         """Two shells as classic ROS has them: on two hosts of one network, with one rosmaster, on the first."""
-        a, b = self.lab.hosts("classic_a", "classic_b", network=network)
+        a, b = self.lab.hosts(f"{name}_a", f"{name}_b", network=network)
         here, there = self.shell(a), self.shell(b)
         here.env["ROS_IP"], there.env["ROS_IP"] = a.address, b.address
         here.env["ROS_MASTER_URI"] = there.env["ROS_MASTER_URI"] = f"http://{a.address}:{here.port}"

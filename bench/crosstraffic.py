@@ -76,25 +76,11 @@ class Loaded(schedule.Score):
 Scores = dict[tuple[str, str], Loaded]
 
 
-def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
+def measure(quick: bool, console: Console, json: Path | None = None, *, realtime: bool = False) -> dict[str, object]:
     """Measure, print the tables, write the files; return the result."""
     plan = QUICK if quick else FULL
     host = schedule.HostLateness()
-    scores: Scores = {}
-    with Bed() as bed:
-        ways = [schedule.direct(bed), schedule.agents(bed, network=1)]
-        for way in ways:
-            for shell in (way.here, way.there):
-                shape(shell.host)
-        streams = {
-            way.key: (way.stream(bed, "/command"), way.stream(bed, "/image", queue=_IMAGE_QUEUE)) for way in ways
-        }
-        for order in schedule.turns(ways, plan.rounds, console):
-            for way in order:
-                for condition in ("unloaded", "loaded"):
-                    score = scores.setdefault((way.key, condition), Loaded())
-                    _round(*streams[way.key], plan.seconds, score, loaded=condition == "loaded")
-    titles = {way.key: way.title for way in ways}
+    scores, titles, how = _take(plan, console, realtime=realtime)
     console.print(_table(scores, titles))
     console.print(_image_table(scores, titles))
     rows = [
@@ -103,23 +89,55 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
     console.print(
         usage_table("processes on the path beside images (the publisher's and receiver's of commands)", rows)
     )
-    ours, idle = scores["agents", "loaded"], scores["agents", "unloaded"]
-    targets = [
-        Target("p99 beside images, ms", _ms(ours.summary.p99), 1.0),
-        Target("p99 beside images / unloaded", ratio(ours.summary.p99, idle.summary.p99), 3.0),
-        Target("images, share of the link", ours.share, 0.9, at_least=True),
-    ]
     result: dict[str, object] = {
         "rows": [_row(key, condition, one, scores) for (key, condition), one in scores.items()],
-        "targets": show_targets(console, targets),
+        "scheduling": how,
+        "targets": show_targets(console, _targets(scores)),
         **host.finish(console),
     }
-    settings = {**asdict(plan), "bytes": _SIZE, "hz": _RATE, "image_bytes": _IMAGE, "image_hz": _IMAGE_RATE}
-    written = results.write("crosstraffic", {**settings, "link_bits_per_s": _LINK}, result, json)
+    settings = {
+        **asdict(plan),
+        "bytes": _SIZE,
+        "hz": _RATE,
+        "image_bytes": _IMAGE,
+        "image_hz": _IMAGE_RATE,
+        "link_bits_per_s": _LINK,
+    }
+    written = results.write(schedule.named("crosstraffic", realtime=realtime), settings, result, json)
     image = written.with_suffix(".png")
     plot.tails(image, _panels(scores, titles), "from due to there, µs", _DEADLINE)
     console.print(f"written: {written} and {image.name}")
     return result
+
+
+def _take(plan: Plan, console: Console, *, realtime: bool) -> tuple[Scores, dict[str, str], str]:
+    """The scores, the ways' titles by key, and how all that ran was scheduled."""
+    scores: Scores = {}
+    with Bed() as bed:
+        ways, fifo, how = schedule.direct_and_agents(bed, realtime=realtime)
+        console.print(how, style="dim")
+        streams = {}
+        for way in ways:
+            shape(way.here.host)
+            shape(way.there.host)
+            # The images' nodes are the less urgent ones of the user's, too.
+            images = way.stream(bed, "/image", queue=_IMAGE_QUEUE, fifo=fifo and fifo - 1)
+            streams[way.key] = way.stream(bed, "/command", fifo=fifo), images
+        for order in schedule.turns(ways, plan.rounds, console):
+            for way in order:
+                for condition in ("unloaded", "loaded"):
+                    score = scores.setdefault((way.key, condition), Loaded())
+                    _round(*streams[way.key], plan.seconds, score, loaded=condition == "loaded")
+    return scores, {way.key: way.title for way in ways}, how
+
+
+def _targets(scores: Scores) -> list[Target]:
+    ours, idle = scores["agents", "loaded"], scores["agents", "unloaded"]
+    return [
+        Target("p99 beside images, ms", _ms(ours.summary.p99), 1.0),
+        Target("p99 beside images / unloaded", ratio(ours.summary.p99, idle.summary.p99), 3.0),
+        Target("images, share of the link", ours.share, 0.9, at_least=True),
+    ]
 
 
 def shape(host: Host) -> None:

@@ -19,7 +19,7 @@ from bench.tables import Target, dash, ratio, show_targets, us, usage_table
 from tests.interop.processes import Process
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from rich.console import Console
@@ -89,8 +89,7 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
     settings = {**asdict(plan), "bytes": _SIZE, "hz": _RATE, "hogs": _HOGS, "node_priority": schedule.NODE_PRIORITY}
     written = results.write("load", settings, result, json)
     image = written.with_suffix(".png")
-    panels = {name: {titles[key]: list(scores[key, name].latencies) for key in titles} for name in _CONDITIONS}
-    plot.tails(image, panels, "from due to there, µs", _DEADLINE)
+    plot.tails(image, _panels(scores, titles), "from due to there, µs", _DEADLINE)
     console.print(f"written: {written} and {image.name}")
     return result
 
@@ -140,3 +139,7 @@ def _table(scores: Scores, titles: dict[str, str]) -> Table:
             ratios = [dash(ratio(row.p99, base)) for base in bases]
             table.add_row(name, beside, *cells, *counts, *ratios, us(samples.summary(one.from_send).p999))
     return table
+
+
+def _panels(scores: Scores, titles: dict[str, str]) -> dict[str, dict[str, Sequence[float]]]:
+    return {name: {titles[key]: scores[key, name].latencies for key in titles} for name in _CONDITIONS}

@@ -63,6 +63,17 @@ def tails(image: Path, panels: Mapping[str, Series], unit: str, limit: float | N
     return _draw(image, panels, draw, unit)
 
 
+def bars(image: Path, panels: Mapping[str, Mapping[str, float]], unit: str) -> bool:
+    """Draw one bar a line side by side; return whether it was drawn."""
+
+    def draw(panel: Panel, title: str, samples: Sequence[float]) -> None:
+        panel.bar([len(panel.containers)], samples, label=title)
+        panel.set_xticks([])
+
+    one_each = {name: {title: [value] for title, value in series.items()} for name, series in panels.items()}
+    return _draw(image, one_each, draw, unit)
+
+
 def lines(image: Path, panels: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]], unit: str) -> bool:
     """Draw figures over what grows, from points of (how much, figure); return whether it was drawn."""
 

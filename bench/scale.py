@@ -67,7 +67,7 @@ class Plan:
     topics: tuple[int, ...] = (10, 100, 1000)
 
 
-FULL: Final = Plan(2.0, 5, 10.0, 3)
+FULL: Final = Plan(1.5, 4, 10.0, 3)
 QUICK: Final = Plan(1.2, 2, 5.0, 1)
 
 

@@ -22,10 +22,12 @@ from bench.tables import usage_row
 from bench.usage import Meter, Usage, add
 from tests.interop.agents import RMPA
 from tests.interop.processes import Deadline
+from tests.interop.ros import NODES as TEST_NODES
 from tests.interop.ros import compiled
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
 
     from rich.console import Console
 
@@ -201,6 +203,7 @@ class Way:
         here: The publisher's shell.
         there: The receiver's.
         agents: The agents between them; none in classic ROS.
+        relayed: Whether a roscpp relay on each host takes each message on.
     """
 
     key: str
@@ -208,14 +211,24 @@ class Way:
     here: Ros
     there: Ros
     agents: list[Agent] = field(default_factory=list)
+    relayed: bool = False
 
     def stream(self, bed: Bed, topic: str, *, queue: int = 100, fifo: int = 0) -> Stream:
         """Start both nodes of one topic, under SCHED_FIFO if ``fifo`` is a priority."""
         prefix = ["chrt", "-f", str(fifo)] if fifo else []
-        words = ["--topic", topic, "--queue", str(queue), "--nodelay"]
-        target = self.there.start(*prefix, compiled("arrive", NODES), *words, name="arrive", commands=True)
-        source = self.here.start(*prefix, compiled("pace", NODES), *words, name="pace", commands=True)
+
+        def node(shell: Ros, program: str, *words: str, nodes: Path = NODES) -> Process:
+            argv: list[str | Path] = [*prefix, compiled(program, nodes), *words, "--queue", str(queue), "--nodelay"]
+            return shell.start(*argv, name=program, commands=True)
+
         between = {f"agent {number}": agent.process for number, agent in enumerate(self.agents, 1)}
+        end = topic
+        if self.relayed:
+            for number, shell in enumerate((self.here, self.there), 1):
+                begin, end = end, f"{topic}_{number}"
+                between[f"relay {number}"] = node(shell, "echo", "--topic", begin, "--reply", end, nodes=TEST_NODES)
+        target = node(self.there, "arrive", "--topic", end)
+        source = node(self.here, "pace", "--topic", topic)
         made = Stream(bed, source, target, between)
         made.wait_flowing()
         return made
@@ -224,6 +237,11 @@ class Way:
 def direct(bed: Bed, network: int = 0) -> Way:
     """Classic ROS at its best: roscpp with tcpNoDelay across the cable, one master."""
     return Way("direct", "roscpp direct", *bed.classic(network))
+
+
+def relays(bed: Bed, network: int = 0) -> Way:
+    """Classic ROS with a relay in C++ on each host: as many hops as through two agents, each at its best."""
+    return Way("relays", "roscpp, two relays", *bed.classic(network, "relays"), relayed=True)
 
 
 def agents(
@@ -255,6 +273,20 @@ def realtime_agents(bed: Bed, *, network: int = 0) -> tuple[Way, str]:
             chrt = ["chrt", "--all-tasks", "--fifo", "--pid", str(_AGENT_PRIORITY), str(agent.pid)]
             subprocess.run(chrt, check=True, timeout=10)
     return way, f"{how}; {', '.join(sorted({_policy(agent.pid) for agent in way.agents}))}"
+
+
+def direct_and_agents(bed: Bed, *, realtime: bool) -> tuple[list[Way], int, str]:
+    """Classic ROS and two agents, each on a network of its own; the nodes' priority (0: none), and how all that ran.
+
+    Args:
+        bed: Where they are.
+        realtime: Whether nodes and agents run under SCHED_FIFO, so that other processes are out of the figures.
+    """
+    if not realtime:
+        return [direct(bed), agents(bed, network=1)], 0, "everything under SCHED_OTHER"
+    way, how = realtime_agents(bed, network=1)
+    way.key = "agents"
+    return [direct(bed), way], NODE_PRIORITY, f"nodes under SCHED_FIFO {NODE_PRIORITY}; agents: {how}"
 
 
 def _policy(pid: int) -> str:
@@ -314,6 +346,11 @@ class Score:
             "publisher_late_us": asdict(samples.summary(self.source_late)),
             "processes": {name: usage_row(usage, self.messages) for name, usage in self.usage.items()},
         }
+
+
+def named(measurement: str, *, realtime: bool) -> str:
+    """The result's name."""
+    return f"{measurement}_realtime" if realtime else measurement
 
 
 def turns(ways: Sequence[Way], rounds: int, console: Console) -> Iterator[list[Way]]:

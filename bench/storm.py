@@ -110,17 +110,8 @@ class Stormy(schedule.Score):
 Scores = dict[str, Stormy]
 
 
-def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
+def measure(quick: bool, console: Console, json: Path | None = None, *, realtime: bool = False) -> dict[str, object]:
     """Measure, print the table, write the files; return the result."""
-    return _measure("storm", quick, console, json, realtime=False)
-
-
-def measure_realtime(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
-    """Measure the same with nodes and agents under SCHED_FIFO: what else the machine does is out of the figures."""
-    return _measure("storm_realtime", quick, console, json, realtime=True)
-
-
-def _measure(name: str, quick: bool, console: Console, json: Path | None, *, realtime: bool) -> dict[str, object]:
     plan = QUICK if quick else FULL
     host = schedule.HostLateness()
     scores: Scores = {}
@@ -145,7 +136,7 @@ def _measure(name: str, quick: bool, console: Console, json: Path | None, *, rea
         **host.finish(console),
     }
     settings = {**asdict(plan), "bytes": _SIZE, "hz": _RATE, "calls_per_s": _CALLS}
-    written = results.write(name, settings, result, json)
+    written = results.write(schedule.named("storm", realtime=realtime), settings, result, json)
     image = written.with_suffix(".png")
     panels: dict[str, dict[str, array[float]]] = {}
     for case in cases:
@@ -156,12 +147,7 @@ def _measure(name: str, quick: bool, console: Console, json: Path | None, *, rea
 
 
 def _cases(bed: Bed, *, realtime: bool) -> tuple[list[Case], str]:
-    direct, how, fifo = schedule.direct(bed), "everything under SCHED_OTHER", 0
-    if realtime:
-        (agents, how), fifo = schedule.realtime_agents(bed, network=1), schedule.NODE_PRIORITY
-        how = f"nodes under SCHED_FIFO {fifo}; agents: {how}; callers, rosmaster and core apart under SCHED_OTHER"
-    else:
-        agents = schedule.agents(bed, network=1)
+    (direct, agents), fifo, how = schedule.direct_and_agents(bed, realtime=realtime)
     classic, relayed = (way.stream(bed, "/command", queue=_QUEUE, fifo=fifo) for way in (direct, agents))
     # The sender's host: its core, its agent. The calls come from a process there, as its tools and nodes do.
     separate = agents.here.start(RMPA, "core", "--port", str(_SEPARATE_PORT), name="core")
@@ -194,7 +180,7 @@ def _cases(bed: Bed, *, realtime: bool) -> tuple[list[Case], str]:
             {"core apart": separate},
         ),
     ]
-    return cases, how
+    return cases, f"{how}; callers, rosmaster and core apart under SCHED_OTHER"
 
 
 def _take(case: Case, seconds: float, score: Stormy) -> None:

@@ -98,18 +98,19 @@ def test_images_count_while_commands_were_due() -> None:
 
 
 @pytest.mark.ros
-def test_a_stream_keeps_its_schedule_and_its_numbers() -> None:
+@pytest.mark.parametrize("relayed", [False, True])
+def test_a_stream_keeps_its_schedule_and_its_numbers(relayed: bool) -> None:
     with Bed() as bed:
         shell = bed.shell()
         shell.master()
-        stream = Way("direct", "direct", shell, shell).stream(bed, "/paced")
+        stream = Way("direct", "direct", shell, shell, relayed=relayed).stream(bed, "/paced")
         for size in (64, 100_000):
             arrivals = stream.run(size, 200.0, 0.5)
             assert (arrivals.sent, arrivals.lost, arrivals.doubled) == (100, 0, 0)
             assert arrivals.step == pytest.approx(5000.0, abs=0.01)
             assert min(arrivals.latencies()) > 0
             assert min(arrivals.from_send()) > 0
-            assert set(arrivals.usage) == {"publisher", "receiver"}
+            assert list(arrivals.usage) == ["publisher", *(["relay 1", "relay 2"] if relayed else []), "receiver"]
             assert arrivals.total == 100 + round(200 * schedule.LEAD_IN)
 
 

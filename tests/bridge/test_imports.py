@@ -242,6 +242,16 @@ def test_what_changes_while_somebody_looks_does_no_harm(imports: Imports) -> Non
     assert len(seen) == 3
 
 
+def test_a_peer_that_nothing_waits_for_leaves_what_was_open(imports: Imports) -> None:
+    imports.advertised(1, Advertise(added=(OFFER, *many(20))))
+    imports.demand(1, CMD, 0.0, wanted=True)
+    imports.opened(1, Opened(1, ABOUT), 0.0)
+    assert not imports.waits_for(1)
+    assert imports.detached(1) == [Detach(1, CMD, 1)]
+    assert imports.detached(1) == []
+    assert len(list(imports.link_down(1))) >= 21
+
+
 def test_a_source_is_known_as_long_as_a_peer_offers_it(imports: Imports) -> None:
     imports.link_up(2)
     imports.advertised(2, Advertise(added=(OFFER,)))

@@ -32,9 +32,9 @@ def route_of(module: Module, topic: str) -> dict[str, object]:
     return found
 
 
-def streaming(modules: ModuleFactory) -> tuple[Module, Module]:
+def streaming(modules: ModuleFactory, config: str = "") -> tuple[Module, Module]:
     """Two modules, and messages without a header from the first to the second for some seconds."""
-    a, b = modules("a", "b")
+    a, b = modules("a", "b", config=config)
     heard = b.ros.roscpp("listener", topic="/chatter")
     a.ros.roscpp("talker", topic="/chatter", rate=RATE, size=SIZE, wait=1)
     flows(heard, 4 * int(RATE))
@@ -58,7 +58,7 @@ def test_figures_are_plausible(modules: ModuleFactory) -> None:
     assert 0 < latency["error"] < 0.02
     bandwidth = route["bandwidth"]
     assert isinstance(bandwidth, float)
-    assert bandwidth == pytest.approx(rate * SIZE, rel=0.1)
+    assert bandwidth == pytest.approx(rate * (SIZE + 12), rel=0.01), "the payload and the array's own twelve bytes"
     link = b.agent.peers()[a.name]["link"]
     assert isinstance(link, dict)
     assert abs(link["clock_offset"]) <= link["clock_error"]
@@ -84,6 +84,38 @@ def test_hz_bw_and_delay_tell_them_too_without_a_header(modules: ModuleFactory) 
     code, output = b.agent.rmpa("topic", "delay", "/chatter", "-n", "20")
     assert code == 0
     assert f"by the link's clock, from {a.name} " in output
+
+
+def test_an_outage_of_a_reliable_topic_is_seen_while_it_lasts_and_after(modules: ModuleFactory) -> None:
+    rule = '[[contract]]\ntopics = ["/chatter"]\nreliability = "reliable"\ndeadline = "300 ms"\n'
+    a, b = streaming(modules, rule)
+    assert route_of(b, "/chatter")["contract"] == {"reliability": "reliable", "deadline": 0.3}
+    before = int(str(route_of(b, "/chatter")["messages"]))
+    a.host.cut()
+    eventually(lambda: route_of(b, "/chatter")["problem"] == "its peer is away", what="the outage")
+    during = route_of(b, "/chatter")
+    assert during["state"] == "waiting"
+    assert int(str(during["messages"])) >= before, "its figures are still there"
+    a.host.restore()
+    a.agent.wait_peer(b.name)
+
+    def goes_on() -> bool:
+        route = route_of(b, "/chatter")
+        age = route["age"]
+        return route["state"] == "open" and isinstance(age, float) and age < 0.2
+
+    eventually(goes_on, what="messages behind the outage")
+    after = route_of(b, "/chatter")
+    assert (after["lost"], after["problem"]) == (0, "")
+    assert int(str(after["messages"])) > int(str(during["messages"]))
+    events, recent = after["events"], after["recent"]
+    assert isinstance(events, dict)
+    assert isinstance(recent, list)
+    assert events["deadline_missed"] >= 3
+    assert any("deadline 300 ms" in event["text"] for event in recent)
+    code, text = b.agent.rmpa("topic", "info", "/chatter")
+    assert code == 0
+    assert "deadline_missed" in text
 
 
 @pytest.mark.skipif(

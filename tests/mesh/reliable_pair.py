@@ -122,6 +122,17 @@ class Pair:
                 self.data.append(Fragment(self.epoch, message, first=n == 0, last=n == pieces - 1))
         return len(taken)
 
+    def hesitate(self) -> None:
+        """One is taken, and cannot go now."""
+        if self.sender.take(1):
+            self.sender.untake()
+
+    def lose_lane(self) -> None:
+        """What is under way is lost, but not the link; acknowledgements go on."""
+        self.data.clear()
+        self.haunted = True
+        self.sender.rewind()
+
     def arrive(self) -> None:
         """The next fragment comes; at the first of a message it is decided, with the last it is received."""
         self._handle(self.data.popleft())

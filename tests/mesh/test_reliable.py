@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 
 import pytest
@@ -213,38 +214,64 @@ def test_an_acknowledgement_may_be_ahead_of_what_the_new_link_has_sent() -> None
     assert machine.pending == 1
 
 
+def test_what_cannot_go_after_all_is_the_next_one_again() -> None:
+    machine = sender(window_bytes=8)
+    fill(machine, 3)
+    assert numbers(machine) == [0, 1]
+    machine.untake()
+    assert machine.under_way == 1
+    assert numbers(machine) == [1]
+    machine.acknowledged(2)
+    with pytest.raises(LocalProtocolError):
+        machine.untake()
+
+
+def test_what_a_lane_lost_is_sent_again_behind_the_last_acknowledgement() -> None:
+    machine = sender(depth=4)
+    fill(machine, 4)
+    machine.take()
+    machine.acknowledged(1)
+    machine.offer(payload(4), 0)
+    machine.offer(payload(5), 0)
+    machine.rewind()
+    assert machine.overflowed == 1
+    assert numbers(machine, 1) == [2]
+    machine.acknowledged(4)  # it was on its way, over the other lane
+    assert numbers(machine) == [4, 5]
+    machine.suspend()
+    machine.rewind()
+    assert machine.take() == []
+
+
 @pytest.mark.parametrize(("depth", "window"), [(0, 1), (1, 0), (-1, 1), (1 << 31, 1), (1, 1 << 31)])
 def test_bounds_that_cannot_be_are_our_own_fault(depth: int, window: int) -> None:
     with pytest.raises(LocalProtocolError):
         sender(depth=depth, window=window)
 
 
-def test_a_message_costs_the_same_however_many_wait() -> None:
-    def cost(waiting: int) -> float:
-        machine = sender(depth=waiting + 10, max_bytes=1 << 30, window=waiting + 10, window_bytes=1 << 30)
-        fill(machine, waiting)
-        machine.take(waiting // 2)
-        started = time.perf_counter()
+def cost(waiting: int, *, dropping: bool) -> float:
+    """Seconds of this process for 2000 messages, with so many others waiting, half of them under way."""
+    depth = waiting + 10 * (not dropping)
+    machine = sender(depth=depth, max_bytes=1 << 30, window=depth, window_bytes=1 << 30)
+    fill(machine, waiting)
+    machine.take(waiting // 2)
+    gc.disable()  # the tests before have left it much to look at
+    try:
+        started = time.process_time()
         for number in range(2000):
             machine.offer(b"x", 0)
-            machine.take(1)
-            machine.acknowledged(number + 1)
-        return time.perf_counter() - started
+            if not dropping:
+                machine.take(1)
+                machine.acknowledged(number + 1)
+        return time.process_time() - started
+    finally:
+        gc.enable()
 
-    assert min(cost(100_000) for _ in range(3)) < 10 * min(cost(10) for _ in range(3)) + 0.01
 
-
-def test_a_drop_costs_the_same_however_many_wait() -> None:
-    def cost(waiting: int) -> float:
-        machine = sender(depth=waiting, max_bytes=1 << 30, window=waiting, window_bytes=1 << 30)
-        fill(machine, waiting)
-        machine.take(waiting // 2)
-        started = time.perf_counter()
-        for _ in range(2000):
-            machine.offer(b"x", 0)
-        return time.perf_counter() - started
-
-    assert min(cost(100_000) for _ in range(3)) < 10 * min(cost(10) for _ in range(3)) + 0.01
+@pytest.mark.parametrize("dropping", [False, True])
+def test_a_message_costs_the_same_however_many_wait(dropping: bool) -> None:
+    few, many = (min(cost(waiting, dropping=dropping) for _ in range(5)) for waiting in (10, 20_000))
+    assert many < 10 * few + 0.01
 
 
 # --- the receiver ---------------------------------------------------------------------------------------------
@@ -517,6 +544,15 @@ class EveryInterleaving(RuleBasedStateMachine):
         self.pair.cut(ghosts)
         if again:
             self.pair.resume()
+
+    @rule()
+    def hesitate(self) -> None:
+        self.pair.hesitate()
+
+    @precondition(lambda self: self.pair.linked and self.pair.data)
+    @rule()
+    def lose_lane(self) -> None:
+        self.pair.lose_lane()
 
     @precondition(lambda self: self.pair.linked)
     @rule()

@@ -151,6 +151,8 @@ def test_who_was_there_is_stale_for_a_while_with_all_that_came_from_it() -> None
     found = judged(health, with_routes(peers=(lost,)), 1.0)
     assert (found["rmpa: joystick"].level, found["rmpa: joystick"].message) == (Level.STALE, "linking: silent")
     assert (found[CMD].level, found[CMD].message) == (Level.STALE, "no link to joystick")
+    waiting = msgspec.structs.replace(HEALTHY, state="waiting", problem="its peer is away")
+    assert judged(health, with_routes(waiting, peers=(lost,)), 1.0)[CMD] == found[CMD]
     gone = with_routes(peers=())
     found = judged(health, gone, 2.0)
     assert [found[name].level for name in ("rmpa: joystick", CMD)] == [Level.STALE] * 2

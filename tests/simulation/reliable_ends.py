@@ -147,6 +147,7 @@ class Exporter:
             self._pump()
         if self.sender is not None:
             assert self.sender.pending <= self._bounds.depth
+            assert self.sender.under_way <= self._bounds.window_messages
             assert self.sender.pending_bytes <= max(self._bounds.max_bytes, len(payload))
 
     def _accept(self, end: End) -> None:

@@ -1,4 +1,4 @@
-"""What the clocks of all linked peers were over the last minute."""
+"""What the clocks of all peers were over the last minute, those that are away for a moment included."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class Clocks:
         return self._clocks[peer]
 
     def follow(self, now: float) -> None:
-        """Take down what each link knows now (monotonic seconds); forget links that are gone."""
+        """Take down what each link knows now (monotonic seconds); forget peers that are gone."""
         before, self._clocks = self._clocks, {}
-        for attached in self._bridge.attached():
+        for attached in self._bridge.everyone():
             clock = self._clocks[attached.peer] = before.get(attached.peer) or PeerClock()
             offset, error = attached.link.clock_offset, attached.link.clock_error
-            if offset is not None and error is not None:
+            if offset is not None and error is not None and attached.away is None:
                 clock.told(offset, error, now)

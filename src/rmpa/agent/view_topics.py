@@ -11,6 +11,7 @@ from rmpa.core.aio.clock import SystemClock
 from rmpa.core.aio.loop import breathe, breathing_sorted
 from rmpa.core.contract import KEYS, Contract, Contracts
 from rmpa.monitor.snapshot import EventInfo, LatencyInfo, RouteInfo, Spread, TopicInfo
+from rmpa.ros.tcpros import LENGTH
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -110,7 +111,7 @@ class TopicsView:
             yield source, self._import(at, source, entry, clocks[peer]), texts
 
     def _import(self, at: Attached, source: Source, entry: Import, clock: PeerClock) -> RouteInfo:
-        flow = at.inbound.flows.get(entry.route)
+        flow = at.inbound.flow(source, entry.route)
         publication = at.inbound.publication(source)
         latched = entry.description.latching if entry.description else False
         now = self._clock.now()
@@ -123,7 +124,7 @@ class TopicsView:
             type=entry.type,
             md5=entry.description.md5 if entry.description else "",
             messages=quality.messages if quality else 0,
-            bytes=quality.bytes if quality else 0,
+            bytes=quality.bytes - LENGTH.size * quality.messages if quality else 0,
             dropped=publication.dropped if publication else 0,
             lost=flow.lost if flow else 0,
             late=flow.late + flow.stale if flow else 0,
@@ -138,7 +139,7 @@ class TopicsView:
             else (),
             age=quality.age if quality else None,
             rate=_known(quality.rate) if quality else None,
-            bandwidth=_known(quality.bandwidth) if quality else None,
+            bandwidth=_known(quality.bandwidth - LENGTH.size * quality.rate) if quality else None,
             period=_spread(quality.period) if quality else None,
             jitter=_known(quality.jitter) if quality else None,
             latency=_latency(quality) if quality else None,
@@ -171,7 +172,7 @@ class TopicsView:
             type=local.type,
             md5=about.md5 if about else "",
             messages=flow.messages if flow else 0,
-            bytes=flow.bytes if flow else 0,
+            bytes=flow.bytes - LENGTH.size * flow.messages if flow else 0,
             dropped=flow.dropped if flow else 0,
             latched=about.latching if about else False,
             lane=leg.lane if leg else "",

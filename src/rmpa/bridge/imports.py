@@ -215,8 +215,7 @@ class Imports:
         known.away = True
         known.routes = {}
         for source, entry in list(known.sources.items()):
-            reliable = entry.contract is not None and entry.contract.reliability is Reliability.RELIABLE
-            keep = briefly or (reliable and entry.wanted and entry.state in _LISTENED)
+            keep = briefly or _outlives(entry)
             if entry.route:
                 actions.append(Detach(peer, source, entry.route, keep=keep))
             entry.route = 0
@@ -225,6 +224,17 @@ class Imports:
             else:
                 actions += self._drop(peer, source, entry)
         return actions, bool(known.sources)
+
+    def waits_for(self, peer: int) -> bool:
+        """Whether somebody local listens to a reliable route of a peer."""
+        return any(map(_outlives, self._peers[peer].sources.values()))
+
+    def detached(self, peer: int) -> list[Action]:
+        """A link is gone, and nothing waits for its peer: ``link_down`` follows. Costs what was open."""
+        known = self._peers[peer]
+        gone = [(source, entry) for source in known.routes.values() if (entry := known.sources[source]).route]
+        known.routes = {}
+        return [Detach(peer, source, entry.route) for source, entry in gone]
 
     def _suspend(self, peer: int, source: Source, entry: Import) -> None:
         """Bring an entry into a state without a link."""
@@ -485,6 +495,12 @@ class Imports:
         else:
             self._move(peer, source, entry, RouteState.WAITING, now + entry.backoff.delay())
         return actions
+
+
+def _outlives(entry: Import) -> bool:
+    """Whether an entry stays when its peer's link is gone."""
+    reliable = entry.contract is not None and entry.contract.reliability is Reliability.RELIABLE
+    return reliable and entry.wanted and entry.state in _LISTENED
 
 
 def _gone(peer: int, sources: dict[Source, Import]) -> Iterator[Action]:

@@ -23,6 +23,8 @@ COLLECT_LOOK_AGAIN: Final = 0.02
 loop for less than a large one."""
 COLLECT_YOUNG: Final = 300
 """Objects that came to stay since the last collection, for the next: what 40 XML-RPC calls leave, some 0.1 ms."""
+COLLECT_BURST: Final = 1000
+"""The same in the midst of work that goes on: a tenth of a millisecond, whatever came to stay."""
 COLLECT_GROWTH: Final = 50_000
 """Memory blocks by which the heap grew, some 5 MB, for a full collection while no data flows."""
 COLLECT_GROWTH_MAX: Final = 500_000

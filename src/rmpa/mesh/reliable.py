@@ -153,7 +153,13 @@ class ReliableSender:
         return taken
 
     def untake(self) -> None:
-        """The last one taken cannot be sent now after all: it is the next one again."""
+        """The last one taken cannot be sent now after all: it is the next one again.
+
+        Raises:
+            LocalProtocolError: None is under way.
+        """
+        if not self._sent:
+            raise LocalProtocolError("no message is under way that could be taken back")
         message = self._sent.pop()
         self._under_way_bytes -= len(message.payload)
         self._unsent.appendleft(message)
@@ -191,6 +197,14 @@ class ReliableSender:
         self._doubtful.clear()
         self._under_way_bytes = 0
         self._linked = True
+
+    def rewind(self) -> None:
+        """The link lost a part of what is under way, nobody knows which: all of it is to be sent again.
+
+        The receiver leaves out what it has. What was dropped under way counts as lost, though it may have arrived.
+        """
+        if self._linked:
+            self.resume(self._acknowledged)
 
     def _check(self, ahead: int, sequence: int, verb: str) -> None:
         if ahead > (self._highest - self._acknowledged) & _MASK:

@@ -58,6 +58,8 @@ class Health:
             counts[name] = Counter(dropped=info.link.dropped if info.link else 0)
             yield _peer(name, here, info, self._new(name, counts[name]), was_linked=name in self._linked)
         for name, topic, route in _named(snapshot.topics):
+            if route.peer not in peers or peers[route.peer].state != _LINKED:
+                continue  # it waits for its peer: stale, as all that came from it
             counts[name] = _missing(route)
             self._topics.setdefault(route.peer, set()).add(name)
             yield _route(name, here, topic, route, self._new(name, counts[name]))

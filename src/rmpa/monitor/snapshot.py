@@ -188,10 +188,10 @@ class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
         type: The message type that the source has.
         md5: Of that type; empty before it is known.
         messages: That crossed since the route was opened.
-        bytes: Likewise.
+        bytes: Of these, without the lengths that TCPROS puts in front.
         dropped: Messages dropped because a receiver was slow.
         lost: Messages that never came, by the gaps in their numbers.
-        late: Messages that came behind newer ones, and were dropped.
+        late: Messages that came behind newer ones, or that an outage held up, and were left out.
         expired: Messages dropped beyond their lifespan.
         age: Seconds since the last message.
         rate: Messages a second.

@@ -9,6 +9,7 @@ import pytest
 
 from rmpa.core import limits
 from rmpa.core.aio.collector import Collector, Due, what_is_due
+from rmpa.core.aio.loop import AgentLoop, breathing
 from rmpa.core.counters import Counters
 
 if TYPE_CHECKING:
@@ -192,3 +193,19 @@ class Pauses:
     def _note(self, phase: str, info: dict[str, int]) -> None:
         if phase == "start":
             self.generations.append(info["generation"])
+
+
+def test_work_that_does_not_end_is_collected_in_its_midst(counters: Counters) -> None:
+    async def main() -> None:
+        collector = Collector(lambda: 0, counters)
+        collector.start()
+        most = 0
+        for _ in breathing(range(100_000)):
+            Knot()
+            most = max(most, gc.get_count()[0])
+        assert counters["collector.young"] > 20
+        assert most < 10 * limits.COLLECT_BURST
+        collector.close()
+
+    with asyncio.Runner(loop_factory=AgentLoop) as runner:
+        runner.run(main())

@@ -331,6 +331,40 @@ def test_sorting_breathes_and_sorts(count: int) -> None:
     assert list(breathing_sorted(words)) == sorted(words)
 
 
+def test_a_chore_is_done_now_and_then_but_not_where_data_is_read(pair: tuple[socket.socket, socket.socket]) -> None:
+    one, other = pair
+
+    async def main() -> None:
+        loop = agent_loop()
+        done: list[str] = []
+        where = "work"
+        loop.between(lambda: done.append(where))
+        for _ in range(100):
+            breathe()
+        assert 5 < len(done) < 50
+
+        def read() -> None:
+            nonlocal where
+            where = "reader"
+            one.recv(10)
+            for _ in range(100):
+                breathe()
+            where = "work"
+
+        loop.add_direct_reader(one.fileno(), read)
+        other.send(b"a")
+        breathe()
+        assert set(done) == {"work"}
+        loop.remove_reader(one.fileno())
+        loop.between(None)
+        done.clear()
+        for _ in range(100):
+            breathe()
+        assert not done
+
+    run(main())
+
+
 def test_breathing_elsewhere_does_nothing() -> None:
     async def main() -> None:
         breathe()

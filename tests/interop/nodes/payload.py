@@ -25,8 +25,10 @@ class Pattern:
 
     def __init__(self, size: int) -> None:
         self.size = max(size, HEADER.size)
-        length = self.size - HEADER.size
-        self._bytes = bytes((i * i + (i >> 8)) & 0xFF for i in range(length + _PERIOD))
+        length = self.size - HEADER.size + _PERIOD
+        # i * i + (i >> 8) in one byte begins anew after 64 KiB.
+        run = bytes((i * i + (i >> 8)) & 0xFF for i in range(min(length, 1 << 16)))
+        self._bytes = (run * (length // len(run) + 1))[:length]
 
     def payload(self, source: int, sequence: int) -> bytes:
         """The payload of one message."""

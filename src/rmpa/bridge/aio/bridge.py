@@ -210,13 +210,13 @@ class Bridge:
         """A peer without a link does not come back at once: only what a reliable route needs waits for it."""
         name = attached.link.name
         attached.away = self._loop.call_later(limits.RESUME_WINDOW, self._give_up, attached)
-        waited_for = self._exports.waits_for(attached.peer)
-        imports, waiting = self._imports.link_away(attached.peer)
-        self._act(imports)
-        if waited_for or waiting:
-            _log.info("= %s is away: its reliable topics wait for %g s", name, limits.RESUME_WINDOW)
-        else:
+        if not self._exports.waits_for(attached.peer) and not self._imports.waits_for(attached.peer):
+            self._act(self._imports.detached(attached.peer))
             self._give_up(attached)
+            return
+        imports, _ = self._imports.link_away(attached.peer)
+        self._act(imports)
+        _log.info("= %s is away: its reliable topics wait for %g s", name, limits.RESUME_WINDOW)
 
     def clock(self, link: MeshLink) -> None:
         """A link knows its peer's clock better."""
@@ -373,6 +373,7 @@ class Bridge:
         for _ in range(min(len(self._changed), limits.RESCANNED_AT_ONCE)):
             topic = next(iter(self._changed))
             del self._changed[topic]
+            breathe()
             self._look_at(topic)
         self._act(self._exports.tell())
         if self._learning:

@@ -11,6 +11,7 @@ from rmpa.bridge.actions import Publish
 from rmpa.bridge.aio.flows import ImportFlow, LinkTime
 from rmpa.bridge.proxy_names import LOOPBACK, proxy_name
 from rmpa.core import limits
+from rmpa.core.aio.loop import breathing
 from rmpa.core.contract import Durability, Reliability
 from rmpa.core.errors import RmpaError
 from rmpa.ros.aio.publication import Publication
@@ -93,6 +94,10 @@ class Inbound:
         """The local end of a source, if it is there."""
         proxy = self._proxies.get(source.node)
         return proxy.publications.get(source.topic) if proxy else None
+
+    def flow(self, source: Source, route: int) -> ImportFlow | None:
+        """What comes of a source: over its open route, or what waits for its peer to come back."""
+        return self.flows.get(route) or self._reliable.get(source)
 
     def publish(self, action: Publish) -> None:
         """Let a source appear; takes a moment."""
@@ -226,14 +231,14 @@ class Inbound:
         """Register again what is missing from the local graph; return how many that were."""
         missing = [
             (proxy, topic)
-            for proxy in self._proxies.values()
-            for topic in proxy.publications
+            for proxy in breathing(list(self._proxies.values()), every=1)
+            for topic in tuple(proxy.publications)
             if publishers.get(topic, {}).get(proxy.node.name) != proxy.node.uri
         ]
         for proxy, topic in missing:
             self._register(proxy, topic)
         if self._jobs.empty():
-            for source, type_name in self._wanted.items():
+            for source, type_name in breathing(list(self._wanted.items())):
                 if self.publication(source) is None:
                     self._jobs.put_nowait(Publish(0, source, type_name))
         return len(missing)

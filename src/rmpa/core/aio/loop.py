@@ -34,6 +34,8 @@ _log = logging.getLogger(__name__)
 
 _EPOLL_RESOLUTION: Final = 1e-3
 _LOOK: Final = 64
+_BREATHS: Final = 8
+"""Breaths for one chore: a look at a counter is cheap, and yet not for each callback."""
 _ITEMS: Final = 64
 """Steps of some work between two breaths, of a microsecond or less each."""
 _RUN: Final = 256
@@ -55,7 +57,8 @@ class DirectSelector(selectors.BaseSelector):
         self._keys: dict[int, selectors.SelectorKey] = {}
         self._readers: dict[int, Callable[[], None]] = {}
         self._writers: dict[int, Callable[[], None]] = {}
-        self._calling = False
+        self.calling = False
+        """Whether a direct reader or writer is at work."""
         self.woke = self.woke_before = time.monotonic()
 
     def call_directly(self, fd: int, reader: Callable[[], None] | None) -> None:
@@ -76,7 +79,7 @@ class DirectSelector(selectors.BaseSelector):
 
     def poll_data(self) -> None:
         """Call the direct readers and writers that are ready now; does nothing when called by one of them."""
-        if not self._calling and (happened := self._look(0, _LOOK)):
+        if not self.calling and (happened := self._look(0, _LOOK)):
             self._call(happened)
 
     def register(
@@ -159,7 +162,7 @@ class DirectSelector(selectors.BaseSelector):
     def _call(self, happened: list[tuple[int, int]]) -> list[tuple[int, int]]:
         """Call those that are direct; return what is left for asyncio."""
         rest = []
-        self._calling = True
+        self.calling = True
         try:
             for fd, event in happened:
                 if (reader := self._readers.get(fd)) is not None and event & _READ:
@@ -172,7 +175,7 @@ class DirectSelector(selectors.BaseSelector):
                     continue
                 rest.append((fd, event))
         finally:
-            self._calling = False
+            self.calling = False
         return rest
 
     def _forget(self, fd: int) -> None:
@@ -208,10 +211,11 @@ class AgentLoop(asyncio.SelectorEventLoop):
     def __init__(self) -> None:
         self._direct_selector = DirectSelector()
         super().__init__(self._direct_selector)
+        self._poll_data = self._direct_selector.poll_data
+        self._chore: Callable[[], None] | None = None
+        self._breaths = 0
         # asyncio takes each callback of a round from here, and from nowhere else.
-        self._ready: deque[asyncio.Handle] = _Turnstile(self._direct_selector)
-        self.poll_data: Final = self._direct_selector.poll_data
-        """Let data that has come go first, now; see ``breathe()``."""
+        self._ready: deque[asyncio.Handle] = _Turnstile(self.breathe)
 
     @property
     def looked_before(self) -> float:
@@ -220,6 +224,22 @@ class AgentLoop(asyncio.SelectorEventLoop):
         What was not there then came later: so long, and no longer, this process may have let it wait.
         """
         return self._direct_selector.woke_before
+
+    def breathe(self) -> None:
+        """Let data that has come go first, now; for who has no loop at hand there is the function ``breathe``."""
+        self._poll_data()
+        if self._chore is not None and not self._direct_selector.calling:
+            self._breaths += 1
+            if self._breaths >= _BREATHS:
+                self._breaths = 0
+                self._chore()
+
+    def between(self, chore: Callable[[], None] | None) -> None:
+        """Call ``chore`` at every few breaths, or nothing any more; it takes microseconds where it has nothing to do.
+
+        For what control work must not put off until it ends, and data need not wait for.
+        """
+        self._chore = chore
 
     def add_direct_reader(self, fd: int, callback: Callable[[], None]) -> None:
         """Like ``add_reader``, on the short way; ``remove_reader`` ends it.
@@ -258,7 +278,7 @@ def breathe() -> None:
     """
     loop = asyncio._get_running_loop()  # noqa: SLF001 - the public one raises where there is none
     if isinstance(loop, AgentLoop):
-        loop.poll_data()
+        loop.breathe()
 
 
 def breathing(items: Iterable[_T], /, every: int = _ITEMS) -> Iterator[_T]:
@@ -282,13 +302,13 @@ def breathing_sorted(items: Iterable[str]) -> Iterator[str]:
 class _Turnstile(deque[asyncio.Handle]):
     """The callbacks that are ready; data goes before each of them."""
 
-    def __init__(self, selector: DirectSelector) -> None:
+    def __init__(self, breathe: Callable[[], None]) -> None:
         super().__init__()
-        self._poll_data = selector.poll_data
+        self._breathe = breathe
 
     def popleft(self) -> asyncio.Handle:
         """The next one to run."""
-        self._poll_data()
+        self._breathe()
         return super().popleft()
 
 

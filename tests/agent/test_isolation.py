@@ -1,0 +1,325 @@
+"""Control work gives way to data: how long the loop of two agents keeps its eyes off the sockets of the data path.
+
+Time is that which the loop's thread had the processor, so that a busy machine does not count. What happens once may
+still be the machine's; what a kind of work does each time is ours. docs/design/isolation.md has the figures.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import os
+import socket
+import sys
+import threading
+import time
+import xmlrpc.client
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager
+from ipaddress import IPv4Address
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from rmpa.agent import Agent
+from rmpa.core import limits
+from rmpa.core.aio import loop as loop_module
+from rmpa.core.aio.loop import AgentLoop, DirectSelector, breathe
+from rmpa.core.config import Settings
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+from rmpa.discovery.beacon import Beacon, BeaconKind
+from rmpa.monitor.aio.control_client import ControlClient
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
+    from pathlib import Path
+    from types import FrameType
+
+DEADLINE: Final = 60.0
+BOUND: Final = 0.004
+"""Seconds that no work may go on for without a look; most of it takes a tenth of that."""
+STRAYS: Final = 2
+"""Longer ones in a phase that are blamed on the machine; each phase does its work more often than that."""
+TOPICS: Final = 1000
+NODES: Final = 50
+TYPE: Final = "sensor_msgs/PointCloud2"
+
+pytestmark = pytest.mark.timeout(240)
+
+
+class Watched(DirectSelector):
+    """Notes how long nobody looked at the sockets of the data path, and who did not."""
+
+    holds: list[tuple[float, str]]
+    looks = 0
+    last: str = ""
+    """The callback of the loop that ran last."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        Watched.holds = []
+        self._thread = threading.get_ident()
+        self._looked = time.thread_time()
+
+    def poll_data(self) -> None:
+        self._note()
+        super().poll_data()
+        self._looked = time.thread_time()
+
+    def select(self, timeout: float | None = None) -> list[tuple[object, int]]:  # type: ignore[override]
+        self._note()
+        try:
+            return super().select(timeout)  # type: ignore[return-value]
+        finally:
+            self._looked = time.thread_time()
+
+    def _call(self, happened: list[tuple[int, int]]) -> list[tuple[int, int]]:
+        """The readers themselves: what one does, the others wait for too."""
+        begin = time.thread_time()
+        try:
+            return super()._call(happened)
+        finally:
+            self._count(time.thread_time() - begin)
+
+    def _note(self) -> None:
+        Watched.looks += 1
+        self._count(time.thread_time() - self._looked)
+
+    def _count(self, hold: float) -> None:
+        if hold > BOUND:
+            Watched.holds.append((hold, _where()))
+
+
+def _where() -> str:
+    """Who let the time pass: the innermost functions of ours."""
+    frame: FrameType | None = sys._getframe(3)
+    names: list[str] = []
+    while frame is not None and len(names) < 4:
+        path = frame.f_code.co_filename
+        if "rmpa" in path and not path.endswith(("aio/loop.py", "test_isolation.py")):
+            names.append(f"{path.rpartition('rmpa/')[2]}:{frame.f_lineno} {frame.f_code.co_name}")
+        frame = frame.f_back
+    return " < ".join(names) or Watched.last
+
+
+@pytest.fixture(autouse=True)
+def watched(monkeypatch: pytest.MonkeyPatch) -> None:
+    run = asyncio.Handle._run
+
+    def remember(handle: asyncio.Handle) -> None:
+        Watched.last = f"before it: {handle!r}"[:300]
+        run(handle)
+
+    monkeypatch.setattr(asyncio.Handle, "_run", remember)
+    monkeypatch.setattr(loop_module, "DirectSelector", Watched)
+    # Where no data flows a full collection may take its time; here data is only imagined.
+    monkeypatch.setattr(limits, "COLLECT_GROWTH", sys.maxsize)
+    monkeypatch.setattr(limits, "COLLECT_GROWTH_MAX", sys.maxsize)
+
+
+class World:
+    """Two linked agents in one loop, and threads that are their nodes and tools."""
+
+    def __init__(
+        self, near: Agent, far: Agent, threads: ThreadPoolExecutor, api: str, group: tuple[str, int]
+    ) -> None:
+        self.near, self.far, self.api, self.group = near, far, api, group
+        self._threads = threads
+        self._phase = ""
+
+    async def beside(self, *works: Callable[[], object]) -> None:
+        """Do blocking work in threads, all at once."""
+        loop = asyncio.get_running_loop()
+        async with asyncio.timeout(DEADLINE):
+            await asyncio.gather(*(loop.run_in_executor(self._threads, work) for work in works))
+
+    async def until(self, condition: Callable[[], object]) -> None:
+        async with asyncio.timeout(DEADLINE):
+            while not condition():
+                await asyncio.sleep(0.01)
+
+    def shown(self) -> int:
+        """Topics of the far module that the near one's graph has."""
+        return sum(topic.startswith("/fleet/") for topic in self.near.core.state().publishers)
+
+    def linked(self) -> bool:
+        return all(len(list(agent.bridge.attached())) == 1 for agent in (self.near, self.far))
+
+
+@asynccontextmanager
+async def worlds(tmp_path: Path) -> AsyncIterator[World]:
+    group = (limits.MULTICAST_GROUP, 20000 + (os.getpid() + 7919) % 20000)
+    agents = [
+        Agent(Settings(name=name, core_port=0, interfaces=("lo",), group_port=group[1], runtime_dir=str(tmp_path)))
+        for name in ("near", "far")
+    ]
+    with socket.create_server(("127.0.0.1", 0)) as listening, ThreadPoolExecutor(16) as threads:
+        api = f"http://127.0.0.1:{listening.getsockname()[1]}/"
+        started: list[Agent] = []
+        try:
+            for agent in agents:
+                await agent.start()
+                started.append(agent)
+            world = World(agents[0], agents[1], threads, api, group)
+            await world.until(world.linked)
+            yield world
+        finally:
+            for agent in reversed(started):
+                await agent.close()
+
+
+def calls(agent: Agent, bodies: Iterable[bytes]) -> Callable[[], None]:
+    """Calls of a node or tool on one connection, one after the other; made there, not in the loop."""
+
+    def work() -> None:
+        connection = http.client.HTTPConnection("127.0.0.1", agent.core.port, timeout=DEADLINE)
+        for body in bodies:
+            connection.request("POST", "/RPC2", body, {"Content-Type": "text/xml"})
+            answer = connection.getresponse()
+            assert answer.status == 200
+            answer.read()
+        connection.close()
+
+    return work
+
+
+def call(method: str, *params: object) -> bytes:
+    return xmlrpc.client.dumps(params, method).encode()  # type: ignore[arg-type]
+
+
+def fleet(method: str, node: int, *further: str) -> Iterator[bytes]:
+    """The (un)registrations of one node."""
+    for topic in range(node, TOPICS, NODES):
+        yield call(method, f"/fleet/node_{node}", f"/fleet/some/namespace/topic_{topic}", *further)
+
+
+# --- the phases ------------------------------------------------------------------------------------------------
+
+
+async def a_fleet_registers(world: World) -> None:
+    nodes = [fleet("registerPublisher", node, TYPE, world.api) for node in range(NODES)]
+    await world.beside(*(calls(world.far, bodies) for bodies in nodes))
+    await world.until(lambda: world.shown() == TOPICS)
+
+
+async def tools_ask_the_master(world: World) -> None:
+    methods = ("getSystemState", "getTopicTypes", "getParamNames", "getUri")
+    bodies = [call(method, "/tool") for method in methods] + [call("getPublishedTopics", "/tool", "")]
+    await world.beside(*(calls(agent, bodies * 8) for agent in (world.near, world.far)))
+
+
+async def parameters_are_large(world: World) -> None:
+    def bodies() -> Iterator[bytes]:
+        yield call("subscribeParam", "/tool", world.api, "/large/k1")
+        maps = [{f"k{i}": {"gains": [1.5] * 20, "frame": "base_link"} for i in range(count)} for count in (50, 500)]
+        texts = ["<link name='a'>\n  <visual/>\n</link>\n" * count for count in (100, 20_000)]
+        for value in (*maps, *texts):
+            for _ in range(3):
+                yield call("setParam", "/tool", "/large", value)
+                yield call("getParam", "/tool", "/large")
+
+    await world.beside(calls(world.near, bodies()))
+
+
+async def somebody_looks_at_everything(world: World) -> None:
+    def work() -> None:
+        path = next(world.near._control.path.parent.glob("near.sock"))
+        with ControlClient(path, timeout=DEADLINE) as client:
+            for _ in range(6):
+                assert len(client.snapshot().topics) > TOPICS
+
+    await world.beside(work)
+
+
+async def plans_are_reconciled(world: World) -> None:
+    for _ in range(6):
+        for agent in (world.near, world.far):
+            assert agent.bridge._reconciler is not None
+            agent.bridge._reconciler.cancel()
+            agent.bridge._reconcile()
+        await world.until(lambda: not (world.near.bridge._changed or world.far.bridge._changed))
+
+
+async def the_link_falls_and_comes_back(world: World) -> None:
+    for _ in range(4):
+        attached = next(iter(world.near.bridge.attached()))
+        attached.link.abort("pulled")
+        await world.until(lambda attached=attached: attached.away is None and world.linked())  # type: ignore[misc]
+        await world.until(lambda: world.shown() == TOPICS)
+
+
+async def many_peers_shout(world: World) -> None:
+    def work() -> None:
+        here = IPv4Address("127.0.0.1")
+        peers = [Identity(Guid.of(here, 1 + i, 7), os.urandom(16), f"ghost{i}") for i in range(50)]
+        everybody = tuple(peer.guid for peer in peers)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+            out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
+            for turn in range(6):
+                kind = BeaconKind.ANNOUNCE if turn < 3 else BeaconKind.HEARTBEAT
+                for peer in peers:
+                    out.sendto(Beacon(kind, peer, 16_000, turn, everybody).serialize(), world.group)
+                time.sleep(0.2)
+
+    await world.beside(work)
+    assert world.near.station is not None
+    assert len(world.near.station.discovery.peers()) > 25
+
+
+async def the_fleet_leaves(world: World) -> None:
+    nodes = [fleet("unregisterPublisher", node, world.api) for node in range(NODES)]
+    await world.beside(*(calls(world.far, bodies) for bodies in nodes))
+    await world.until(lambda: world.shown() == 0)
+
+
+PHASES: Final[tuple[Callable[[World], Awaitable[None]], ...]] = (
+    a_fleet_registers,
+    tools_ask_the_master,
+    parameters_are_large,
+    somebody_looks_at_everything,
+    plans_are_reconciled,
+    the_link_falls_and_comes_back,
+    many_peers_shout,
+    the_fleet_leaves,
+)
+
+
+def test_no_work_of_a_thousand_topics_goes_on_without_a_look_at_the_data(tmp_path: Path) -> None:
+    found: dict[str, list[tuple[float, str]]] = {}
+
+    async def main() -> None:
+        async with worlds(tmp_path) as world:
+            for phase in PHASES:
+                Watched.holds.clear()
+                await phase(world)
+                if len(Watched.holds) > STRAYS:
+                    found[phase.__name__] = sorted(Watched.holds, reverse=True)[:8]
+
+    with asyncio.Runner(loop_factory=AgentLoop) as runner:
+        runner.run(main())
+    told = [f"{name}: {1e3 * hold:.1f} ms: {who}" for name, holds in found.items() for hold, who in holds]
+    assert not found, "\n".join(told)
+    assert Watched.looks > 10_000
+
+
+def test_the_watch_sees_work_that_does_not_breathe() -> None:
+    def work(breathing: bool) -> None:
+        for _ in range(20):
+            until = time.thread_time() + BOUND / 4
+            while time.thread_time() < until:
+                pass
+            if breathing:
+                breathe()
+
+    async def main() -> None:
+        work(breathing=True)
+        await asyncio.sleep(0)
+        assert len(Watched.holds) <= STRAYS
+        for _ in range(STRAYS + 1):
+            work(breathing=False)
+            await asyncio.sleep(0)
+        assert len(Watched.holds) > STRAYS
+
+    with asyncio.Runner(loop_factory=AgentLoop) as runner:
+        runner.run(main())

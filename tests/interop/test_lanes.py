@@ -1,0 +1,121 @@
+"""A command is not late because of an image: two lanes on a cable of 100 Mbit/s, between real nodes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.interop.modules import flows
+from tests.interop.processes import eventually
+from tests.interop.recordings import in_order, recorded, wait_last
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.interop.conftest import ModuleFactory
+    from tests.interop.modules import Module
+    from tests.interop.namespaces import Host
+
+pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
+
+MBIT = 100
+IMAGE = 1 << 20
+COMMANDS = 400
+"""At 100 Hz."""
+RULES = """
+[[contract]]
+topics = ["/urgent"]
+priority = "high"
+[[contract]]
+topics = ["/later"]
+priority = "low"
+"""
+
+
+def shape(host: Host) -> None:
+    """Limit what a host sends; within the limit the kernel's usual three bands, which look at SO_PRIORITY."""
+    host.shape(f"{MBIT}mbit")
+    bands = ["qdisc", "replace", "dev", host.cables[0].interface, "parent", "1:1", "handle", "10:", "pfifo_fast"]
+    root = ["qdisc", "replace", "dev", host.cables[0].interface, "root", "handle", "1:", "tbf"]
+    for words in ([*root, "rate", f"{MBIT}mbit", "burst", "32kb", "latency", "50ms"], bands):
+        subprocess.run(["tc", "-n", host.namespace, *words], check=True, capture_output=True, timeout=20)
+
+
+def lanes(module: Module, topic: str) -> list[str]:
+    """The lane of each route of a topic, as ``rmpa topic info --json`` says."""
+    code, output = module.agent.rmpa("topic", "info", topic, "--json")
+    assert code == 0, output
+    return [str(route["lane"]) for route in json.loads(output)["mesh"]["routes"]]
+
+
+def test_commands_cross_a_cable_that_images_fill(modules: ModuleFactory, tmp_path: Path) -> None:
+    a, b = modules("a", "b")
+    for module in (a, b):
+        shape(module.host)
+    images = b.ros.roscpp("listener", "__name:=eye", topic="/image", queue=2)
+    commands = b.ros.roscpp("recorder", topic="/command", nodelay=True, commands=True)
+    # More than the cable carries, so that an image is always waiting.
+    a.ros.roscpp("talker", "__name:=camera", topic="/image", size=IMAGE, rate=15, queue=2, wait=1)
+    before = flows(images, 3)
+    teller = a.ros.roscpp("teller", topic="/command", nodelay=True, wait=1, commands=True)
+    teller.wait_event("connected")
+    teller.tell(f"64 {COMMANDS} 100")
+    teller.wait_event("told")
+    wait_last(commands, COMMANDS)
+    after = images.events("report")[-1]
+    rows = recorded(commands, tmp_path)
+    in_order(rows, COMMANDS)
+    # Behind one image in one queue a command would wait for up to 84 ms, and for 42 ms on the average.
+    ages = sorted(row.age for row in rows)
+    assert ages[COMMANDS // 2] < 0.02
+    assert ages[COMMANDS * 9 // 10] < 0.04
+    assert after["bad"] == 0
+    carried = 8 * (int(str(after["bytes"])) - int(str(before["bytes"]))) / (COMMANDS / 100)
+    assert carried > 0.7 * MBIT * 1e6
+    for module in (a, b):
+        assert lanes(module, "/command") == ["express"]
+        assert lanes(module, "/image") == ["bulk"]
+
+
+def test_a_topic_of_small_and_large_messages_keeps_its_order(modules: ModuleFactory, tmp_path: Path) -> None:
+    a, b = modules("a", "b")
+    for module in (a, b):
+        shape(module.host)
+    recorders = [
+        b.ros.node(kind, "recorder", topic="/mixed", nodelay=True, commands=True) for kind in ("rospy", "roscpp")
+    ]
+    teller = a.ros.roscpp("teller", topic="/mixed", nodelay=True, wait=1, commands=True)
+    teller.wait_event("connected")
+    eventually(lambda: lanes(b, "/mixed") == ["express"], what="the route to /mixed")
+    # 200 KB at 100 Hz would be 160 Mbit/s; each fifth are 32 Mbit/s, and still under way when small ones follow. A row
+    # of small ones takes the topic back to the express lane, 5 s after the last large one.
+    told = 0
+    for sizes, count, rate, lane in (
+        ("100,100,204800,100,100", 200, 100, "bulk"),
+        ("100", 1200, 200, "express"),
+        ("100,204800,100,100,100", 200, 100, "bulk"),
+    ):
+        since = teller.mark_events()
+        teller.tell(f"{sizes} {count} {rate}")
+        teller.wait_event("told", since=since)
+        told += count
+        for recorder in recorders:
+            wait_last(recorder, told)
+        assert lanes(a, "/mixed") == [lane]
+    for recorder in recorders:
+        in_order(recorded(recorder, tmp_path), told)
+
+
+def test_a_contract_decides_the_lane(modules: ModuleFactory) -> None:
+    rules = (
+        '[[contract]]\ntopics = ["/urgent"]\npriority = "high"\n[[contract]]\ntopics = ["/later"]\npriority = "low"\n'
+    )
+    a, b = modules("a", "b", config=rules)
+    for topic, size, lane in (("/urgent", 200_000, "express"), ("/later", 64, "bulk")):
+        heard = b.ros.roscpp("listener", topic=topic)
+        a.ros.roscpp("talker", topic=topic, size=size, rate=20, wait=1)
+        assert flows(heard, 20)["bad"] == 0
+        assert lanes(a, topic) == lanes(b, topic) == [lane]
