@@ -85,7 +85,7 @@ class Reader:
         return read
 
     def _frame(self, kind: int, flags: int, route: int, number: int, size: int, body: bytes) -> str:
-        if kind == Kind.HELLO:
+        if kind in {Kind.HELLO, Kind.PING}:
             return "whole"
         if kind != Kind.DATA:
             self._in_order(kind, route, number)
@@ -216,6 +216,7 @@ class Model:
             while self._too_old(key, now):
                 pass
         assert not self.budget(), "expired without need"
+        self.ready()
 
     def read(self, fresh: bytes, now: float) -> None:
         """So many more bytes are on their way on this connection."""
@@ -242,9 +243,13 @@ class Model:
             pass
         entry = self.flows[key][0]
         assert entry.number == number, "the oldest of the key leaves first"
-        for other, since in self.served.items():
-            if other != key:
-                assert key not in since, f"{key} had two turns while {other} waited"
+        for other, since in list(self.served.items()):
+            if other != key and key in since:
+                while self._too_old(other, now):
+                    pass  # its turn came, and all that it had was too old
+                self.ready()
+                assert other not in self.served, f"{key} had two turns while {other} waited"
+            elif other != key:
                 since.add(key)
         self.served[key] = set()
         if not entry.begun:

@@ -115,11 +115,11 @@ class ExportFlow:
         self._legs = tuple(self.by_peer.values())
         return leg
 
-    def suspend(self, peer: int) -> None:
-        """A peer's link is gone: keep its messages."""
+    def suspend(self, peer: int, keep: Callable[[bytes, int], object] | None = None) -> None:
+        """A peer's link is gone: keep its messages; see ``ReliableLeg.suspend``."""
         leg = self.by_peer.get(peer)
         if isinstance(leg, ReliableLeg):
-            leg.suspend()
+            leg.suspend(keep)
 
     def remove(self, peer: int) -> None:
         """Send to that peer no longer."""

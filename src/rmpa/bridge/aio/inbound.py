@@ -97,7 +97,7 @@ class Inbound:
 
     def flow(self, source: Source, route: int) -> ImportFlow | None:
         """What comes of a source: over its open route, or what waits for its peer to come back."""
-        return self.flows.get(route) or self._reliable.get(source)
+        return self.flows.get(route) or self._latest.get(source)
 
     def publish(self, action: Publish) -> None:
         """Let a source appear; takes a moment."""
@@ -139,7 +139,7 @@ class Inbound:
     ) -> tuple[ImportFlow, bool]:
         """The flow of a route, and whether it goes on exactly where it was when its link fell."""
         source, contract = action.source, action.contract
-        flow = self._latest.pop(source, None)
+        flow = flow_before = self._latest.pop(source, None)
         goes_on = False
         if flow is not None and flow.contract == contract and contract.reliability is Reliability.RELIABLE:
             flow.rebind(on_ack)
@@ -157,7 +157,9 @@ class Inbound:
                 on_ack=on_ack,
                 on_torn=lambda: self._call_back_soon(source, publication),
             )
-            flow.begin_epoch(action.epoch, action.first)
+            position = flow_before.position if flow_before is not None else None
+            known = position is not None and position[0] == action.epoch
+            flow.begin_epoch(action.epoch, position[1] + 1 if position is not None and known else action.first)
         publication.bound(contract.depth)
         if contract.durability is Durability.TRANSIENT_LOCAL:
             publication.keep(contract.kept)

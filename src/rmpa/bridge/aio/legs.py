@@ -16,6 +16,8 @@ from rmpa.core.contract import Contract, History, Reliability
 from rmpa.mesh.reliable import ReliableSender
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rmpa.core.aio.stream import Buffer
     from rmpa.core.outbox import Parcel
 
@@ -277,6 +279,7 @@ class ReliableLeg(Leg):
         self.sender = ReliableSender(
             depth, limits.REPLAY_BYTES, limits.RELIABLE_WINDOW_MESSAGES, limits.RELIABLE_WINDOW_BYTES, epoch
         )
+        self._keep: Callable[[bytes, int], object] | None = None
         super().__init__(link, route, contract, large=large)
         self._direct = False
 
@@ -301,9 +304,15 @@ class ReliableLeg(Leg):
         else:
             self._pump()
 
-    def suspend(self) -> None:
-        """The link is gone; messages are kept until ``resume``, or until it is given up."""
+    def suspend(self, keep: Callable[[bytes, int], object] | None = None) -> None:
+        """The link is gone; messages are kept until ``resume``, or until it is given up.
+
+        Args:
+            keep: ``(payload, stamp_ns)``: offers a message to the sender, and sees to it that all suspended ones
+                together keep no more than they may.
+        """
         self.link = None
+        self._keep = keep
         self.sender.suspend()
 
     def resume(self, link: DataLink, route: int, after: int) -> None:
@@ -313,6 +322,7 @@ class ReliableLeg(Leg):
             RemoteProtocolError: It cannot have.
         """
         self.sender.resume(after)
+        self._keep = None
         self.link, self.route = link, route
         self._switch.restart()
         self._set_terms()
@@ -324,8 +334,11 @@ class ReliableLeg(Leg):
 
     def _send(self, stamp_ns: int, framed: Buffer) -> int:
         before = self.sender.overflowed
-        self.sender.offer(bytes(framed), stamp_ns)
-        self._pump()
+        if self._keep is not None:
+            self._keep(bytes(framed), stamp_ns)
+        else:
+            self.sender.offer(bytes(framed), stamp_ns)
+            self._pump()
         lost = self.sender.overflowed - before
         self.dropped += lost
         return lost
