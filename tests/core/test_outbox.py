@@ -1,4 +1,7 @@
-"""The outbox against a plain model: bounds hold, order is kept per key, no message is torn, no byte is lost."""
+"""The outbox: bounds hold, order is kept per key, no message is torn, no byte is lost.
+
+Here by example, and whole messages alone against a plain model; ``test_outbox_machine.py`` has all that there is.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,9 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
+from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError
-from rmpa.core.outbox import URGENT, Outbox
+from rmpa.core.outbox import ABORT, FIRST, LAST, URGENT, Outbox, Parcel
 
 ENTRIES = 4
 BYTES = 300
@@ -125,6 +129,251 @@ def test_clear_lets_go_and_keeps_the_counts() -> None:
     assert not box
     assert box.pending_bytes == box.urgent_bytes == 0
     assert box.dropped == {1: 1}
+
+
+# --- in turns and in parts ----------------------------------------------------------------------------------------
+
+
+def flags_of(parcel: Parcel, length: int, flags: int) -> bytes:
+    """A header that can be read in a test: ``<7:3F`` is the first fragment of route 7, 3 bytes."""
+    letters = "".join(letter for letter, flag in (("F", FIRST), ("L", LAST), ("A", ABORT)) if flags & flag)
+    return f"<{parcel.key}:{length}{letters}>".encode()
+
+
+def framed(**bounds: int) -> Outbox:
+    return Outbox(bounds.get("entries", 10), bounds.get("max_bytes", 1000), frame=flags_of, fragment=4)
+
+
+def test_messages_of_several_keys_take_turns() -> None:
+    box = Outbox(10, 1000)
+    for key in (1, 2, 3):
+        for number in range(3):
+            box.push(b"%d%d " % (key, number), key)
+    box.push_urgent(b"now ")
+    assert drain(box) == b"now 10 20 30 11 21 31 12 22 32 "
+
+
+def test_a_large_message_leaves_in_fragments_and_a_small_one_between_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "COMMIT_BYTES", 1)  # nothing is prepared beyond what leaves
+    box = framed()
+    large = Parcel(1, 10)
+    box.extend(large, b"0123456789")
+    assert b"".join(box.head()) == b"<1:4F>0123"
+    box.push(b"small", 2)
+    box.push_urgent(b"!")
+    assert drain(box) == b"<1:4F>0123!<1:4>4567small<1:2L>89"
+    assert large.sent == large.size
+
+
+def test_what_comes_while_it_leaves_follows_and_a_parcel_without_bytes_holds_nobody_up() -> None:
+    box = framed()
+    growing = Parcel(1, 9)
+    box.extend(growing, b"abc")
+    assert drain(box) == b"<1:3F>abc"
+    assert not box
+    assert box.waiting(1) == 1
+    box.push(b"other", 2)
+    box.push(b"later", 1)
+    assert drain(box) == b"other", "the next of its key waits for the rest"
+    box.extend(Parcel(3, 1), b"x")
+    growing_rest = b"defghi"
+    with pytest.raises(LocalProtocolError, match="9 bytes"):
+        box.extend(growing, growing_rest + b"j")
+
+
+def test_bytes_of_a_message_behind_which_another_was_queued_are_never_put_in_front_of_it() -> None:
+    """A leg sends the parts of one message in one go; this is what keeps the model honest."""
+    box = framed()
+    growing = Parcel(1, 6)
+    box.extend(growing, b"abc")
+    box.extend(growing, b"def")
+    box.push(b"next", 1)
+    assert drain(box) == b"<1:4F>abcd<1:2L>efnext"
+
+
+def test_a_parcel_in_many_small_pieces_leaves_in_as_few_fragments_as_there_can_be() -> None:
+    box = framed()
+    parcel = Parcel(1, 10)
+    for byte in b"0123456789":
+        box.extend(parcel, bytes([byte]))
+    assert drain(box) == b"<1:4F>0123<1:4>4567<1:2L>89"
+
+
+def test_without_a_framer_bytes_leave_as_they_are() -> None:
+    box = Outbox(10, 1000, fragment=4)
+    parcel = Parcel(1, 10)
+    box.extend(parcel, b"0123456")
+    box.push_urgent(b"!")
+    assert drain(box) == b"!0123456"
+    box.extend(parcel, b"789")
+    assert drain(box) == b"789"
+
+
+def test_a_message_that_was_not_begun_is_abandoned_without_a_word() -> None:
+    box = framed()
+    parcel = Parcel(1, 10)
+    box.extend(parcel, b"0123")
+    assert box.abandon(parcel) is False
+    assert not box
+    assert box.pending_bytes == box.waiting(1) == 0
+    assert box.extend(parcel, b"4567") == 0
+    assert not box
+
+
+def test_one_that_was_begun_is_abandoned_with_a_word_once() -> None:
+    box = framed()
+    parcel = Parcel(1, 10)
+    box.extend(parcel, b"012345")
+    box.head(2)
+    assert box.abandon(parcel) is False
+    assert box.abandon(parcel) is False
+    box.extend(parcel, b"6789")
+    assert drain(box) in (b"<1:4F>0123<1:0LA>", b"<1:4F>0123<1:2>45<1:0LA>")
+    assert box.pending_bytes == 0
+
+
+def test_without_a_framer_nobody_can_be_told() -> None:
+    box = Outbox(10, 1000)
+    parcel = Parcel(1, 10)
+    box.extend(parcel, b"012345")
+    drain(box)
+    assert box.abandon(parcel) is True
+    assert box.abandon(parcel) is False
+
+
+def test_a_closed_route_aborts_what_it_began() -> None:
+    box = framed()
+    parcel = Parcel(1, 10)
+    box.extend(parcel, b"0123456789")
+    box.push(b"behind", 1)
+    box.consumed(len(b"<1:4F>0123"))
+    assert box.discard(1) == 2
+    assert parcel.dropped
+    assert drain(box).endswith(b"<1:0LA>")
+    assert box.pending_bytes == 0
+
+
+def test_a_growing_message_that_was_dropped_is_dropped_for_good() -> None:
+    box = framed(entries=1)
+    old = Parcel(1, 10)
+    box.extend(old, b"0123")
+    assert box.push(b"new", 1) == 1
+    assert old.dropped
+    assert box.extend(old, b"456789") == 0
+    assert drain(box) == b"new"
+    assert box.dropped == {1: 1}
+
+
+def test_what_grows_pushes_others_out_but_never_itself() -> None:
+    box = framed(max_bytes=20)
+    box.push(bytes(15), 2)
+    growing = Parcel(1, 40)
+    assert box.extend(growing, bytes(4)) == 0
+    assert box.extend(growing, bytes(30)) == 1
+    assert box.dropped == {2: 1}
+    assert not growing.dropped
+
+
+def test_marks_are_never_dropped_and_push_nothing_out() -> None:
+    box = framed(entries=2, max_bytes=20)
+    box.push(b"old", 1)
+    for number in range(30):
+        assert box.push(b"[%02d]" % number, 1, pinned=True) == (number == 1)
+    for number in range(5):
+        box.push(b"m%d" % number, 1)
+    assert drain(box) == b"".join(b"[%02d]" % n for n in range(30)) + b"m4"
+    assert box.dropped == {1: 5}
+
+
+# --- terms of a key -----------------------------------------------------------------------------------------------
+
+
+def test_what_is_too_old_gives_way_to_what_is_newer_and_the_newest_leaves_however_old() -> None:
+    box = Outbox(10, 1000)
+    box.set_terms(1, 10, 0.5)
+    for tenth in range(4):
+        box.push(b"%d" % tenth, 1, now=1.0 + tenth / 10)
+    assert b"".join(box.head(now=1.55)) == b"123"
+    box.push(b"x", 2, now=9.0)
+    box.clear()
+    for tenth in range(4):
+        box.push(b"%d" % tenth, 1, now=1.0 + tenth / 10)
+    assert b"".join(box.head(now=99.0)) == b"3"
+    assert box.expired == {1: 4}
+    assert not box.dropped
+
+
+def test_a_lifespan_holds_for_the_newest_too() -> None:
+    box = Outbox(10, 1000)
+    box.set_terms(1, 10, 0.5, strict=True)
+    box.push(b"a", 1, now=1.0)
+    box.push(b"b", 1, now=1.2)
+    assert box
+    assert box.head(now=2.0) == []
+    assert not box
+    assert box.pending_bytes == 0
+    assert box.expired == {1: 2}
+
+
+def test_what_was_begun_and_marks_never_grow_too_old() -> None:
+    box = framed()
+    box.set_terms(1, 10, 0.5, strict=True)
+    begun = Parcel(1, 6, born=1.0)
+    box.extend(begun, b"abc")
+    assert b"".join(box.head(now=1.1)) == b"<1:3F>abc"
+    box.extend(begun, b"def")
+    box.push(b"[]", 1, now=1.2, pinned=True)
+    box.push(b"old", 1, now=1.2)
+    box.consumed(len(b"<1:3F>abc"))
+    assert b"".join(box.head(now=9.0)) == b"<1:3L>def[]"
+
+
+def test_terms_hold_for_what_waits_already_and_end_with_the_route() -> None:
+    box = Outbox(1, 1000)
+    box.push(b"a", 1)
+    box.set_terms(1, 3)
+    assert [box.push(b"%d" % n, 1) for n in range(3)] == [0, 0, 1]
+    box.discard(1)
+    assert [box.push(b"%d" % n, 1) for n in range(2)] == [0, 1]
+
+
+# --- another connection -------------------------------------------------------------------------------------------
+
+
+def test_a_lost_connection_takes_what_was_begun_and_leaves_the_rest_for_the_next(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(limits, "COMMIT_BYTES", 1)
+    box = framed()
+    torn, whole = Parcel(1, 8), Parcel(2, 8)
+    box.extend(torn, b"01234567")
+    box.head()
+    box.extend(whole, b"abcdefgh")
+    box.push(b"one", 1)
+    box.push(b"[]", 2, pinned=True)
+    box.push_urgent(b"bye of the old one")
+    box.consumed(3)
+    assert box.reset() == 1
+    assert torn.dropped
+    assert not whole.dropped
+    assert box.pending_bytes == len(b"one") + len(b"abcdefgh") + len(b"[]")
+    box.prepend(b"hello ")
+    assert drain(box) in (b"hello <2:4F>abcdone<2:4L>efgh[]", b"hello one<2:4F>abcd<2:4L>efgh[]")
+    assert box.reset() == 0
+
+
+def test_a_message_that_waits_for_its_next_bytes_is_torn_too() -> None:
+    box = framed()
+    parcel = Parcel(1, 8)
+    box.extend(parcel, b"0123")
+    drain(box)
+    assert box.reset() == 1
+    assert box.extend(parcel, b"4567") == 0
+    assert not box
+    assert box.waiting(1) == 0
+
+
+# --- whole messages against a model -------------------------------------------------------------------------------
 
 
 class AgainstModel(RuleBasedStateMachine):

@@ -16,6 +16,8 @@ from rmpa.bridge.actions import Describe, Publish
 from rmpa.bridge.aio.inbound import Inbound
 from rmpa.bridge.messages import Description as About
 from rmpa.bridge.messages import Source
+from rmpa.core.contract import Contract
+from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.ros.aio.core import RosCore
 from rmpa.ros.aio.http_client import call_api
 from rmpa.ros.aio.node import Node
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
 
     from tests.interop.agents import Agent
     from tests.interop.conftest import AgentFactory, ShellFactory
+    from tests.interop.processes import Process
     from tests.interop.ros import Ros
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
@@ -173,21 +176,75 @@ async def test_listeners_come_back_when_a_remote_publisher_has_another_header(
     core: RosCore, ros: Ros, library: str, closing: AsyncExitStack
 ) -> None:
     """They are promised another definition by hanging up; rospy comes again only if the master names the proxy."""
-    kind = MessageType(BYTES)
-    source = Source("/chatter", "/speaker")
-    inbound = Inbound(core, "/rmpa/peer", on_demand=lambda _s, _w: None, on_mismatch=lambda _s, _c, _t: None)
-    inbound.publish(Publish(1, source, BYTES))
+    inbound, listener = await proxied(core, ros.node(library, "listener", each=True))
     closing.push_async_callback(inbound.close)
-    listener = ros.node(library, "listener", each=True)
-    await until(lambda: (p := inbound.publication(source)) is not None and p.subscribers)
     for route, latching in ((1, False), (2, True)):
-        inbound.describe(Describe(1, source, route, About(BYTES, kind.md5sum, kind.definition, latching)))
-        sequence = 0
-        while not any(f"'{route}'" in str(r["sources"]) for r in listener.events("report")):
-            sequence += 1
-            message = frame_message(framed(Pattern(64).payload(route, sequence)))
-            inbound.flows[route].message(sequence, 0, memoryview(message))
-            await asyncio.sleep(0.02)
+        describe(inbound, route, latching=latching)
+        await heard(inbound, route, listener, str(route))
+
+
+@pytest.mark.trap(14)
+@libraries
+async def test_listeners_that_were_hung_up_on_in_the_middle_of_a_message_come_back(
+    core: RosCore, ros: Ros, library: str, closing: AsyncExitStack
+) -> None:
+    """A remote publisher was killed in the middle of an image: TCPROS cannot take half of it back."""
+    inbound, listener = await proxied(core, ros.node(library, "listener", each=True))
+    closing.push_async_callback(inbound.close)
+    describe(inbound, 1)
+    sequence = await heard(inbound, 1, listener, "1")
+    publication = inbound.publication(SOURCE)
+    assert publication is not None
+    flow, wire = inbound.flows[1], frame_message(framed(Pattern(1_000_000).payload(2, 1)))
+    for end in (LAST | ABORT, 0):
+        flow.part(sequence + 1, 0, FIRST, memoryview(wire)[:500_000])
+        if end:
+            flow.part(sequence + 1, 0, end, memoryview(b""))
+        else:
+            flow.torn()
+        assert publication.subscribers == 0
+        await until(lambda: publication.subscribers)
+        before = len(listener.events("report"))
+        sequence = await heard(inbound, 1, listener, "1", first=sequence + 2, after=before)
+    report = listener.events("report")[-1]
+    assert (report["bad"], list(report["sources"])) == (0, ["1"])  # type: ignore[call-overload]
+
+
+SOURCE = Source("/chatter", "/speaker")
+
+
+async def proxied(core: RosCore, listener: Process) -> tuple[Inbound, Process]:
+    """A peer's side with one source, and a listener of that source that is connected to its proxy."""
+    inbound = Inbound(
+        core,
+        "/rmpa/peer",
+        on_demand=lambda _s, _w: None,
+        on_mismatch=lambda _s, _c, _t: None,
+        on_occurred=lambda _s, _o: None,
+    )
+    inbound.publish(Publish(1, SOURCE, BYTES))
+    await until(lambda: (p := inbound.publication(SOURCE)) is not None and p.subscribers)
+    return inbound, listener
+
+
+def describe(inbound: Inbound, route: int, *, latching: bool = False) -> None:
+    """A route of the source is open."""
+    kind = MessageType(BYTES)
+    about = About(BYTES, kind.md5sum, kind.definition, latching)
+    inbound.describe(Describe(1, SOURCE, route, about, Contract()), lambda _sequence: None)
+
+
+async def heard(
+    inbound: Inbound, route: int, listener: Process, source: str, *, first: int = 1, after: int = 0
+) -> int:
+    """Send messages on a route until the listener has heard one; return the last one's number."""
+    sequence = first - 1
+    while not any(source in str(report["sources"]) for report in listener.events("report")[after:]):
+        sequence += 1
+        message = frame_message(framed(Pattern(64).payload(int(source), sequence)))
+        inbound.flows[route].message(sequence, 0, memoryview(message))
+        await asyncio.sleep(0.02)
+    return sequence
 
 
 # --- through two agents -----------------------------------------------------------------------------------------

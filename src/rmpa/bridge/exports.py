@@ -283,6 +283,13 @@ class Exports:
             actions.append(SuspendRoute(source, peer))
         return actions, self.waits_for(peer)
 
+    def given_up(self, source: Source, peer: int) -> list[Action]:
+        """Nothing is kept any more of a suspended route."""
+        flow = self._flows.get(source)
+        if flow is None or flow.away.pop(peer, None) is None:
+            return []
+        return self._disconnect(source, flow)
+
     def waits_for(self, peer: int) -> bool:
         """Whether a reliable route waits for a peer without a link."""
         return any(peer in flow.away for flow in self._flows.values())

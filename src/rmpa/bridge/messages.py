@@ -234,11 +234,12 @@ def _check_terms(message: Open | Opened) -> None:
     numbers = (message.epoch, message.after if isinstance(message, Open) else message.first)
     times = (contract.deadline, contract.lifespan, contract.liveliness_lease)
     lowest, highest = limits.CONTRACT_TIME_MIN, limits.CONTRACT_TIME_MAX
+    lowest_rate = limits.CONTRACT_RATE_MIN
     if not 1 <= contract.depth <= limits.CONTRACT_DEPTH_MAX:
         problem = f"a depth of {contract.depth}"
     elif any(t is not None and not (math.isfinite(t) and lowest <= t <= highest) for t in times):
         problem = f"times of {times} seconds"
-    elif contract.max_rate is not None and not 0 < contract.max_rate <= limits.CONTRACT_RATE_MAX:
+    elif contract.max_rate is not None and not lowest_rate <= contract.max_rate <= limits.CONTRACT_RATE_MAX:
         problem = f"a rate of {contract.max_rate}"
     elif any(not 0 <= number <= _ROUTE_MAX for number in numbers):
         problem = f"the numbers {numbers}"

@@ -141,8 +141,10 @@ KEEPALIVE_ANSWERED: Final = 1.2
 """The acceptor's interval in those of the dialler: the dialler pings, and the pong counts as a sign of life."""
 HANDSHAKE_TIMEOUT: Final = 3.0
 """From connect to welcome; whoever takes longer is a port scanner or stuck."""
+DIAL_ATTEMPTS: Final = (0.3, 0.5, 1.2)
+"""For each of the TCP connects that make a dial."""
 DIAL_TIMEOUT: Final = 2.0
-"""For the TCP connect itself."""
+"""For all of them."""
 DIAL_FALLBACK: Final = 2.0
 """The higher GUID waits this long for the lower one's call, then dials itself (NAT, firewall)."""
 BACKOFF_FIRST: Final = 0.1
@@ -203,7 +205,7 @@ AWAY_GRACE: Final = 0.5
 contact the next link stands within it, and no node need connect anew."""
 KEEP_ALL_MESSAGES: Final = 1_000_000
 """What "all" means for a contract's history: bytes bound it first."""
-BULK_STALE_AGE: Final = 1.0
+BULK_STALE_AGE: Final = 0.5
 """The same on the bulk lane: of a topic that a slow link cannot carry, the newest goes."""
 REPLAY_BYTES: Final = 64 * MIB
 """Reliable messages of one route that are kept for a peer, at the most; the oldest is given up beyond it."""

@@ -208,7 +208,8 @@ class Outbox:
     def push(self, data: bytes, key: int, now: float = 0.0, *, pinned: bool = False) -> int:
         """Queue one whole entry; return how many older ones, of any key, were dropped for it.
 
-        An empty entry is nothing to send and not queued. A pinned one is never dropped: a mark between messages.
+        An empty entry is nothing to send and not queued. A pinned one is never dropped, and not counted against the
+        bound in bytes: a mark between messages.
         """
         if not data:
             return 0
@@ -287,10 +288,14 @@ class Outbox:
         return count
 
     def reset(self) -> int:
-        """The connection is gone: forget what was begun, keep what was not; return how many entries were torn."""
+        """The connection is gone: forget what was begun, keep what was not; return how many entries were torn.
+
+        Urgent entries are what the connection itself had to say: the next one must not begin with its bye.
+        """
         torn = 0
         self._committed.clear()
-        self._committed_bytes = 0
+        self._urgent.clear()
+        self._committed_bytes = self._urgent_bytes = 0
         for key, flow in list(self._flows.items()):
             parcel = flow.parcels[0] if flow.parcels else None
             if parcel is not None and parcel.sent:
@@ -386,7 +391,7 @@ class Outbox:
     def _commit_turn(self, flow: _Flow, parcel: Parcel) -> None:
         """Commit one turn's bytes of a parcel that has some."""
         flags = 0 if parcel.sent else FIRST
-        if not parcel.sent:  # begun from here on: no longer counted against the bound
+        if not parcel.sent and not parcel.pinned:  # begun from here on: no longer counted against the bound
             flow.size -= parcel.held
             self._data_bytes -= parcel.held
             self._begun_bytes += parcel.held
@@ -419,7 +424,7 @@ class Outbox:
         parcel.chunks.append(data)
         parcel.held = len(data)
         flow.parcels.append(parcel)
-        if parcel.sent:
+        if parcel.sent or parcel.pinned:
             self._begun_bytes += len(data)
         else:
             flow.size += len(data)
@@ -443,7 +448,7 @@ class Outbox:
 
     def _release(self, flow: _Flow, parcel: Parcel) -> None:
         """Let go of a parcel's bytes, and of their account."""
-        if parcel.sent:
+        if parcel.sent or parcel.pinned:
             self._begun_bytes -= parcel.held
         else:
             flow.size -= parcel.held

@@ -242,8 +242,15 @@ class Peering:
         self._by_link[link_id] = peer
         self._outputs.append(LinkUp(link_id, identity))
 
-    def link_down(self, link_id: int, reason: str, now: float) -> None:
-        """A link ended, for whatever reason; one that was replaced or never up says nothing new."""
+    def link_down(self, link_id: int, reason: str, now: float, *, silent: bool = False) -> None:
+        """A link ended, for whatever reason; one that was replaced or never up says nothing new.
+
+        Args:
+            link_id: Which.
+            reason: Why.
+            now: Monotonic seconds.
+            silent: It fell silent: the way to the peer is what failed, and may be back at once.
+        """
         peer = self._by_link.get(link_id)
         if peer is None or peer.link is None:
             return
@@ -251,7 +258,7 @@ class Peering:
         self._drop(peer, link, reason)
         peer.fell = now
         peer.last_error = reason
-        if now - link.since >= limits.LINK_STABLE:
+        if silent or now - link.since >= limits.LINK_STABLE:
             peer.backoff.reset()
         if not peer.announced and len(self._peers) > limits.ROSTER_PEERS_MAX:
             peer.gone = True  # invented identities must not fill the memory, nor make us dial for them

@@ -94,6 +94,11 @@ class ReliableSender:
         return self._next
 
     @property
+    def confirmed(self) -> int:
+        """The receiver has everything up to this message, as far as is known."""
+        return self._acknowledged
+
+    @property
     def pending(self) -> int:
         """Messages kept."""
         return len(self._sent) + len(self._unsent)

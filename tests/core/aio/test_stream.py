@@ -329,7 +329,8 @@ async def test_what_is_sent_in_a_read_leaves_before_a_close_in_the_same_read(soc
     assert other.ends == [None]
 
 
-async def test_a_read_within_a_read_moves_nothing_that_still_waits(sockets: Sockets) -> None:
+@pytest.mark.parametrize("size", [5, 600])
+async def test_a_read_within_a_read_moves_nothing_that_still_waits(sockets: Sockets, size: int) -> None:
     """A reader feeds another stream whose messages go to the same target; views of both must stay whole."""
     target, end = counted(sockets[0]), End(sockets[1])
     (a_far, a_near), (b_far, b_near) = socket.socketpair(), socket.socketpair()
@@ -347,9 +348,9 @@ async def test_a_read_within_a_read_moves_nothing_that_still_waits(sockets: Sock
         return taken
 
     first.into._on_bytes = both
-    a_far.send(b"\0\0\0\5outer")
+    a_far.send(size.to_bytes(4, "big") + b"o" * size)
     await until(lambda: len(end.got) == 4)
-    assert end.got == [b"outer", *inner]
+    assert end.got == [b"o" * size, *inner]
     second.close()
     first.close()
     end.stream.close()

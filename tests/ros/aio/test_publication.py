@@ -328,3 +328,237 @@ async def test_a_machine_that_was_switched_off_is_noticed_by_the_kernel(known: O
     ):
         assert inbound._sock.getsockopt(level, option) == value
     link.close()
+
+
+# --- messages in parts ------------------------------------------------------------------------------------------
+
+PARTS = [bytes([n]) * 100_000 for n in range(1, 11)]
+WHOLE = b"".join(PARTS)
+
+
+def begin(publication: Publication, payload: bytes = WHOLE) -> None:
+    publication.begin(4 + len(payload))
+    publication.extend(memoryview(len(payload).to_bytes(4, "little")))
+
+
+def extend(publication: Publication, *parts: bytes) -> None:
+    for part in parts:
+        buffer = bytearray(part)
+        publication.extend(memoryview(buffer))
+        buffer[:] = bytes(len(buffer))  # the stream's buffer is used again
+
+
+async def test_parts_go_on_as_they_come_and_make_the_message(known: Owner) -> None:
+    link = await known.subscriber()
+    await link.header()
+    known.publication.publish_framed(frame_message(b"before"))
+    begin(known.publication)
+    extend(known.publication, PARTS[0])
+    assert await link.message() == b"before"
+    while len(link.data) < 4 + len(PARTS[0]):
+        await link._more()
+    assert known.publication.messages == 1
+    extend(known.publication, *PARTS[1:])
+    known.publication.publish_framed(frame_message(b"after"))
+    assert await link.message() == WHOLE
+    assert await link.message() == b"after"
+    assert known.publication.messages == 3
+    assert known.publication.bytes == 4 + len(WHOLE) + 2 * 4 + 11
+    link.close()
+
+
+async def test_what_nobody_hears_is_counted_all_the_same(known: Owner) -> None:
+    begin(known.publication)
+    extend(known.publication, *PARTS)
+    assert (known.publication.messages, known.publication.bytes) == (1, 4 + len(WHOLE))
+    link = await known.subscriber()
+    begin(known.publication)
+    link.close()
+    await until(lambda: known.publication.subscribers == 0)
+    extend(known.publication, *PARTS)
+    assert (known.publication.messages, known.publication.bytes) == (2, 2 * (4 + len(WHOLE)))
+
+
+async def test_a_slow_subscriber_among_fast_ones_gets_whole_messages_or_none() -> None:
+    owner = Owner(STRING, queue_messages=2, queue_bytes=1 << 30)
+    slow = await owner.subscriber(callerid="/slow", buffer=4096)
+    fast = [await owner.subscriber(callerid=f"/fast{n}") for n in range(2)]
+    for link in (slow, *fast):
+        await link.header()
+    sent = []
+    for number in range(30):
+        parts = [bytes([number]) * 150_000, bytes([255 - number]) * 100_000]
+        sent.append(b"".join(parts))
+        begin(owner.publication, sent[-1])
+        extend(owner.publication, *parts)
+        for link in fast:
+            assert await link.message() == sent[-1]
+    dropped = owner.publication.dropped
+    assert dropped > 10
+    got = [await slow.message() for _ in range(30 - dropped)]
+    assert got == [message for message in sent if message in got], "in order, none torn, none twice"
+    assert got[-2:] == sent[-2:]
+    for link in (slow, *fast):
+        link.close()
+    owner.close()
+
+
+async def test_a_slow_subscriber_holds_no_more_than_its_bytes_of_parts_either() -> None:
+    owner = Owner(STRING, queue_messages=1000, queue_bytes=1_000_000)
+    slow = await owner.subscriber(buffer=4096)
+    for _ in range(20):
+        begin(owner.publication)
+        extend(owner.publication, *PARTS)
+    (inbound,) = owner.publication._open
+    assert inbound.stream.pending_bytes <= 1_000_000 + 2 * len(WHOLE)
+    slow.close()
+    owner.close()
+
+
+async def test_who_comes_in_the_middle_begins_with_the_next_one(known: Owner) -> None:
+    early = await known.subscriber(callerid="/early")
+    begin(known.publication)
+    extend(known.publication, *PARTS[:5])
+    late = await known.subscriber(callerid="/late")
+    extend(known.publication, *PARTS[5:])
+    known.publication.publish_framed(frame_message(b"next"))
+    for link, messages in ((early, [WHOLE, b"next"]), (late, [b"next"])):
+        await link.header()
+        assert [await link.message() for _ in messages] == messages
+        link.close()
+
+
+@pytest.mark.trap(10)
+async def test_who_comes_in_the_middle_of_a_latched_one_gets_it_whole_behind_the_one_before(latched: Owner) -> None:
+    """A map is published once: there is no next one to begin with."""
+    early = await latched.subscriber(callerid="/early")
+    latched.publication.publish_framed(frame_message(b"old map"))
+    begin(latched.publication)
+    extend(latched.publication, *PARTS[:5])
+    late = await latched.subscriber(callerid="/late")
+    extend(latched.publication, *PARTS[5:])
+    latest = await latched.subscriber(callerid="/latest")
+    latched.publication.publish_framed(frame_message(b"next"))
+    for link, messages in ((early, [b"old map", WHOLE]), (late, [b"old map", WHOLE]), (latest, [WHOLE])):
+        await link.header()
+        assert [await link.message() for _ in range(len(messages) + 1)] == [*messages, b"next"]
+        link.close()
+
+
+async def test_an_abort_hangs_up_on_those_who_have_the_beginning_and_on_nobody_else() -> None:
+    owner = Owner(STRING, queue_messages=100)
+    half = await owner.subscriber(callerid="/half")
+    stuck = await owner.subscriber(callerid="/stuck", buffer=4096)
+    await stuck.header()
+    (blocked,) = [link for link in owner.publication._open if link.caller_id == "/stuck"]
+    fills = 0
+    while not blocked.stream.pending_bytes:
+        owner.publication.publish_framed(frame_message(bytes(100_000)))
+        fills += 1
+    owner.publication.publish_framed(frame_message(b"last"))
+    begin(owner.publication)
+    extend(owner.publication, *PARTS[:3])
+    late = await owner.subscriber(callerid="/late")
+    assert owner.publication.abort() == 1
+    assert {link.caller_id for link in owner.publication._open} == {"/stuck", "/late"}
+    assert owner.said == ["first"]
+    await half.header()
+    assert [len(await half.message()) for _ in range(fills + 1)] == [100_000] * fills + [4]
+    with pytest.raises(EOFError):
+        await half.message()
+    assert 0 < len(half.data) < len(WHOLE)
+    owner.publication.publish_framed(frame_message(b"next"))
+    assert [len(await stuck.message()) for _ in range(fills + 2)] == [100_000] * fills + [4, 4]
+    await late.header()
+    assert await late.message() == b"next"
+    for link in (half, stuck, late):
+        link.close()
+    owner.close()
+
+
+async def test_an_abort_that_leaves_nobody_ends_the_demand(known: Owner) -> None:
+    link = await known.subscriber()
+    begin(known.publication)
+    assert known.publication.abort() == 1
+    assert known.said == ["first", "last"]
+    assert known.publication.abort() == 0
+    again = await known.subscriber()
+    known.publication.publish_framed(frame_message(b"next"))
+    await again.header()
+    assert await again.message() == b"next"
+    link.close()
+    again.close()
+
+
+async def test_what_was_aborted_is_not_latched(latched: Owner) -> None:
+    latched.publication.publish_framed(frame_message(b"old"))
+    begin(latched.publication)
+    extend(latched.publication, *PARTS[:9])
+    assert latched.publication.abort() == 0
+    link = await latched.subscriber()
+    await link.header()
+    assert await link.message() == b"old"
+    link.close()
+
+
+async def test_a_subscriber_that_leaves_in_the_middle_does_not_disturb_the_others(known: Owner) -> None:
+    leaves, stays = await known.subscriber(callerid="/leaves"), await known.subscriber(callerid="/stays")
+    begin(known.publication)
+    extend(known.publication, *PARTS[:2])
+    leaves.close()
+    await until(lambda: known.publication.subscribers == 1)
+    extend(known.publication, *PARTS[2:])
+    await stays.header()
+    assert await stays.message() == WHOLE
+    stays.close()
+
+
+async def test_withdrawn_in_the_middle_nothing_is_left(latched: Owner) -> None:
+    link = await latched.subscriber()
+    begin(latched.publication)
+    extend(latched.publication, *PARTS[:2])
+    latched.publication.withdraw()
+    extend(latched.publication, *PARTS[2:])
+    assert latched.publication.latched == ()
+    link.close()
+
+
+async def test_as_many_are_kept_as_was_said_and_each_new_subscriber_gets_them_in_order(latched: Owner) -> None:
+    latched.publication.publish_framed(frame_message(b"0"))
+    latched.publication.keep(3)
+    for n in range(1, 3):
+        latched.publication.publish_framed(frame_message(b"%d" % n))
+    begin(latched.publication)
+    extend(latched.publication, *PARTS)
+    kept = list(latched.publication.latched)
+    assert kept == [frame_message(b"1"), frame_message(b"2"), frame_message(WHOLE)]
+    link = await latched.subscriber()
+    await link.header()
+    assert [await link.message() for _ in range(3)] == [b"1", b"2", WHOLE]
+    latched.publication.keep(1)
+    assert list(latched.publication.latched) == kept[-1:]
+    link.close()
+
+
+def test_no_contract_keeps_more_than_the_limit() -> None:
+    publication = Publication("/t", "/p", LATCHED)
+    publication.keep(limits.LATCHED_MAX * 10)
+    for n in range(limits.LATCHED_MAX * 2):
+        publication.publish_framed(frame_message(b"%d" % n))
+    assert len(publication.latched) == limits.LATCHED_MAX
+
+
+@pytest.mark.trap(19)
+async def test_a_contracts_depth_bounds_what_waits_for_each_subscriber_old_and_new() -> None:
+    owner = Owner(STRING)
+    early = await owner.subscriber(callerid="/early", buffer=4096)
+    owner.publication.bound(3)
+    late = await owner.subscriber(callerid="/late", buffer=4096)
+    for _ in range(100):
+        owner.publication.publish_framed(frame_message(bytes(200_000)))
+    assert all(link.dropped > 50 and link.stream.outbox.pending_entries <= 4 for link in owner.publication._open)
+    owner.publication.bound(10**6)
+    assert owner.publication._queue_messages == limits.SUBSCRIBER_QUEUE_MESSAGES
+    early.close()
+    late.close()
+    owner.close()

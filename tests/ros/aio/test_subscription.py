@@ -14,6 +14,8 @@ from tests.ros.aio.peers import MD5, STRING, RawPublisher, until
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
 
+    from rmpa.ros.aio.subscription import PartsTaker
+
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -30,7 +32,7 @@ async def publisher() -> AsyncIterator[RawPublisher]:
 class Said:
     """One connection to one publisher, and what it said."""
 
-    def __init__(self, uri: str, **options: str) -> None:
+    def __init__(self, uri: str, *, on_parts: PartsTaker | None = None, **options: str) -> None:
         self.headers: list[Mapping[str, str]] = []
         self.messages: list[bytes] = []
         self.refused: list[str] = []
@@ -41,6 +43,7 @@ class Said:
             "/s",
             on_header=self.headers.append,
             on_message=lambda framed: self.messages.append(bytes(framed)),
+            on_parts=on_parts,
             on_refused=self.refused.append,
             on_lost=self.lost.append,
             type_name=options.get("type_name", "*"),
@@ -303,3 +306,172 @@ async def test_half_a_message_holds_nobody_else_up_and_the_kernel_watches(publis
         await fine.close()
         half.close()
         whole.close()
+
+
+# --- messages in parts ------------------------------------------------------------------------------------------
+
+LARGE = bytes(range(256)) * (limits.CUT_THROUGH_BYTES // 256 + 40)
+
+
+class InParts(Said):
+    """A connection that wants large messages in parts."""
+
+    def __init__(self, uri: str) -> None:
+        self.sizes: list[int] = []
+        self.parts: list[int] = []
+        self.aborts = 0
+        self.half = b""
+        super().__init__(uri, on_parts=self)
+
+    def begin(self, size: int) -> None:
+        assert not self.half
+        self.sizes.append(size)
+
+    def part(self, part: memoryview) -> None:
+        self.half += part
+        self.parts.append(len(part))
+        assert len(self.half) <= self.sizes[-1]
+        if len(self.half) == self.sizes[-1]:
+            self.messages.append(self.half)
+            self.half = b""
+
+    def abort(self) -> None:
+        self.aborts += 1
+        self.half = b""
+
+
+async def test_only_above_the_limit_a_message_comes_in_parts(publisher: RawPublisher) -> None:
+    said = InParts(publisher.uri)
+    link, _ = await publisher.serve()
+    payloads = [bytes(limits.CUT_THROUGH_BYTES - 4), bytes(limits.CUT_THROUGH_BYTES - 3), LARGE, b"", b"small"]
+    for payload in payloads:
+        await link.send(frame_message(payload))
+    await until(lambda: len(said.messages) == 5)
+    assert said.messages == [frame_message(payload) for payload in payloads]
+    # What came whole with one read is whole; else it is handed on as it comes.
+    assert all(size > limits.CUT_THROUGH_BYTES for size in said.sizes)
+    connection = said.link.connection()
+    assert (connection.messages, connection.bytes) == (5, sum(len(payload) + 4 for payload in payloads))
+    await said.close()
+    link.close()
+
+
+async def test_the_first_bytes_are_handed_on_before_the_last_ones_were_sent(publisher: RawPublisher) -> None:
+    said = InParts(publisher.uri)
+    link, _ = await publisher.serve()
+    wire = frame_message(LARGE)
+    await link.send(frame_message(b"one") + wire[:3])
+    await until(lambda: said.messages)
+    assert said.sizes == []
+    await link.send(wire[3:4])
+    await until(lambda: said.parts == [4])
+    await link.send(wire[4:1000])
+    await until(lambda: sum(said.parts) == 1000)
+    assert said.link.messages == 1
+    await link.send(wire[1000:] + frame_message(b"two"))
+    await until(lambda: len(said.messages) == 3)
+    assert [m[4:] for m in said.messages] == [b"one", LARGE, b"two"]
+    assert said.aborts == 0
+    await said.close()
+    link.close()
+
+
+@pytest.mark.parametrize("chunk", [1, 3, 4097, 100_003])
+async def test_any_pieces_make_the_same_messages(publisher: RawPublisher, chunk: int) -> None:
+    """Fed by hand: a socket would join the pieces again."""
+    said = InParts(publisher.uri)
+    link, _ = await publisher.serve()
+    await until(lambda: said.headers)
+    payloads = [b"one", b"", LARGE, LARGE[::-1], b"two", bytes(limits.CUT_THROUGH_BYTES - 3), b""]
+    wire = b"".join(map(frame_message, payloads))
+    assert said.link._stream is not None
+    if chunk == 1:
+        wire = wire[: len(frame_message(b"one")) + 4 + len(frame_message(LARGE))]
+        payloads = payloads[:3]
+    for start in range(0, len(wire), chunk):
+        said.link._stream.feed(wire[start : start + chunk])
+    assert [m[4:] for m in said.messages] == payloads
+    assert said.link.messages == len(payloads)
+    assert said.link.bytes == len(wire)
+    await said.close()
+    link.close()
+
+
+async def test_large_messages_in_one_read_with_small_ones_around_them(publisher: RawPublisher) -> None:
+    said = InParts(publisher.uri)
+    link, _ = await publisher.serve()
+    await until(lambda: said.headers)
+    payloads = [b"a", LARGE, b"b", b"c", LARGE, LARGE, b"d"]
+    assert said.link._stream is not None
+    said.link._stream.feed(b"".join(map(frame_message, payloads)))
+    assert [m[4:] for m in said.messages] == payloads
+    await said.close()
+    link.close()
+
+
+@pytest.mark.trap(14, 17)
+async def test_a_publisher_lost_in_the_middle_of_parts_is_an_abort_and_found_again(publisher: RawPublisher) -> None:
+    said = InParts(publisher.uri)
+    link, _ = await publisher.serve()
+    await link.send(frame_message(LARGE) + frame_message(LARGE)[:5000])
+    await until(lambda: sum(said.parts) > len(LARGE) + 4)
+    link.close()
+    again, _ = await publisher.serve()
+    await again.send(frame_message(b"after") + frame_message(LARGE))
+    await until(lambda: len(said.messages) == 3)
+    assert [m[4:] for m in said.messages] == [LARGE, b"after", LARGE]
+    assert (said.aborts, len(said.lost), said.link.messages) == (1, 1, 3)
+    await said.close()
+    assert said.aborts == 1
+    again.close()
+
+
+async def test_left_in_the_middle_of_parts_is_an_abort_too(publisher: RawPublisher) -> None:
+    said = InParts(publisher.uri)
+    link, _ = await publisher.serve()
+    await link.send(frame_message(LARGE)[:5000])
+    await until(lambda: sum(said.parts) == 5000)
+    said.link.close()
+    assert (said.aborts, said.lost) == (1, [])
+    await said.close()
+    assert said.aborts == 1
+    link.close()
+
+
+@pytest.mark.parametrize("when", ["begin", "part", "end"])
+async def test_closed_from_within_a_part_no_other_comes(publisher: RawPublisher, when: str) -> None:
+    class Closing(InParts):
+        def begin(self, size: int) -> None:
+            super().begin(size)
+            if when == "begin":
+                self.link.close()
+
+        def part(self, part: memoryview) -> None:
+            super().part(part)
+            if when == "part" or not self.half:
+                self.link.close()
+
+    said = Closing(publisher.uri)
+    link, _ = await publisher.serve()
+    await until(lambda: said.headers)
+    assert said.link._stream is not None
+    stream, wire = said.link._stream, frame_message(LARGE)
+    stream.feed(wire[:5000])
+    stream.feed(wire[5000:] + frame_message(b"two"))
+    assert said.messages == ([wire] if when == "end" else [])
+    assert said.parts == {"begin": [], "part": [5000], "end": [5000, len(wire) - 5000]}[when]
+    assert said.aborts == (when != "end")
+    await said.close()
+    link.close()
+
+
+@pytest.mark.trap(17)
+async def test_a_claim_beyond_the_limit_begins_no_parts(publisher: RawPublisher) -> None:
+    said = InParts(publisher.uri)
+    link, _ = await publisher.serve()
+    await link.send(frame_message(LARGE) + b"\xff\xff\xff\xff")
+    await until(lambda: said.lost)
+    assert said.sizes in ([], [len(LARGE) + 4])
+    assert (said.aborts, said.half) == (0, b"")
+    await said.close()
+    link.close()

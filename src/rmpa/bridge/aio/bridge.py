@@ -84,7 +84,9 @@ class Bridge:
         self._node = SlaveNode(
             OWN_NODE, LOOPBACK, core.uri, counters=self.counters, taps=lambda: self._outbound.connections
         )
-        self._outbound = Outbound(core, self._node, on_described=self._described, on_lost=self._lost)
+        self._outbound = Outbound(
+            core, self._node, on_described=self._described, on_lost=self._lost, on_given_up=self._given_up
+        )
         self._numbers = itertools.count(1)
         self._by_number: dict[int, Attached] = {}
         self._by_link: dict[MeshLink, Attached] = {}
@@ -452,6 +454,11 @@ class Bridge:
 
     def _lost(self, source: Source, reason: str) -> None:
         self._act(self._exports.lost(source, reason))
+
+    def _given_up(self, source: Source, peer: int) -> None:
+        text = f"{source}: more than {limits.RESUME_BYTES_MAX >> 20} MiB wait for peers that are away; given up"
+        self._warn("route.given_up", str(source), text)
+        self._act(self._exports.given_up(source, peer))
 
     # --- carrying out ------------------------------------------------------------------------------------------
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
+from itertools import islice
 from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.bridge.aio.legs import Leg, ReliableLeg, make_leg
@@ -22,7 +23,7 @@ from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.reliable import ReliableReceiver
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from rmpa.bridge.aio.legs import DataLink
     from rmpa.core.aio.stream import Buffer
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 _SEQUENCE_MASK: Final = (1 << 32) - 1
 _HALF: Final = 1 << 31
 _LENGTH: Final = 4
+_NONE: Final = -1
+"""No sequence is expected: none came yet, or a message in parts is under way. The next one takes the long way."""
 
 
 class Outlet(Protocol):
@@ -57,6 +60,7 @@ class ExportFlow:
 
     __slots__ = (
         "_got",
+        "_keeping",
         "_latched",
         "_legs",
         "_size",
@@ -75,39 +79,47 @@ class ExportFlow:
         self.by_peer: dict[int, Leg] = {}
         self._legs: tuple[Leg, ...] = ()
         self._latched: deque[tuple[bytes, int]] = deque(maxlen=1)
+        self._keeping = False
         self._streaming: list[Leg] = []
         self._whole: bytearray | None = None
         self._size = self._got = self._stamp = 0
         self.latching = False
-        """Whether the last message is kept for peers that come later."""
+        """Whether the publisher latches: whoever comes later gets its last message, whatever the contract."""
         self.large = False
         self.messages = 0
         self.bytes = 0
         self.dropped = 0
 
+    def latch(self) -> None:
+        """The publisher latches."""
+        self.latching = True
+        self.keep(1)
+
     def keep(self, depth: int) -> None:
         """Keep the last ``depth`` messages for peers that come later."""
-        self.latching = True
+        self._keeping = True
         if depth > (self._latched.maxlen or 0):
             self._latched = deque(self._latched, maxlen=min(depth, limits.LATCHED_MAX))
 
     def add(self, peer: int, link: DataLink, route: int, contract: Contract, epoch: int) -> Leg:
-        """Send to one more peer from now on; first what is kept for it."""
+        """Send to one more peer from now on; first what its contract, or the publisher, has kept for it."""
         self.remove(peer)
         leg = make_leg(link, route, contract, epoch, large=self.large)
         if contract.durability is Durability.TRANSIENT_LOCAL:
             self.keep(contract.kept)
-        for framed, stamp in self._latched:
+        # What is kept because another peer asked for it is old news, and may be an old command, to this one.
+        kept = contract.kept if contract.durability is Durability.TRANSIENT_LOCAL else int(self.latching)
+        for framed, stamp in islice(self._latched, max(0, len(self._latched) - kept), None):
             leg.message(stamp, framed)
         self.by_peer[peer] = leg
         self._legs = tuple(self.by_peer.values())
         return leg
 
-    def suspend(self, peer: int) -> None:
-        """A peer's link is gone: keep its messages."""
+    def suspend(self, peer: int, keep: Callable[[bytes, int], object] | None = None) -> None:
+        """A peer's link is gone: keep its messages; see ``ReliableLeg.suspend``."""
         leg = self.by_peer.get(peer)
         if isinstance(leg, ReliableLeg):
-            leg.suspend()
+            leg.suspend(keep)
 
     def remove(self, peer: int) -> None:
         """Send to that peer no longer."""
@@ -127,7 +139,7 @@ class ExportFlow:
             dropped = leg.message(stamp, framed)
             if dropped:
                 self.dropped += dropped
-        if self.latching:
+        if self._keeping:
             self._latched.append((bytes(framed), stamp))
 
     def begin(self, size: int) -> None:
@@ -136,7 +148,7 @@ class ExportFlow:
         self._size, self._got = size, 0
         self.large = True
         self._streaming = [leg for leg in self._legs if leg.begin(self._stamp, size)]
-        self._whole = bytearray() if self.latching or len(self._streaming) < len(self._legs) else None
+        self._whole = bytearray() if self._keeping or len(self._streaming) < len(self._legs) else None
 
     def part(self, part: memoryview) -> None:
         """Hand a part of it on; valid during the call only."""
@@ -165,7 +177,7 @@ class ExportFlow:
         for leg in self._legs:
             if leg not in streamed:
                 self.dropped += leg.message(self._stamp, whole)
-        if self.latching:
+        if self._keeping:
             self._latched.append((whole, self._stamp))
 
 
@@ -213,14 +225,17 @@ class ImportFlow:
         self._time = link_time
         self._on_ack = on_ack
         self._on_torn = on_torn
-        self._expected = -1  # none: the first one takes the long way, once
-        self._replay: bytes | None = None
+        self._expected = _NONE
+        self._next = 1
+        self._replay: deque[bytes] | None = None
         self._receiver: ReliableReceiver | None = None
         if contract.reliability is Reliability.RELIABLE:
             self._receiver = ReliableReceiver()
         self._epoch = 0
         self._plain = self._receiver is None
         self._stale_ns = round((contract.lifespan or limits.STALE_AGE) * 1e9)
+        # The first ones of a route may be as old as they are: kept messages, of a latching publisher at least one.
+        self._kept = contract.kept if contract.durability is Durability.TRANSIENT_LOCAL else 1
         self._size = self._got = 0
         self._parts: bytearray | None = None
         self._sequence: int | None = None
@@ -261,9 +276,9 @@ class ImportFlow:
         self._drop_parts()
         return self._receiver.begin(epoch, first) if self._receiver is not None else True
 
-    def expect_replay(self, latched: bytes | None) -> None:
-        """The subscribers have this latched message already; the new route brings it again, if it is still that."""
-        self._replay = latched
+    def expect_replay(self, kept: Iterable[bytes]) -> None:
+        """The subscribers have these kept messages already; the new route brings again those that are still kept."""
+        self._replay = deque(kept) or None
 
     def rebind(self, on_ack: Callable[[int], None]) -> None:
         """Go on over another link."""
@@ -283,7 +298,9 @@ class ImportFlow:
                 return
             if self._stale is not None:
                 self._supersede()
-        elif not self._accept(sequence, stamp_ns, len(framed), now_ns):
+        elif not self._accept(sequence, stamp_ns, len(framed), now_ns) or (
+            self._replay is not None and self._is_replay(framed)
+        ):
             return
         self._outlet.publish_framed(framed)
         self._note(stamp_ns, now_ns, len(framed))
@@ -295,14 +312,16 @@ class ImportFlow:
             RemoteProtocolError: The parts do not make one message.
         """
         if flags & FIRST:
-            self._begin(sequence, part)
-        elif flags & ABORT:
-            self._drop_parts()
-            return
+            self._begin(sequence, stamp_ns, part)
         if self._sequence is None:
             return  # of a message that is left out
         if self._sequence != sequence:
+            if sequence - self._sequence & _SEQUENCE_MASK >= _HALF:
+                return  # of one from before, by a lane that is about to end
             raise RemoteProtocolError(f"a part of message {sequence} comes in the middle of message {self._sequence}")
+        if flags & ABORT:
+            self._drop_parts(missing=False)
+            return
         self._got += len(part)
         if self._got > self._size or (self._got == self._size) != bool(flags & LAST):
             raise RemoteProtocolError(f"a message of {self._size} bytes came as {self._got}")
@@ -339,19 +358,28 @@ class ImportFlow:
         self.quality.arrived(now, now_ns, stamp_ns, size)
 
     def _follows(self, sequence: int) -> bool:
-        """A jump of the sequence: count what is missing; whether the message is not one from before."""
-        expected = 1 if self._expected < 0 else self._expected
+        """The long way of a sequence: count what is missing; whether the message is not one from before."""
+        expected = self._expected
+        if expected == _NONE:
+            expected = self._next if self._sequence is None else self._sequence
         gap = sequence - expected & _SEQUENCE_MASK
         if gap >= _HALF:
             self.late += 1
             return False
+        # Half a message is here, and its lane is gone, though we have not heard of that yet.
+        self._drop_parts()
         if gap:
             self._missing(gap)
         return True
 
-    def _is_replay(self, framed: memoryview) -> bool:
-        latched, self._replay = self._replay, None
-        return latched is not None and framed == memoryview(latched)
+    def _is_replay(self, framed: memoryview | bytearray) -> bool:
+        """Whether the subscribers have this message; the first that they do not have ends the replay."""
+        replay = self._replay
+        while replay:
+            if memoryview(replay.popleft()) == framed:
+                return True
+        self._replay = None
+        return False
 
     def _missing(self, count: int) -> None:
         self.lost += count
@@ -372,8 +400,8 @@ class ImportFlow:
             self.expired += 1
             self.watch.expired(1, self._loop.time())
             return True
-        if sequence == 1:
-            return False  # what a latching publisher said before we listened is as old as it is
+        if sequence <= self._kept:
+            return False
         if self._stale is not None:
             self.stale += 1
         self._stale = (sequence, stamp_ns, bytes(framed))
@@ -442,46 +470,78 @@ class ImportFlow:
             # The loop's clock may round a timer to a moment before it is due.
             self._acknowledge(self._receiver, self._loop.time() + 0.001)
 
-    def _begin(self, sequence: int, part: memoryview) -> None:
+    def _begin(self, sequence: int, stamp_ns: int, part: memoryview) -> None:
         """The first part of a message: its length is in front."""
-        self._drop_parts()
         if len(part) < _LENGTH:
             raise RemoteProtocolError(f"a first part of {len(part)} bytes has no length")
         size = _LENGTH + int.from_bytes(part[:_LENGTH], "little")
         if size > limits.MESSAGE_MAX:
             raise LimitExceeded("message", size, limits.MESSAGE_MAX)
         if self._receiver is not None:
-            # One that may come again must not have reached anybody by half.
-            deliver = self._receiver.judge(sequence, self._epoch).deliver
-            self._parts = bytearray()
-            if not deliver:
+            if not self._receiver.judge(sequence, self._epoch).deliver:
                 self._accept(sequence, 0, 0, 0)
-                self._parts = None
                 return
-        elif sequence != self._expected and not self._follows(sequence):
+            self._drop_parts()
+            # One that may come again must not have reached anybody by half.
+            self._parts = bytearray()
+        elif not self._begin_plain(sequence, stamp_ns, size):
             return
-        else:
-            self._expected = sequence + 1 & _SEQUENCE_MASK
-            self._outlet.begin(size)
         self._sequence = sequence
         self._size, self._got = size, 0
+
+    def _begin_plain(self, sequence: int, stamp_ns: int, size: int) -> bool:
+        """The first part of a best-effort message; whether its parts are wanted."""
+        if sequence != self._expected and not self._follows(sequence):
+            return False
+        self._expected = sequence + 1 & _SEQUENCE_MASK
+        if self._outlived(stamp_ns):
+            return False
+        if self._stale is not None:
+            self._supersede()
+        if self._replay is not None and any(len(kept) == size for kept in self._replay):
+            self._parts = bytearray()  # what it is shows at its end
+        else:
+            self._replay = None
+            self._outlet.begin(size)
+        # Until then whatever else comes takes the long way.
+        self._next, self._expected = sequence, _NONE
+        return True
+
+    def _outlived(self, stamp_ns: int) -> bool:
+        """Whether a message in parts is beyond its lifespan."""
+        error = self._time.error_ns
+        if self.contract.lifespan is None or error is None:
+            return False
+        if time.time_ns() - stamp_ns + self._time.ahead_ns <= self._stale_ns + error:
+            return False
+        self.expired += 1
+        self.watch.expired(1, self._loop.time())
+        return True
 
     def _complete(self, sequence: int, stamp_ns: int) -> None:
         parts, self._parts, self._sequence = self._parts, None, None
         now_ns = time.time_ns()
+        if self._plain:
+            self._expected = sequence + 1 & _SEQUENCE_MASK
+        elif not self._accept(sequence, stamp_ns, self._size, now_ns):
+            return
         if parts is not None:
-            if not self._accept(sequence, stamp_ns, len(parts), now_ns):
+            if self._replay is not None and self._is_replay(parts):
                 return
             self._outlet.publish_framed(parts)
-        if self._stale is not None:
-            self._supersede()
         self._note(stamp_ns, now_ns, self._size)
 
-    def _drop_parts(self) -> None:
-        """Half a message came, and nothing more of it will."""
-        if self._sequence is None:
+    def _drop_parts(self, *, missing: bool = True) -> None:
+        """Half a message came, and nothing more of it will.
+
+        Args:
+            missing: Whether it is lost on the way, not given up by its publisher.
+        """
+        sequence, self._sequence = self._sequence, None
+        if sequence is None:
             return
-        self._sequence = None
+        if self._plain:
+            self._next = sequence if missing else sequence + 1 & _SEQUENCE_MASK
         if self._parts is not None:
             self._parts = None
         elif self._outlet.abort() and self._on_torn is not None:

@@ -82,7 +82,8 @@ class Inbound:
         self.flows: dict[int, ImportFlow] = {}
         """Open routes; the data path looks here."""
         self.time = LinkTime()
-        self._reliable: dict[Source, ImportFlow] = {}
+        self._latest: dict[Source, ImportFlow] = {}
+        """Of each source: the flow of its route, or of the one that its last link had."""
         self._watches: dict[Source, asyncio.TimerHandle] = {}
 
     def __iter__(self) -> Iterator[tuple[str, Proxy]]:
@@ -96,7 +97,7 @@ class Inbound:
 
     def flow(self, source: Source, route: int) -> ImportFlow | None:
         """What comes of a source: over its open route, or what waits for its peer to come back."""
-        return self.flows.get(route) or self._reliable.get(source)
+        return self.flows.get(route) or self._latest.get(source)
 
     def publish(self, action: Publish) -> None:
         """Let a source appear; takes a moment."""
@@ -106,6 +107,7 @@ class Inbound:
     def retract(self, action: Retract) -> None:
         """Let a source disappear: its data stops at once, its registration a moment later."""
         self._wanted.pop(action.source, None)
+        self._over(action.source)
         self._jobs.put_nowait(action)
 
     def describe(self, action: Describe, on_ack: Callable[[int], None]) -> None:
@@ -118,28 +120,32 @@ class Inbound:
         publication = self.publication(action.source)
         if publication is None:
             return
-        self.flows[action.route] = self._flow(action, publication, on_ack)
+        flow, goes_on = self._flow(action, publication, on_ack)
+        self.flows[action.route] = flow
         about = action.description
         text = about.definition.encode("latin-1").decode(errors="surrogateescape")
         if publication.describe(Description(about.type, about.md5, text, about.latching)):
-            # Those who were hung up on come again when the master names the proxy; rospy only then, and only if it
-            # has noticed the end by that time.
-            for delay in limits.CALL_BACK_DELAYS:
-                asyncio.get_running_loop().call_later(delay, self._call_back, action.source, publication)
+            self._call_back_soon(action.source, publication)
+        if not goes_on:
+            flow.expect_replay(publication.latched)
 
     def position(self, source: Source) -> tuple[int, int] | None:
         """Where a reliable source goes on that outlived its link."""
-        flow = self._reliable.get(source)
+        flow = self._latest.get(source)
         return flow.position if flow is not None else None
 
-    def _flow(self, action: Describe, publication: Publication, on_ack: Callable[[int], None]) -> ImportFlow:
-        """The flow of a route: the one from before its link fell, or a new one."""
+    def _flow(
+        self, action: Describe, publication: Publication, on_ack: Callable[[int], None]
+    ) -> tuple[ImportFlow, bool]:
+        """The flow of a route, and whether it goes on exactly where it was when its link fell."""
         source, contract = action.source, action.contract
-        flow = self._reliable.pop(source, None)
-        if flow is not None and flow.contract == contract:
+        flow = flow_before = self._latest.pop(source, None)
+        goes_on = False
+        if flow is not None and flow.contract == contract and contract.reliability is Reliability.RELIABLE:
             flow.rebind(on_ack)
             flow.watch.link_up(asyncio.get_running_loop().time())
-            if not flow.begin_epoch(action.epoch, action.first):
+            goes_on = flow.begin_epoch(action.epoch, action.first)
+            if not goes_on:
                 _log.warning("! %s: %s: messages were lost, it is not known how many", self.prefix, source)
         else:
             if flow is not None:
@@ -149,17 +155,17 @@ class Inbound:
                 contract,
                 self.time,
                 on_ack=on_ack,
-                on_torn=lambda: self._call_back(source, publication),
+                on_torn=lambda: self._call_back_soon(source, publication),
             )
-            flow.begin_epoch(action.epoch, action.first)
-            flow.expect_replay(publication.latched)
+            position = flow_before.position if flow_before is not None else None
+            known = position is not None and position[0] == action.epoch
+            flow.begin_epoch(action.epoch, position[1] + 1 if position is not None and known else action.first)
         publication.bound(contract.depth)
         if contract.durability is Durability.TRANSIENT_LOCAL:
             publication.keep(contract.kept)
-        if contract.reliability is Reliability.RELIABLE:
-            self._reliable[source] = flow
+        self._latest[source] = flow
         self._watch(source, flow)
-        return flow
+        return flow, goes_on
 
     def _watch(self, source: Source, flow: ImportFlow) -> None:
         """Look at a source's contract when it may be broken next."""
@@ -183,6 +189,22 @@ class Inbound:
             timer.cancel()
         flow.close()
 
+    def _over(self, source: Source) -> None:
+        """No flow of a source goes on; its proxy may go with it, so the lease is not waited for."""
+        flow = self._latest.pop(source, None)
+        if flow is not None:
+            for occurred in flow.watch.link_gone(asyncio.get_running_loop().time()):
+                self._on_occurred(source, occurred)
+            self._end(source, flow)
+
+    def _call_back_soon(self, source: Source, publication: Publication) -> None:
+        """Subscribers were hung up on: they come again when the master names the proxy.
+
+        rospy only then, and only if it has noticed the end by that time.
+        """
+        for delay in limits.CALL_BACK_DELAYS:
+            asyncio.get_running_loop().call_later(delay, self._call_back, source, publication)
+
     def _call_back(self, source: Source, publication: Publication) -> None:
         proxy = self._proxies.get(source.node)
         if proxy is not None and proxy.publications.get(source.topic) is publication:
@@ -202,12 +224,7 @@ class Inbound:
             if flow is not None:
                 self._watch(action.source, flow)
             return
-        flow = self._reliable.pop(action.source, flow)
-        if flow is not None:
-            # Its proxy goes with it, so that the lease is not waited for.
-            for occurred in flow.watch.link_gone(asyncio.get_running_loop().time()):
-                self._on_occurred(action.source, occurred)
-            self._end(action.source, flow)
+        self._over(action.source)
         publication = self.publication(action.source)
         if publication is not None:
             publication.forget_latched()
@@ -230,12 +247,12 @@ class Inbound:
 
     async def close(self) -> None:
         """Retract everything that is still there."""
-        for flow in {*self.flows.values(), *self._reliable.values()}:
+        for flow in self._latest.values():
             flow.close()
         for timer in self._watches.values():
             timer.cancel()
         self._watches.clear()
-        self._reliable.clear()
+        self._latest.clear()
         self.flows.clear()
         self._jobs.put_nowait(None)
         await self._task

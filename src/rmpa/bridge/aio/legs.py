@@ -16,6 +16,8 @@ from rmpa.core.contract import Contract, History, Reliability
 from rmpa.mesh.reliable import ReliableSender
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rmpa.core.aio.stream import Buffer
     from rmpa.core.outbox import Parcel
 
@@ -49,6 +51,10 @@ class DataLane(Protocol):
         """Bound what may wait of a route."""
         ...
 
+    def discard(self, route: int) -> None:
+        """Let go of what waits of a route, and of its terms."""
+        ...
+
 
 class DataLink(Protocol):
     """What the data path needs of a link."""
@@ -80,6 +86,7 @@ class Leg:
         self.link: DataLink | None = link
         self.route = route
         self.contract = contract
+        self._depth = limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.depth
         self.sequence = 0
         self.dropped = 0
         """Messages that gave way because a bound of ours was reached."""
@@ -120,7 +127,9 @@ class Leg:
         if self._throttle is not None and not self._throttle.admit(self._loop.time()):
             self._wait_for_turn(self._throttle, stamp_ns, framed)
             return 0
-        self._newest = None
+        if self._throttle is not None and self._newest is not None:
+            self._throttle.skipped += 1
+            self._newest = None
         return self._send(stamp_ns, framed)
 
     def begin(self, stamp_ns: int, size: int) -> bool:
@@ -152,6 +161,7 @@ class Leg:
     def lane_lost(self) -> None:
         """The bulk lane's connection is gone."""
         if self._switch.lane_lost():
+            self._discard_bulk()
             self._go_on()
 
     def close(self) -> None:
@@ -189,9 +199,7 @@ class Leg:
         self._held.append((sequence, stamp_ns, payload))
         self._held_bytes += len(payload)
         dropped = 0
-        while len(self._held) > 1 and (
-            len(self._held) > self.contract.depth or self._held_bytes > limits.LINK_QUEUE_BYTES
-        ):
+        while len(self._held) > 1 and (len(self._held) > self._depth or self._held_bytes > limits.LINK_QUEUE_BYTES):
             self._held_bytes -= len(self._held.popleft()[2])
             dropped += 1
         self.dropped += dropped
@@ -202,7 +210,17 @@ class Leg:
         held, self._held = self._held, deque()
         self._held_bytes = 0
         for sequence, stamp_ns, payload in held:
-            self._lane.send(self.route, sequence, stamp_ns, payload)
+            # A large one may have come while the way back to the express lane was fenced.
+            if self._lane_for(len(payload)):
+                self._lane.send(self.route, sequence, stamp_ns, payload)
+            else:
+                self._hold(sequence, stamp_ns, payload)
+
+    def _discard_bulk(self) -> None:
+        """Let go of what waits for the bulk lane's next connection: it would come behind what is sent now."""
+        if self.link is not None:
+            self.link.bulk.discard(self.route)
+            self._set_terms()
 
     def _settle(self) -> None:
         """Use the switch's lane; begin to change it at once where it is not the one that is wanted."""
@@ -219,10 +237,9 @@ class Leg:
         if self.link is None:
             return
         contract = self.contract
-        depth = limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.depth
         for lane, stale in ((self.link.express, limits.STALE_AGE), (self.link.bulk, limits.BULK_STALE_AGE)):
             strict = contract.lifespan is not None
-            lane.set_terms(self.route, depth, contract.lifespan if strict else stale, strict=strict)
+            lane.set_terms(self.route, self._depth, contract.lifespan if strict else stale, strict=strict)
 
     def _wait_for_turn(self, throttle: Throttle, stamp_ns: int, framed: Buffer) -> None:
         """Keep the newest until the beat lets it go."""
@@ -262,7 +279,7 @@ class ReliableLeg(Leg):
         self.sender = ReliableSender(
             depth, limits.REPLAY_BYTES, limits.RELIABLE_WINDOW_MESSAGES, limits.RELIABLE_WINDOW_BYTES, epoch
         )
-        self._confirmed = 0
+        self._keep: Callable[[bytes, int], object] | None = None
         super().__init__(link, route, contract, large=large)
         self._direct = False
 
@@ -273,20 +290,29 @@ class ReliableLeg(Leg):
     def acknowledged(self, sequence: int) -> None:
         """The peer has everything up to a message."""
         self.sender.acknowledged(sequence)
-        self._confirmed = sequence
         self._pump()
 
     def lane_lost(self) -> None:
         """The bulk lane's connection is gone: what was on it is sent again; the peer leaves out what it has."""
-        on_bulk = self._switch.lane is not EXPRESS
-        super().lane_lost()
-        if on_bulk and self.link is not None:
-            self.sender.resume(self._confirmed)
+        if self._switch.lane is EXPRESS or self.link is None:
+            return
+        # What still waits for the lane comes again too, in its place: in front of those torn it would be a gap.
+        self._discard_bulk()
+        self.sender.resume(self.sender.confirmed)
+        if self._switch.lane_lost():
+            self._go_on()
+        else:
             self._pump()
 
-    def suspend(self) -> None:
-        """The link is gone; messages are kept until ``resume``, or until it is given up."""
+    def suspend(self, keep: Callable[[bytes, int], object] | None = None) -> None:
+        """The link is gone; messages are kept until ``resume``, or until it is given up.
+
+        Args:
+            keep: ``(payload, stamp_ns)``: offers a message to the sender, and sees to it that all suspended ones
+                together keep no more than they may.
+        """
         self.link = None
+        self._keep = keep
         self.sender.suspend()
 
     def resume(self, link: DataLink, route: int, after: int) -> None:
@@ -296,7 +322,7 @@ class ReliableLeg(Leg):
             RemoteProtocolError: It cannot have.
         """
         self.sender.resume(after)
-        self._confirmed = after
+        self._keep = None
         self.link, self.route = link, route
         self._switch.restart()
         self._set_terms()
@@ -308,8 +334,11 @@ class ReliableLeg(Leg):
 
     def _send(self, stamp_ns: int, framed: Buffer) -> int:
         before = self.sender.overflowed
-        self.sender.offer(bytes(framed), stamp_ns)
-        self._pump()
+        if self._keep is not None:
+            self._keep(bytes(framed), stamp_ns)
+        else:
+            self.sender.offer(bytes(framed), stamp_ns)
+            self._pump()
         lost = self.sender.overflowed - before
         self.dropped += lost
         return lost

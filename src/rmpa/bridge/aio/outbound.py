@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
+from functools import partial
 from typing import TYPE_CHECKING
 
 from rmpa.bridge.aio.flows import ExportFlow
@@ -10,6 +12,8 @@ from rmpa.bridge.aio.legs import ReliableLeg
 from rmpa.bridge.messages import Description, Source
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.core import limits
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.mesh.reliable import ResumeTable
 from rmpa.ros.aio.subscription import PublisherConnection
 from rmpa.ros.tcpros import Description as TcprosDescription
 
@@ -32,6 +36,7 @@ class Outbound:
         node: The agent's own node.
         on_described: Called with a source and its publisher's header.
         on_lost: Called with a source and a reason when its publisher is no longer connected.
+        on_given_up: Called with a source and a peer that is away when no more can be kept for it.
     """
 
     def __init__(
@@ -41,6 +46,7 @@ class Outbound:
         *,
         on_described: Callable[[Source, Description], None],
         on_lost: Callable[[Source, str], None],
+        on_given_up: Callable[[Source, int], None],
     ) -> None:
         self._core = core
         self._node = node
@@ -49,6 +55,8 @@ class Outbound:
         self._connections: dict[Source, PublisherConnection] = {}
         self._flows: dict[Source, ExportFlow] = {}
         self._legs: dict[tuple[int, int], Leg] = {}
+        self._parked: ResumeTable[tuple[int, Source]] = ResumeTable()
+        self._on_given_up = on_given_up
 
     @property
     def flows(self) -> Mapping[Source, ExportFlow]:
@@ -92,8 +100,13 @@ class Outbound:
         """Send a source to one more peer, or go on where its last link ended."""
         flow = self._flows[action.source]
         leg = flow.by_peer.get(action.peer)
+        self._parked.claim((action.peer, action.source), None, 0.0)
         if action.after is not None and isinstance(leg, ReliableLeg) and leg.sender.epoch == action.epoch:
-            leg.resume(link, action.route, action.after)
+            try:
+                leg.resume(link, action.route, action.after)
+            except RemoteProtocolError:
+                flow.remove(action.peer)  # the link is closed for it; the next one begins a numbering of its own
+                raise
         else:
             leg = flow.add(action.peer, link, action.route, action.contract, action.epoch)
         self._legs[action.peer, action.route] = leg
@@ -102,15 +115,33 @@ class Outbound:
         """Keep a source's messages for a peer whose link is gone."""
         flow = self._flows.get(action.source)
         if flow is not None:
-            self._forget(flow.by_peer.get(action.peer), action.peer)
-            flow.suspend(action.peer)
+            leg = flow.by_peer.get(action.peer)
+            self._forget(leg, action.peer)
+            if isinstance(leg, ReliableLeg):
+                key = (action.peer, action.source)
+                flow.suspend(
+                    action.peer, lambda payload, stamp: self._give_up(self._parked.offer(key, payload, stamp))
+                )
+                self._give_up(self._parked.park(key, leg.sender, asyncio.get_running_loop().time()))
 
     def remove_route(self, action: RemoveRoute) -> None:
         """Send a source to a peer no longer."""
+        self._parked.claim((action.peer, action.source), None, 0.0)
         flow = self._flows.get(action.source)
         if flow is not None:
             self._forget(flow.by_peer.get(action.peer), action.peer)
             flow.remove(action.peer)
+
+    def _keep(self, key: tuple[int, Source], message: bytes, stamp_ns: int) -> None:
+        self._give_up(self._parked.offer(key, message, stamp_ns))
+
+    def _give_up(self, keys: list[tuple[int, Source]]) -> None:
+        """Too much is kept for peers that are away: let go of what waited longest."""
+        for peer, source in keys:
+            flow = self._flows.get(source)
+            if flow is not None:
+                flow.remove(peer)
+            self._on_given_up(source, peer)
 
     def leg(self, peer: int, route: int) -> Leg | None:
         """One peer's route."""
@@ -139,7 +170,7 @@ class Outbound:
             self._gone(source, self._connections[source], description.problem)
             return
         if description.latching:
-            self._flows[source].keep(1)
+            self._flows[source].latch()
         self._on_described(source, description)
 
     def _gone(self, source: Source, connection: PublisherConnection, reason: str) -> None:
@@ -155,6 +186,7 @@ class Outbound:
         flow = self._flows.pop(source, None)
         if flow is not None:
             for peer in list(flow.by_peer):
+                self._parked.claim((peer, source), None, 0.0)
                 self._forget(flow.by_peer[peer], peer)
                 flow.remove(peer)
         if flow is not None and not any(s.topic == source.topic for s in self._flows):

@@ -24,6 +24,7 @@ _FIRST_BUFFER: Final = 64 * limits.KIB
 _BUSY_BUFFER: Final = 256 * limits.KIB
 _KEPT_BUFFER: Final = 4 * limits.MIB
 _IOV: Final = 64
+_CORK_ABOVE: Final = 512
 _CORK_MESSAGES: Final = 128
 _CORK_BYTES: Final = 512 * limits.KIB
 _PART: Final = limits.MIB
@@ -209,6 +210,8 @@ class Stream:
             return self._outbox.extend(parcel, bytes(view))
         if self._outbox.waiting(parcel.key):
             # Its first bytes had to wait, and the outbox counts them.
+            if self._kept:
+                self._uncork()
             dropped = self._outbox.extend(parcel, bytes(view))
             self._wait_for_room()
             self._writable()
@@ -230,7 +233,8 @@ class Stream:
             return False
         if self._kept:
             self._uncork()
-        if not self._writing and parcel.sent and not parcel.dropped and self._frame is not None:
+        waits = self._writing or self._outbox.waiting(parcel.key)
+        if not waits and parcel.sent and not parcel.dropped and self._frame is not None:
             parcel.dropped = True
             self._send_now([self._frame(parcel, 0, LAST | ABORT)], parcel.key)
             return False
@@ -240,6 +244,8 @@ class Stream:
 
     def pump(self) -> None:
         """Send what was put into the outbox from elsewhere."""
+        if self._kept:
+            self._uncork()
         if self._outbox and not self._writing and not self._closed:
             self._wait_for_room()
 
@@ -271,6 +277,9 @@ class Stream:
         size, self._kept_bytes = self._kept_bytes, 0
         if self._closed or not kept:
             return
+        if self._writing or self._outbox:
+            self._keep_rest(kept, 0)  # it must not get into the middle of what the outbox sends
+            return
         if len(kept) == 1:
             self._send_now(*kept[0])
             return
@@ -286,16 +295,20 @@ class Stream:
             self._keep_rest(kept, sent)
 
     def _keep_rest(self, kept: list[tuple[Sequence[Buffer], int, bool]], sent: int) -> None:
-        """Queue what a batch's ``sendmsg`` did not take: the rest of one message perhaps, then whole ones."""
+        """Queue what a batch's ``sendmsg`` did not take: the rest of one message perhaps, then whole ones.
+
+        What is in front of a part of a message stays in front of it: a part has its header and no other turn.
+        """
         self._wait_for_room()
-        for parts, key, part in kept:
+        last_part = max((index for index, (_, _, part) in enumerate(kept) if part), default=-1)
+        for index, (parts, key, _) in enumerate(kept):
             length = sum(map(len, parts))
             if sent >= length:
                 sent -= length
             elif sent > 0:
                 self._outbox.push_rest(_behind(parts, sent), key)
                 sent = 0
-            elif part:
+            elif index <= last_part:
                 self._outbox.commit(b"".join(parts))
             else:
                 self._queue(b"".join(parts), key)
@@ -391,7 +404,9 @@ class Stream:
     def _deliver(self) -> None:
         global _corked  # noqa: PLW0603 - one loop, one thread: whoever reads holds the cork
         outer = _corked
-        _corked = []
+        # A few bytes are one message, or two, and are handed on at once; not past what an outer read keeps.
+        corked: list[Stream] = []
+        _corked = corked if self._filled > _CORK_ABOVE or outer is not None else None
         try:
             consumed, wanted = self._on_bytes(self._view[: self._filled])
         except RemoteProtocolError as error:
@@ -403,7 +418,7 @@ class Stream:
             return
         finally:
             # Before anything moves in the buffer that the messages are views of.
-            for stream in _corked:
+            for stream in corked:
                 stream._uncork()  # noqa: SLF001 - its own class
             _corked = outer
         if self._closed:

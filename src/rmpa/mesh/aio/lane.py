@@ -111,6 +111,13 @@ class LaneSender:
         """Bound what may wait of one route; see ``core.outbox``."""
         self.outbox.set_terms(route, depth, max_age, strict=strict)
 
+    def discard(self, route: int) -> None:
+        """Let go of what waits of a route, and of its terms; it goes on."""
+        self.outbox.discard(route)
+        self._open.pop(route, None)
+        if self._stream is not None:
+            self._stream.pump()
+
     def close_route(self, route: int) -> int:
         """Discard what waits of a closed route; return how many messages that were. Its counts end too."""
         count = self.outbox.discard(route)

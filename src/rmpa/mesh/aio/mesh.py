@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import logging
 import os
@@ -269,7 +270,7 @@ class Mesh:
         if guid is not None:
             self._peering.dial_failed(guid, reason, now)
         if was_up:
-            self._peering.link_down(link.id, reason, now)
+            self._peering.link_down(link.id, reason, now, silent=link.silent)
         self._act(link)
 
     # --- acting on the peers' machine -----------------------------------------------------------------------
@@ -400,6 +401,14 @@ class Mesh:
             self._open(sock, Role.DIALLER, link.remote_endpoint, link.guid)
             return
 
+    async def _reach(self, endpoint: tuple[str, int]) -> socket.socket:
+        """Connect; a lost SYN is repeated by new attempts, for TCP would take a second."""
+        *hasty, patient = limits.DIAL_ATTEMPTS
+        for within in hasty:
+            with contextlib.suppress(TimeoutError):
+                return await self._connect(endpoint, Lane.EXPRESS, within)
+        return await self._connect(endpoint, Lane.EXPRESS, patient)
+
     async def _connect(
         self, endpoint: tuple[str, int], lane: Lane, within: float = limits.DIAL_TIMEOUT
     ) -> socket.socket:
@@ -417,7 +426,7 @@ class Mesh:
         host, port = dial.endpoint
         _log.debug("> dialling %s at %s:%d", dial.guid, host, port)
         try:
-            sock = await self._connect(dial.endpoint, Lane.EXPRESS)
+            sock = await self._reach(dial.endpoint)
         except OSError as error:  # TimeoutError is one, no file descriptor for the socket another
             self.counters.add("link.dial_failed")
             problem = os.strerror(error.errno) if error.errno else f"no answer within {limits.DIAL_TIMEOUT:g} s"

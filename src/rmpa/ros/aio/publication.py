@@ -76,7 +76,7 @@ class Publication:
         self._latched: deque[bytes] = deque(maxlen=1)
         self._parcels: list[tuple[Inbound, Parcel]] = []
         self._whole: bytearray | None = None
-        self._size = 0
+        self._size = self._left = 0
         self._dropped_before = 0
         self._withdrawn = False
         if description is not None:
@@ -88,9 +88,9 @@ class Publication:
         return self._description
 
     @property
-    def latched(self) -> bytes | None:
-        """The last message that is kept for later subscribers, with its length in front."""
-        return self._latched[-1] if self._latched else None
+    def latched(self) -> tuple[bytes, ...]:
+        """The messages that are kept for later subscribers, oldest first, with their lengths in front."""
+        return tuple(self._latched)
 
     @property
     def subscribers(self) -> int:
@@ -190,9 +190,9 @@ class Publication:
     def begin(self, size: int) -> None:
         """Begin a message of ``size`` bytes, its length in front, whose parts follow.
 
-        Those subscribe too late for it that come before its end.
+        Those that come before its end subscribe too late for it, unless it is kept for such.
         """
-        self._size = size
+        self._size = self._left = size
         self._parcels = [(link, link.begin(size)) for link in self._open]
         latching = self._description is not None and self._description.latching
         self._whole = bytearray() if latching else None
@@ -201,18 +201,21 @@ class Publication:
         """Send a part of it to all that have its beginning; none waits for another."""
         for link, parcel in self._parcels:
             link.extend(parcel, part)
-        self._size -= len(part)
+        self._left -= len(part)
         if self._whole is not None:
             self._whole += part
-        if self._size:
+        if self._left:
             return
         self.messages += 1
-        if self._parcels:
-            self.bytes += self._parcels[0][1].size
-        self._parcels = []
+        self.bytes += self._size
+        began, self._parcels = self._parcels, []
         if self._whole is not None:
-            self._latched.append(bytes(self._whole))
-            self._whole = None
+            framed, self._whole = bytes(self._whole), None
+            self._latched.append(framed)
+            served = {link for link, _ in began}
+            for link in self._open:
+                if link not in served:
+                    link.send(framed)
 
     def abort(self) -> int:
         """The rest of it will not come.

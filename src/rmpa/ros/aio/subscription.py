@@ -248,7 +248,8 @@ class PublisherConnection:
         if self._parts is not None and wanted > limits.CUT_THROUGH_BYTES and not self._closed:
             self._left = wanted
             self._parts.begin(wanted)
-            self._take_part(self._parts, data[start:])
+            if self._left:  # it may have closed us
+                self._take_part(self._parts, data[start:])
             return len(data), 0
         return start, wanted
 
