@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from rmpa.bridge.aio.legs import DataLink
+    from rmpa.bridge.watch import Occurred
     from rmpa.core.aio.stream import Buffer
 
 _SEQUENCE_MASK: Final = (1 << 32) - 1
@@ -207,6 +208,7 @@ class ImportFlow:
         time: The link's.
         on_ack: ``(sequence)``: tell the sender that everything up to this message has come.
         on_torn: Subscribers were closed in the middle of a message: let them come again.
+        on_broken: A reliable route has lost messages all the same.
     """
 
     def __init__(
@@ -217,6 +219,7 @@ class ImportFlow:
         *,
         on_ack: Callable[[int], None] | None = None,
         on_torn: Callable[[], None] | None = None,
+        on_broken: Callable[[Occurred], None] | None = None,
     ) -> None:
         self._loop = asyncio.get_running_loop()
         now = self._loop.time()
@@ -225,6 +228,7 @@ class ImportFlow:
         self._time = link_time
         self._on_ack = on_ack
         self._on_torn = on_torn
+        self._on_broken = on_broken
         self._expected = _NONE
         self._next = 1
         self._replay: deque[bytes] | None = None
@@ -383,7 +387,9 @@ class ImportFlow:
 
     def _missing(self, count: int) -> None:
         self.lost += count
-        self.watch.lost(count, self._loop.time())
+        occurred = self.watch.lost(count, self._loop.time())
+        if self._on_broken is not None and self._receiver is not None:
+            self._on_broken(occurred)
 
     def _give_way(self, sequence: int, stamp_ns: int, framed: memoryview, age: int) -> bool:
         """A message that is older than the contract, or an outage, allows; whether it is dealt with.

@@ -156,6 +156,7 @@ class Inbound:
                 self.time,
                 on_ack=on_ack,
                 on_torn=lambda: self._call_back_soon(source, publication),
+                on_broken=lambda occurred: self._on_occurred(source, occurred),
             )
             position = flow_before.position if flow_before is not None else None
             known = position is not None and position[0] == action.epoch

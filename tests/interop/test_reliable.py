@@ -1,0 +1,175 @@
+"""Topics over cables that are pulled: reliable loses, doubles and moves nothing; best effort is fresh afterwards."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.interop.processes import eventually
+from tests.interop.recordings import recorded, wait_last
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.interop.conftest import ModuleFactory
+    from tests.interop.modules import Module
+    from tests.interop.processes import Process
+
+pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
+
+KINDS = ("roscpp", "rospy")
+COUNT = 10_000
+"""At 1 kHz."""
+
+
+def contract(depth: int) -> str:
+    """A reliable topic."""
+    return f'[[contract]]\ntopics = ["/chatter"]\nreliability = "reliable"\ndepth = {depth}\n'
+
+
+def recorders(module: Module) -> list[Process]:
+    """A recorder of each kind."""
+    return [module.ros.node(kind, "recorder", topic="/chatter", nodelay=True, commands=True) for kind in KINDS]
+
+
+def connected(teller: Process, heard: list[Process]) -> int:
+    """Send one message after the other until each recorder has one; return how many that were."""
+
+    def all_heard() -> bool:
+        since = teller.mark_events()
+        teller.tell("64 1 0")
+        sent.append(int(str(teller.wait_event("told", since=since)["sent"])))
+        return all(listener.events("report") for listener in heard)
+
+    sent: list[int] = []
+    eventually(all_heard, what="the first message at every recorder", every=0.2)
+    for listener in heard:
+        wait_last(listener, sent[-1])
+    return sent[-1]
+
+
+def route(module: Module) -> dict[str, object]:
+    """What ``rmpa topic info --json`` says of the route."""
+    code, output = module.agent.rmpa("topic", "info", "/chatter", "--json")
+    assert code == 0, output
+    (found,) = json.loads(output)["mesh"]["routes"]
+    return dict(found)
+
+
+@pytest.mark.parametrize(("outage", "cuts", "pause"), [(0.3, 5, 1.4), (2.5, 2, 2.0)], ids=["short", "long"])
+def test_nothing_is_lost_doubled_or_moved(
+    modules: ModuleFactory, tmp_path: Path, outage: float, cuts: int, pause: float
+) -> None:
+    a, b = modules("a", "b", config=contract(depth=2 * COUNT))
+    heard = recorders(b)
+    teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
+    first = connected(teller, heard)
+    for listener in heard:
+        recorded(listener, tmp_path)
+    teller.tell(f"64 {COUNT} 1000")
+    for number in range(cuts):
+        time.sleep(pause)
+        (b, a)[number % 2].host.outage(outage)
+    last = int(str(teller.wait_event("told", where=lambda event: event["sent"] == first + COUNT)["sent"]))
+    for listener in heard:
+        wait_last(listener, last)
+        rows = recorded(listener, tmp_path)
+        assert not any(row.bad for row in rows)
+        sequences = [row.sequence for row in rows]
+        assert sequences == list(range(first + 1, last + 1)), jumps(sequences)
+    assert (route(b)["lost"], route(b)["events"]) == (0, {})
+    if outage > 1.0:  # the lease
+        assert a.agent.process.output.count("b is back") == b.agent.process.output.count("a is back") >= cuts
+
+
+def jumps(sequences: list[int]) -> str:
+    """Where a row of numbers is not one, for a failure's text."""
+    pairs = itertools.pairwise(sequences)
+    return f"{len(sequences)} numbers; {[(one, other) for one, other in pairs if other != one + 1][:10]}"
+
+
+def test_large_reliable_messages_survive_too(modules: ModuleFactory, tmp_path: Path) -> None:
+    a, b = modules("a", "b", config=contract(depth=100))
+    for module in (a, b):
+        module.host.shape("200mbit")
+    heard = recorders(b)
+    teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
+    last = connected(teller, heard) + 60
+    teller.tell("2000000,100,1000 60 10")  # 8 s of the cable's time are 6 s of the teller's
+    for _ in range(3):
+        time.sleep(1.0)
+        b.host.outage(0.8)
+    for listener in heard:
+        wait_last(listener, last, 40.0)
+        rows = recorded(listener, tmp_path)
+        assert not any(row.bad for row in rows)
+        sequences = [row.sequence for row in rows][-60:]
+        assert sequences == list(range(last - 59, last + 1)), jumps(sequences)
+
+
+def test_an_outage_longer_than_the_buffer_is_told_with_the_exact_count(
+    modules: ModuleFactory, tmp_path: Path
+) -> None:
+    a, b = modules("a", "b", config=contract(depth=500))
+    heard = recorders(b)
+    teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
+    first = connected(teller, heard)
+    for listener in heard:
+        recorded(listener, tmp_path)
+    teller.tell("64 4000 1000")
+    time.sleep(0.5)
+    b.host.outage(2.0)
+    last = first + 4000
+    teller.wait_event("told", where=lambda event: event["sent"] == last)
+    missing = []
+    for listener in heard:
+        wait_last(listener, last)
+        sequences = [row.sequence for row in recorded(listener, tmp_path)]
+        assert sequences == sorted(set(sequences))
+        assert (sequences[0], sequences[-1]) == (first + 1, last)
+        missing.append(4000 - len(sequences))
+    assert missing[0] == missing[1] > 1000
+    found = route(b)
+    assert (found["lost"], found["events"]) == (missing[0], {"messages_lost": missing[0]})
+    recent = [(event["count"], event["text"]) for event in found["recent"]]  # type: ignore[attr-defined]  # promised
+    assert recent == [(missing[0], f"{missing[0]} messages lost")]
+    b.agent.process.wait_for(rf"(?i)warning.*/chatter.*\b{missing[0]} messages lost")
+
+
+def test_best_effort_is_fresh_after_a_cut(modules: ModuleFactory, tmp_path: Path) -> None:
+    a, b = modules("a", "b")
+    heard = recorders(b)
+    teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
+    first = connected(teller, heard)
+    for listener in heard:
+        recorded(listener, tmp_path)
+    teller.tell(f"64 {COUNT // 2} 1000")
+    for _ in range(2):
+        time.sleep(1.0)
+        b.host.outage(0.6)
+    for listener in heard:
+        wait_last(listener, first + COUNT // 2)
+        rows = recorded(listener, tmp_path)
+        sequences = [row.sequence for row in rows]
+        assert sequences == sorted(set(sequences))
+        # Half a second of messages waited for the cable; they give way to those that follow.
+        stale = [row for row in rows if row.age > 0.15]
+        assert len(stale) <= 5
+
+
+@pytest.mark.parametrize("outage", [0.3, 0.6])
+def test_the_last_word_before_a_cut_still_counts(modules: ModuleFactory, tmp_path: Path, outage: float) -> None:
+    a, b = modules("a", "b")
+    heard = recorders(b)
+    teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
+    last = connected(teller, heard) + 1
+    b.host.cut()
+    teller.tell("64 1 0")
+    time.sleep(outage)
+    b.host.restore()
+    for listener in heard:
+        wait_last(listener, last)
