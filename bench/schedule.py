@@ -16,6 +16,8 @@ from array import array
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Final
 
+import psutil
+
 from bench import machine, samples
 from bench.bed import NODES, Bed
 from bench.tables import usage_row
@@ -362,17 +364,25 @@ def turns(ways: Sequence[Way], rounds: int, console: Console) -> Iterator[list[W
 
 
 class HostLateness:
-    """How late the machine itself wakes, before and after a measurement."""
+    """How late the machine itself wakes, before and after a measurement, and what the hypervisor took in between."""
 
     def __init__(self) -> None:
         self._late = machine.lateness(_HOST_LATENESS)
+        self._times = psutil.cpu_times()
 
     def finish(self, console: Console) -> dict[str, object]:
-        """Measure again, print the histogram, return both for the result."""
+        """Measure again, print what came out, return it for the result."""
+        times = psutil.cpu_times()
+        stolen = 1000 * (times.steal - self._times.steal)
         self._late += machine.lateness(_HOST_LATENESS)
         histogram = machine.histogram(self._late)
         console.print(f"late wake-ups of this machine (1 ms sleeps, µs): {histogram}")
-        return {"late_wake_ups_us": asdict(samples.summary(self._late)), "late_histogram": histogram}
+        console.print(f"taken by the hypervisor while processes wanted to run: {stolen:.0f} ms, over all processors")
+        return {
+            "late_wake_ups_us": asdict(samples.summary(self._late)),
+            "late_histogram": histogram,
+            "stolen_ms": stolen,
+        }
 
 
 def lateness_under_fifo(seconds: float, priority: int) -> list[float]:

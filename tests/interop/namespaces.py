@@ -108,6 +108,12 @@ class Host:
         wire = self.cables[cable]
         _ip("-n", wire.switch, "link", "set", wire.port, "up")
 
+    def outage(self, seconds: float, cable: int = 0) -> None:
+        """Pull the cable out, and put it in again after a while."""
+        self.cut(cable)
+        time.sleep(seconds)
+        self.restore(cable)
+
     def switch_off(self, cable: int = 0) -> None:
         """Take the interface down inside the host (its routes go with it)."""
         self.ip("link", "set", self.cables[cable].interface, "down")
