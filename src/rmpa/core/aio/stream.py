@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import socket
 from collections.abc import Callable, Sequence
 from typing import Final, cast
@@ -86,6 +87,8 @@ class Stream:
         self.bytes_out = 0
         self.last_in = self._loop.time()
         """When bytes last came (``loop.time()``), whether or not ``on_bytes`` was called for them."""
+        self.resumed_at = -math.inf
+        """When bytes came after a silence of more than ``limits.STALE_AGE`` (``loop.time()``)."""
         self._fd = sock.fileno()
         # An agent's loop has a short way for the data path; elsewhere (tools, tests) the usual one does.
         add_reader = getattr(self._loop, "add_direct_reader", self._loop.add_reader)
@@ -393,7 +396,13 @@ class Stream:
         if count == 0:
             self._lost(None)
             return
-        self.last_in = self._loop.time()
+        now = self._loop.time()
+        if now - self.last_in > limits.STALE_AGE:
+            # Only a silence in which we looked counts: not that this process got no CPU.
+            looked = getattr(self._loop, "looked_before", now)
+            if looked - self.last_in > limits.STALE_AGE:
+                self.resumed_at = now
+        self.last_in = now
         self.bytes_in += count
         self._filled += count
         if self._filled == _FIRST_BUFFER == len(self._buffer):

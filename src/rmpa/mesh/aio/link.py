@@ -239,6 +239,11 @@ class MeshLink:
         return None if estimate is None else estimate[1]
 
     @property
+    def resumed_at(self) -> float:
+        """When the express lane was heard again after its last silence, monotonic seconds; see ``Stream``."""
+        return self._stream.resumed_at
+
+    @property
     def bytes_in(self) -> int:
         """Bytes received, headers included, by both lanes."""
         return self._stream.bytes_in + self._bulk_before[0] + (self._bulk_link.bytes_in if self._bulk_link else 0)
