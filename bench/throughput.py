@@ -8,6 +8,7 @@ stands beside it. *Without loss* is the highest rate of which practically all ar
 from __future__ import annotations
 
 import json as json_text
+import math
 import os
 import statistics
 import time
@@ -63,7 +64,7 @@ class Plan:
     bisections: int
 
 
-FULL: Final = Plan(5.0, 3, 5)
+FULL: Final = Plan(5.0, 3, 6)
 QUICK: Final = Plan(2.0, 1, 3)
 
 
@@ -159,14 +160,22 @@ class Way:
             dropped=dropped,
         )
 
-    def lossless(self, bytes_each: int, seconds: float, at_most: float, bisections: int) -> float:
-        """The highest rate found of which practically all arrives: what arrived then, messages a second."""
-        low, high, best = 0.0, at_most, 0.0
-        for _ in range(bisections):
-            rate = (low + high) / 2
+    def lossless(self, bytes_each: int, seconds: float, between: tuple[float, float], steps: int) -> float | None:
+        """The highest rate found of which practically all arrives; ``None`` if no rate that was tried did.
+
+        Args:
+            bytes_each: Of a message.
+            seconds: Of each try.
+            between: Messages a second: where to look.
+            steps: Tries; each halves the range, in octaves.
+        """
+        low, high = between
+        best = None
+        for _ in range(steps):
+            rate = math.sqrt(low * high)
             window = self.window(bytes_each, seconds, rate)
-            if window.lost <= _LOSSLESS and window.received > best:
-                low, best = rate, window.received
+            if window.lost <= _LOSSLESS:
+                low, best = rate, max(best or 0.0, window.received)
             else:
                 high = rate
         return best
@@ -234,7 +243,7 @@ class Score:
 
     Args:
         windows: Flat out, one a round.
-        lossless: Messages a second without loss.
+        lossless: Messages a second without loss; ``None`` if no rate that was tried had none.
     """
 
     windows: list[Window] = field(default_factory=list)
@@ -268,10 +277,10 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
         console.print("the rates without loss", style="dim")
         for (key, bytes_each), score in scores.items():
             with Bed() as bed:
-                # Flat out the processes take the cores from each other: without loss it may be more.
-                most = 1.5 * score.received
-                found = WAYS[key][1](bed).lossless(bytes_each, min(2.0, plan.seconds), most, plan.bisections)
-                score.lossless = found
+                # Flat out the processes take the cores from each other: without loss it may be more, or much less.
+                between = (score.received / 8, 1.5 * scores["direct", bytes_each].received)
+                way = WAYS[key][1](bed)
+                score.lossless = way.lossless(bytes_each, min(2.0, plan.seconds), between, plan.bisections)
     for bytes_each in _LIMITS:
         console.print(_table(bytes_each, scores))
         middles = [(title, scores[key, bytes_each].middle) for key, (title, _) in WAYS.items()]
@@ -353,7 +362,10 @@ def _table(bytes_each: int, scores: Scores) -> Table:
         middle = score.middle
         cells = [f"{score.received:.0f}", dash(ratio(score.received, base.received))]
         cells += [f"{score.received * bytes_each / 1e6:.1f}", f"{middle.sent:.0f}", f"{100 * middle.lost:.1f}"]
-        cells += [f"{score.lossless or 0:.0f}", dash(ratio(score.lossless, base.lossless))]
+        cells += [
+            "-" if score.lossless is None else f"{score.lossless:.0f}",
+            dash(ratio(score.lossless, base.lossless)),
+        ]
         dropped = "-" if not middle.dropped else " + ".join(str(count) for count in middle.dropped.values())
         table.add_row(title, *cells, dropped, f"{middle.others:.0f}")
     return table
