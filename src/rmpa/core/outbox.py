@@ -88,6 +88,7 @@ class _Flow:
     terms: _Terms
     parcels: deque[Parcel] = field(default_factory=deque)
     size: int = 0
+    marks: int = 0
     turning: bool = False
 
 
@@ -208,8 +209,8 @@ class Outbox:
     def push(self, data: bytes, key: int, now: float = 0.0, *, pinned: bool = False) -> int:
         """Queue one whole entry; return how many older ones, of any key, were dropped for it.
 
-        An empty entry is nothing to send and not queued. A pinned one is never dropped, and not counted against the
-        bound in bytes: a mark between messages.
+        An empty entry is nothing to send and not queued. A pinned one, a mark between messages, is never dropped and
+        not counted against the bounds.
         """
         if not data:
             return 0
@@ -381,6 +382,7 @@ class Outbox:
             self._commit_turn(flow, parcel)
             if parcel.sent == parcel.size:
                 flow.parcels.popleft()
+                flow.marks -= parcel.pinned
             if not flow.parcels:
                 self._forget(key, flow)
             elif flow.parcels[0].chunks:
@@ -419,8 +421,11 @@ class Outbox:
         if flow is None:
             flow = self._flows[parcel.key] = _Flow(self._special.get(parcel.key, self._terms))
         dropped = 0
-        while len(flow.parcels) >= flow.terms.entries and self._drop_oldest(flow, parcel):
-            dropped += 1
+        if parcel.pinned:
+            flow.marks += 1
+        else:
+            while len(flow.parcels) - flow.marks >= flow.terms.entries and self._drop_oldest(flow, parcel):
+                dropped += 1
         parcel.chunks.append(data)
         parcel.held = len(data)
         flow.parcels.append(parcel)

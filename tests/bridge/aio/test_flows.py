@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -265,6 +266,9 @@ class Inlet:
         self.called_back = 0
         self.time = LinkTime()
         self.time.set(ahead, error)
+        self.resumed = math.inf
+        """When the link's last silence ended: nothing came since."""
+        self.time.resumed_at = lambda: self.resumed
         self.flow = ImportFlow(self.outlet, contract, self.time, on_ack=self.acks.append, on_torn=self.torn)
         self.flow._next = first
 
@@ -545,15 +549,22 @@ def test_the_peers_clock_is_what_dates_its_messages(clock: Clock, ahead: float) 
     assert inlet.got == [b"new", b"newer"]
 
 
-def test_what_waited_here_is_not_the_links_fault(clock: Clock) -> None:
-    """This process got no CPU for a second: nothing is thrown away because of that."""
+@pytest.mark.parametrize("resumed", [-math.inf, -5.0])
+def test_what_no_silence_held_up_is_not_thrown_away(clock: Clock, resumed: float) -> None:
+    """A slow link, a full buffer, a process that got no CPU: late, but all that there is."""
     inlet = Inlet(error=0.001, first=2)
-    clock.now += 1.0  # and nobody looked at the sockets
-    burst(inlet, clock, [1.05, 0.9, 0.5])
+    inlet.resumed = clock.now + resumed
+    burst(inlet, clock, [3.0, 0.9, 0.5])
     assert inlet.got == [b"\2", b"\3", b"\4"]
-    burst(inlet, clock, [1.2], first=5)
     assert inlet.counts == (0, 0, 0, 0)
-    assert len(inlet.got) == 3, "that one was late before"
+
+
+def test_what_was_sent_before_a_silence_ended_gives_way_and_what_was_sent_since_does_not(clock: Clock) -> None:
+    inlet = Inlet(error=0.001, first=2)
+    inlet.resumed = clock.now - 0.5
+    burst(inlet, clock, [0.9, 0.6, 0.4, 0.3])
+    assert inlet.got == [b"\4", b"\5"]
+    assert inlet.counts == (0, 0, 2, 0)
 
 
 @pytest.mark.parametrize(

@@ -329,7 +329,7 @@ async def test_a_route_that_is_closed_within_a_read_does_not_disturb_what_is_cor
     sender, receiver, _ = await half_sent(sockets)
 
     def action() -> None:
-        sender.send(2, 9000)
+        sender.send(2, 90_000)
         assert sender.stream.outbox.discard(1) == 1
         sender.stream.pump()
         sender.send(2, 9000)
@@ -337,6 +337,40 @@ async def test_a_route_that_is_closed_within_a_read_does_not_disturb_what_is_cor
     await Corked(action).run()
     await until(lambda: len(receiver.got) == 2, receiver)
     assert "data 1:1 aborted" in receiver.said
+    sender.stream.close()
+    receiver.stream.close()
+
+
+async def test_a_mark_stays_behind_what_is_corked(sockets: Sockets) -> None:
+    sender, receiver = Sender(sockets[0]), Receiver(sockets[1])
+
+    def action() -> None:
+        for number in range(3):
+            sender.send(1, 100 * number + 1)
+            sender.mark(1)
+
+    await Corked(action).run()
+    await until(lambda: len(receiver.got) == 6, receiver)
+    assert receiver.got == sender.sent
+    sender.stream.close()
+    receiver.stream.close()
+
+
+async def test_a_mark_that_has_to_wait_is_not_dropped(sockets: Sockets) -> None:
+    zeros = stuff(sockets[0])
+    box = Outbox(1, 1 << 20)
+    sender = Sender(sockets[0], box)
+    for number in (1, 2, 3, 5):
+        sender.stream.send([whole(1, number, 100)], 1)
+    sender.number = 5
+    sender.mark(1)
+    sender.stream.send([whole(1, 7, 100)], 1)
+    await drain_zeros(sockets[1], zeros)
+    receiver = Receiver(sockets[1])
+    await until(lambda: not sender.stream.pending_bytes, receiver)
+    await until(lambda: receiver.said[-1:] == ["data 1:7 whole"], receiver)
+    assert "fence 1:6 whole" in receiver.said
+    assert box.dropped[1] >= 3
     sender.stream.close()
     receiver.stream.close()
 
@@ -466,6 +500,23 @@ async def test_an_adopted_outbox_leaves_behind_what_the_connection_had_to_say(so
     assert receiver.said[:2] == ["hello 0:0 whole", "ping 0:0 whole"]
     assert by_key(receiver.got[2:]) == {7: [1, 2, 4], 8: [3]}
     assert receiver.said.index("data 7:4 whole") < receiver.said.index("data 8:3 whole"), "in turns"
+    sender.stream.close()
+    receiver.stream.close()
+
+
+async def test_an_outbox_that_is_adopted_within_a_read_follows_what_that_read_said(sockets: Sockets) -> None:
+    """As a welcome, which the lane's messages must not overtake."""
+    sender, receiver = Sender(sockets[0], Outbox(1, 1)), Receiver(sockets[1])
+    box = large_outbox()
+    box.push(whole(7, 1, 100), 7)
+
+    def action() -> None:
+        sender.stream.send([Frame(Kind.HELLO, b"hello").serialize()], URGENT)
+        sender.stream.adopt(box, pack_fragment_header)
+
+    await Corked(action).run()
+    await until(lambda: len(receiver.got) == 2, receiver)
+    assert receiver.said == ["hello 0:0 whole", "data 7:1 whole"]
     sender.stream.close()
     receiver.stream.close()
 

@@ -169,6 +169,7 @@ class Bridge:
         if back is not None:
             _log.info("= %s is back: reliable topics go on", link.name)
             back.link = link
+            back.inbound.time.resumed_at = lambda: link.resumed_at
             self._by_link[link] = back
             self._act(self._imports.link_up(back.peer))
             self._act(self._exports.link_up(back.peer))
@@ -184,6 +185,7 @@ class Bridge:
             on_mismatch=lambda source, subscriber, text: self._mismatched(peer, source, subscriber, text),
             on_occurred=lambda source, occurred: self._occurred(peer, source, occurred),
         )
+        inbound.time.resumed_at = lambda: link.resumed_at
         attached = Attached(peer, link, inbound)
         self._by_number[peer] = self._by_link[link] = attached
         self._act(self._imports.link_up(peer))

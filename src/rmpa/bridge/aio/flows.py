@@ -8,6 +8,7 @@ with the planning side.
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections import deque
 from itertools import islice
@@ -182,12 +183,19 @@ class ExportFlow:
             self._latched.append((whole, self._stamp))
 
 
+def _never() -> float:
+    """No silence so far."""
+    return -math.inf
+
+
 class LinkTime:
     """How a link's messages are dated here: one for all of its flows, renewed whenever the link knows better."""
 
-    __slots__ = ("ahead_ns", "error_ns")
+    __slots__ = ("ahead_ns", "error_ns", "resumed_at")
 
     def __init__(self) -> None:
+        self.resumed_at: Callable[[], float] = _never
+        """When the link was heard again after its last silence, monotonic seconds."""
         self.ahead_ns = 0
         """The peer's wall clock less ours."""
         self.error_ns: int | None = None
@@ -400,8 +408,8 @@ class ImportFlow:
         error = self._time.error_ns
         if error is None or age <= self._stale_ns + error:
             return False
-        if self.contract.lifespan is None and age - self._waited_here() <= self._stale_ns + error:
-            return False  # it is not the link that was late, but we
+        if self.contract.lifespan is None and self._loop.time() - age / 1e9 >= self._time.resumed_at():
+            return False  # not an outage held it up, but a slow link, or we
         if self.contract.lifespan is not None:
             self.expired += 1
             self.watch.expired(1, self._loop.time())
@@ -414,11 +422,6 @@ class ImportFlow:
         if self._timer is None:
             self._timer = self._loop.call_later(limits.STALE_HOLD, self._nothing_newer)
         return True
-
-    def _waited_here(self) -> int:
-        """Nanoseconds for which the message may have been here already: this process got no CPU, perhaps."""
-        now = self._loop.time()
-        return round((now - getattr(self._loop, "looked_before", now)) * 1e9)
 
     def _supersede(self) -> None:
         self._stale = None

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import socket
 from collections.abc import Callable, Sequence
 from typing import Final, cast
@@ -23,7 +24,8 @@ _log = logging.getLogger(__name__)
 _FIRST_BUFFER: Final = 64 * limits.KIB
 _BUSY_BUFFER: Final = 256 * limits.KIB
 _KEPT_BUFFER: Final = 4 * limits.MIB
-_IOV: Final = 64
+_IOV: Final = 512
+_WRITES: Final = 16
 _CORK_ABOVE: Final = 512
 _CORK_MESSAGES: Final = 128
 _CORK_BYTES: Final = 512 * limits.KIB
@@ -86,6 +88,8 @@ class Stream:
         self.bytes_out = 0
         self.last_in = self._loop.time()
         """When bytes last came (``loop.time()``), whether or not ``on_bytes`` was called for them."""
+        self.resumed_at = -math.inf
+        """When bytes came after a silence of more than ``limits.STALE_AGE`` (``loop.time()``)."""
         self._fd = sock.fileno()
         # An agent's loop has a short way for the data path; elsewhere (tools, tests) the usual one does.
         add_reader = getattr(self._loop, "add_direct_reader", self._loop.add_reader)
@@ -393,7 +397,13 @@ class Stream:
         if count == 0:
             self._lost(None)
             return
-        self.last_in = self._loop.time()
+        now = self._loop.time()
+        if now - self.last_in > limits.STALE_AGE:
+            # Only a silence in which we looked counts: not that this process got no CPU.
+            looked = getattr(self._loop, "looked_before", now)
+            if looked - self.last_in > limits.STALE_AGE:
+                self.resumed_at = now
+        self.last_in = now
         self.bytes_in += count
         self._filled += count
         if self._filled == _FIRST_BUFFER == len(self._buffer):
@@ -439,22 +449,31 @@ class Stream:
             self._view[:rest] = view[:rest]
 
     def _writable(self) -> None:
-        try:
+        """Send what waits until the socket takes no more; but let others have their turn too."""
+        for _ in range(_WRITES):
+            # All that waited may have been too old; then there are no parts.
             parts = self._outbox.head(_IOV, self._loop.time())
-            sent = self._sock.sendmsg(parts) if parts else 0  # all that waited may have been too old
-        except (BlockingIOError, InterruptedError):
-            return
-        except OSError as error:
-            self._lost(error)
-            return
-        self.bytes_out += sent
-        self._outbox.consumed(sent)
-        if not self._outbox:
-            self._writing = False
-            self._loop.remove_writer(self._fd)
-            if self._finishing:
-                self._shut_write()
-            self._done_draining()
+            try:
+                sent = self._sock.sendmsg(parts) if parts else 0
+            except (BlockingIOError, InterruptedError):
+                return
+            except OSError as error:
+                self._lost(error)
+                return
+            self.bytes_out += sent
+            self._outbox.consumed(sent)
+            if not self._outbox:
+                self._all_sent()
+                return
+            if sent < sum(map(len, parts)):
+                return
+
+    def _all_sent(self) -> None:
+        self._writing = False
+        self._loop.remove_writer(self._fd)
+        if self._finishing:
+            self._shut_write()
+        self._done_draining()
 
 
 def _behind(parts: Sequence[Buffer], sent: int) -> bytes:

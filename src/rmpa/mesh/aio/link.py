@@ -239,6 +239,11 @@ class MeshLink:
         return None if estimate is None else estimate[1]
 
     @property
+    def resumed_at(self) -> float:
+        """When the express lane was heard again after its last silence, monotonic seconds; see ``Stream``."""
+        return self._stream.resumed_at
+
+    @property
     def bytes_in(self) -> int:
         """Bytes received, headers included, by both lanes."""
         return self._stream.bytes_in + self._bulk_before[0] + (self._bulk_link.bytes_in if self._bulk_link else 0)
@@ -326,11 +331,11 @@ class MeshLink:
             self._bulk_link._listen(self, takers)  # noqa: SLF001 - its own class
 
     def attach(self, bulk: MeshLink) -> None:
-        """Carry the bulk lane by this connection from now on; an older one is closed."""
+        """Carry the bulk lane by this connection from now on; an older one is closed without a word."""
         if self._bulk_link is not None:
             old = self._bulk_link
             self.detach(old)
-            old.close("replaced by a newer bulk lane")
+            old._sever("replaced by a newer bulk lane")  # noqa: SLF001 - its own class
         self._bulk_link = bulk
         bulk._listen(self, self._takers)
         self.bulk.connect(bulk._stream)
@@ -404,10 +409,15 @@ class MeshLink:
             self._finish(event.reason)
 
     def _marked(self, event: Marked) -> None:
-        """A fence is answered on the express lane, whichever it came by; the rest is the takers'."""
+        """A fence is answered on the express lane, whichever it came by; the rest is the takers'.
+
+        One on a connection that is no longer used is not: what was in front of it was not taken.
+        """
+        if self._mark_to is None:
+            return
         if event.kind is Kind.FENCE:
             self._of.mark(Kind.FENCED, event.route, event.sequence)
-        elif self._mark_to is not None:
+        else:
             self._mark_to(event.kind, event.route, event.sequence)
 
     def _after(self) -> None:
@@ -438,6 +448,11 @@ class MeshLink:
     def _lost(self, error: Exception | None) -> None:
         self.silent = isinstance(error, OSError) and error.errno in _SILENCE
         reason = f"{self.name} closed the connection" if error is None else f"connection to {self.name} lost: {error}"
+        self._machine.lost(reason)
+
+    def _sever(self, reason: str) -> None:
+        """End at once, where the outbox is another connection's now: not a byte of it may leave by this one."""
+        self._stream.close()
         self._machine.lost(reason)
 
     def _finish(self, reason: str) -> None:
