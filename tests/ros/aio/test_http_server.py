@@ -11,7 +11,7 @@ from rmpa.core import limits
 from rmpa.core.errors import StartError
 from rmpa.ros.aio.http_client import call
 from rmpa.ros.aio.http_server import XmlRpcServer
-from rmpa.ros.xmlrpc import RosFault, XmlRpcValue, parse_response, serialize_call
+from rmpa.ros.xmlrpc import RosFault, XmlRpcValue, parse_response, serialize_call, serialize_response
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -318,3 +318,74 @@ async def test_a_port_in_use_is_said_with_a_remedy(echo: Echo) -> None:
             await XmlRpcServer(echo, port=port).start()
     with pytest.raises(StartError, match="does not have that address"):
         await XmlRpcServer(echo, host="192.0.2.1").start()
+
+
+REQUEST = b"POST / HTTP/1.1\r\nHost: x\r\nContent-length: %d\r\n\r\n"
+
+
+@pytest.mark.parametrize("size", [1, 10, 100, 10_000])
+async def test_plain_requests_in_any_pieces_one_after_the_other(server: XmlRpcServer, size: int) -> None:
+    body = serialize_call("echo", ["x"])
+    async with client(server) as c:
+        for _ in range(3):
+            data = REQUEST % len(body) + body
+            for begin in range(0, len(data), size):
+                c.writer.write(data[begin : begin + size])
+                await c.writer.drain()
+                await asyncio.sleep(0)
+            head, answer = await c.response()
+            assert head.startswith(b"HTTP/1.1 200 OK\r\n")
+            assert parse_response(answer) == [1, "127.0.0.1", ["x"]]
+
+
+@pytest.mark.parametrize("headers", [b"", b"X-Odd: 1\r\n"])
+async def test_requests_right_behind_each_other_are_answered_in_order(server: XmlRpcServer, headers: bytes) -> None:
+    async with client(server) as c:
+        for number in range(5):
+            body = serialize_call("echo", [number])
+            c.writer.write(REQUEST.replace(b"Host: x\r\n", b"Host: x\r\n" + headers) % len(body) + body)
+        for number in range(5):
+            assert parse_response((await c.response())[1]) == [1, "127.0.0.1", [number]]
+
+
+async def test_a_request_behind_one_that_waits_is_answered_after_it(server: XmlRpcServer, echo: Echo) -> None:
+    async with client(server) as c:
+        for method in ("wait", "echo"):
+            body = serialize_call(method, [])
+            c.writer.write(REQUEST % len(body) + body)
+            await c.writer.drain()
+            await echo.waiting.wait()
+        await asyncio.sleep(0.01)
+        echo.go.set()
+        assert parse_response((await c.response())[1]) == "waited"
+        assert parse_response((await c.response())[1]) == [1, "127.0.0.1", []]
+
+
+async def test_a_connection_that_shall_end_with_its_answer_does(server: XmlRpcServer) -> None:
+    body = serialize_call("echo", [])
+    async with client(server) as c:
+        c.writer.write((REQUEST % len(body)).replace(b"Host", b"Connection: close\r\nHost") + body)
+        answer = await c.ended()
+        assert b"Connection: close\r\n" in answer
+        assert answer.endswith(serialize_response([1, "127.0.0.1", []]))
+
+
+async def test_a_client_that_half_closes_behind_a_plain_request_is_answered(server: XmlRpcServer, echo: Echo) -> None:
+    for method, wanted in (("echo", [1, "127.0.0.1", []]), ("wait", "waited")):
+        body = serialize_call(method, [])
+        async with client(server) as c:
+            c.writer.write(REQUEST % len(body) + body)
+            c.writer.write_eof()
+            echo.go.set()
+            assert (await c.ended()).endswith(serialize_response(wanted))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("cut", [5, 40, 60])
+async def test_a_client_that_ends_within_a_plain_request_is_closed(server: XmlRpcServer, cut: int) -> None:
+    body = serialize_call("echo", [])
+    async with client(server) as c:
+        c.writer.write((REQUEST % len(body) + body)[:cut])
+        c.writer.write_eof()
+        await c.ended()
+    while server.connections:
+        await asyncio.sleep(0.005)

@@ -1,7 +1,8 @@
 """An XML-RPC server on h11: POST to any path, one response in one piece, everything bounded.
 
-h11 speaks HTTP/1.1 (RFC 9112), ``ros.xmlrpc`` reads the bodies. Made for clients as they are: XmlRpc++ wants
-``Content-length`` and no chunks, Python keeps its connections open for as long as its threads live.
+``ros.http_head`` knows the requests of rospy and roscpp, h11 speaks HTTP/1.1 (RFC 9112) with everybody else,
+``ros.xmlrpc`` reads the bodies. Made for clients as they are: XmlRpc++ wants ``Content-length`` and no chunks, Python
+keeps its connections open for as long as its threads live.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from rmpa.core import limits
 from rmpa.core.aio.loop import breathe
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, StartError
+from rmpa.ros.http_head import Head, plain_head
 from rmpa.ros.xmlrpc import CallReader, RosFault, XmlRpcValue, brief, response_pieces, serialize_fault
 
 _log = logging.getLogger(__name__)
@@ -230,12 +232,16 @@ class XmlRpcServer:
 
 
 class _Connection(asyncio.Protocol):
-    """One client: bytes to h11, bodies to the server's ``_answer``, one answer at a time."""
+    """One client: bytes to h11 unless they are plain, bodies to the server's ``_answer``, one answer at a time."""
 
     def __init__(self, server: XmlRpcServer) -> None:
         self._server = server
         self._loop = asyncio.get_running_loop()
-        self._http = h11.Connection(h11.SERVER, max_incomplete_event_size=limits.HTTP_HEADERS_MAX)
+        # From the first request on that is not plain.
+        self._http: h11.Connection | None = None
+        self._unread = bytearray()
+        self._head: Head | None = None
+        self._plain = False
         self._transport: asyncio.Transport | None = None
         self._body = bytearray()
         self._task: asyncio.Task[None] | None = None
@@ -279,14 +285,18 @@ class _Connection(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         if self._closing and self._task is None:
             return  # the rest of a refused request
-        self._http.receive_data(data)
-        self._advance()
+        if self._http is None:
+            self._unread += data
+            if self._task is None:
+                self._take()
+        else:
+            self._http.receive_data(data)
+            self._advance(self._http)
 
     def eof_received(self) -> bool:
         if self._closing and self._task is None:
             return False
-        self._http.receive_data(b"")
-        self._advance()
+        self._hand_over(end=True)
         # A client may half-close behind its request; it still gets its answer.
         return self._task is not None
 
@@ -317,13 +327,48 @@ class _Connection(asyncio.Protocol):
                 self._server._refuse("http.timeout", self, "a request was not finished in time")  # noqa: SLF001
             self.abort()
 
+    # --- plain requests ---------------------------------------------------------------------------------------
+
+    def _take(self) -> None:
+        """Take a plain request if it is whole; leave the connection to h11 if it is none."""
+        if not self._unread:
+            return
+        if self._head is None:
+            self._head = plain_head(self._unread)
+            if self._head is None:
+                self._hand_over()
+                return
+            self._receiving = True
+            self._expect(limits.HTTP_REQUEST_TIMEOUT)
+        missing = self._head.end + self._head.length - len(self._unread)
+        if missing < 0:  # the next one is right behind it
+            self._hand_over()
+        elif missing == 0:
+            body = bytes(self._unread[self._head.end :])
+            self._unread.clear()
+            self._closing, self._plain, self._head = self._head.close, True, None
+            self._call(body)
+
+    def _hand_over(self, *, end: bool = False) -> None:
+        """To h11, from now on: all that was not taken yet, and perhaps the end of it."""
+        if self._http is None:
+            self._http = h11.Connection(h11.SERVER, max_incomplete_event_size=limits.HTTP_HEADERS_MAX)
+        if self._unread:
+            self._http.receive_data(bytes(self._unread))
+            self._unread.clear()
+            self._head = None
+        if end:
+            self._http.receive_data(b"")
+        self._advance(self._http)
+
     # --- h11's side -------------------------------------------------------------------------------------------
 
-    def _advance(self) -> None:
+    def _advance(self, http: h11.Connection) -> None:
         """Take what h11 has, up to the end of the next request that has to wait."""
         while self._task is None and not self._closing:
+            breathe()
             try:
-                event = self._http.next_event()
+                event = http.next_event()
             except h11.RemoteProtocolError as error:
                 self._reject(error.error_status_hint, str(error), "http.malformed")
                 return
@@ -331,7 +376,7 @@ class _Connection(asyncio.Protocol):
                 case h11.Request():
                     self._receiving = True
                     self._expect(limits.HTTP_REQUEST_TIMEOUT)
-                    if not self._accepts(event):
+                    if not self._accepts(event, http):
                         return
                 case h11.Data(data=data):
                     if len(self._body) + len(data) > limits.HTTP_BODY_MAX:
@@ -339,17 +384,19 @@ class _Connection(asyncio.Protocol):
                         return
                     self._body += data
                 case h11.EndOfMessage():
-                    self._call()
+                    body = bytes(self._body)
+                    self._body.clear()
+                    self._call(body)
                 case h11.ConnectionClosed():
                     self.close_when_answered()
                     return
                 case _:  # NEED_DATA or PAUSED
-                    if event is h11.NEED_DATA and not self._receiving and self._http.trailing_data[0]:
+                    if event is h11.NEED_DATA and not self._receiving and http.trailing_data[0]:
                         self._receiving = True
                         self._expect(limits.HTTP_REQUEST_TIMEOUT)
                     return
 
-    def _accepts(self, request: h11.Request) -> bool:
+    def _accepts(self, request: h11.Request, http: h11.Connection) -> bool:
         if request.method != b"POST":
             self._reject(405, f"{request.method.decode('ascii')}: XML-RPC is called by POST only", "http.method")
             return False
@@ -360,13 +407,13 @@ class _Connection(asyncio.Protocol):
             if name == b"content-encoding" and value.lower() != b"identity":
                 self._reject(415, "an encoded body; send it as it is", "http.encoding")
                 return False
-        if self._http.they_are_waiting_for_100_continue:
-            self._write(h11.InformationalResponse(status_code=100, headers=[], reason=b"Continue"))
+        if http.they_are_waiting_for_100_continue:
+            self._write(http, h11.InformationalResponse(status_code=100, headers=[], reason=b"Continue"))
         return True
 
-    def _call(self) -> None:
-        body = bytes(self._body)
-        self._body.clear()
+    # --- answers ----------------------------------------------------------------------------------------------
+
+    def _call(self, body: bytes) -> None:
         self._receiving = False
         self._server._used(self)  # noqa: SLF001
         breathe()
@@ -385,11 +432,26 @@ class _Connection(asyncio.Protocol):
         self._reply(200, body)
         if self._transport is not None and not self._closing:
             self._transport.resume_reading()
-            self._advance()
+            if self._http is None:
+                self._take()
+            else:
+                self._advance(self._http)
 
     def _reply(self, status: int, body: bytes) -> None:
         if self._transport is None or self._transport.is_closing():
             return
+        if self._plain or self._http is None:
+            self._plain = False
+            close = b"Connection: close\r\n" if self._closing else b""
+            self._transport.write(_PLAIN_REPLY % (len(body), close) + body)
+            if self._closing:
+                self._close()
+            else:
+                self._expect(limits.HTTP_IDLE_TIMEOUT)
+            return
+        self._reply_by(self._http, status, body)
+
+    def _reply_by(self, http: h11.Connection, status: int, body: bytes) -> None:
         headers = [
             (b"Server", b"rmpa"),
             (b"Content-Type", b"text/xml" if status == 200 else b"text/plain; charset=utf-8"),
@@ -398,25 +460,27 @@ class _Connection(asyncio.Protocol):
         if status != 200 or self._closing:
             headers.append((b"Connection", b"close"))
         self._write(
+            http,
             h11.Response(status_code=status, headers=headers, reason=_REASONS.get(status, b"Refused")),
             h11.Data(data=body),
             h11.EndOfMessage(),
         )
-        if self._http.our_state is h11.DONE and self._http.their_state is h11.DONE and not self._closing:
-            self._http.start_next_cycle()
+        if http.our_state is h11.DONE and http.their_state is h11.DONE and not self._closing:
+            http.start_next_cycle()
             self._expect(limits.HTTP_IDLE_TIMEOUT)
         elif status == 200:
             self._close()
 
-    def _write(self, *events: h11.Event) -> None:
+    def _write(self, http: h11.Connection, *events: h11.Event) -> None:
         assert self._transport is not None  # noqa: S101 - for mypy: nothing is received before
-        self._transport.write(b"".join(self._http.send(event) or b"" for event in events))
+        self._transport.write(b"".join(http.send(event) or b"" for event in events))
 
     def _reject(self, status: int, text: str, name: str) -> None:
         self._server._refuse(name, self, text)  # noqa: SLF001
-        if self._http.our_state in {h11.IDLE, h11.SEND_RESPONSE}:
+        if self._http is not None and self._http.our_state in {h11.IDLE, h11.SEND_RESPONSE}:
             self._closing = True
-            self._reply(status, f"{text}\n".encode())
+            if self._transport is not None and not self._transport.is_closing():
+                self._reply_by(self._http, status, f"{text}\n".encode())
             self._linger()
         else:
             self._close()
@@ -450,6 +514,7 @@ class _Connection(asyncio.Protocol):
             self._transport.abort()
 
 
+_PLAIN_REPLY: Final = b"HTTP/1.1 200 OK\r\nServer: rmpa\r\nContent-Type: text/xml\r\nContent-length: %d\r\n%s\r\n"
 _REASONS: Final = {
     200: b"OK",
     400: b"Bad Request",
