@@ -155,8 +155,8 @@ FRAME_HEADER_BYTES: Final = 24
 """See docs/design/protocol.md."""
 MESSAGE_MAX: Final = 256 * MIB
 """One ROS message with its length; the largest point clouds and images stay below this."""
-FRAGMENT_BYTES: Final = 64 * KIB
-"""What one message sends before another of its lane has its turn: 5 ms of a 100 Mbit/s link. Longer messages go in
+FRAGMENT_BYTES: Final = 128 * KIB
+"""What one message sends before another of its lane has its turn: 10 ms of a 100 Mbit/s link. Longer messages go in
 several data frames."""
 DATA_PAYLOAD_MAX: Final = 256 * KIB
 """Data frames longer than this are refused: nobody sends them, and one would hold up all others of its lane."""
@@ -179,7 +179,7 @@ EXPRESS_AGAIN_MESSAGES: Final = 200
 """Small messages in a row before a topic that had a large one goes back to the express lane."""
 EXPRESS_AGAIN_AFTER: Final = 5.0
 """Seconds since its last large message, likewise: a topic that mixes both sizes must not go to and fro."""
-CUT_THROUGH_BYTES: Final = 128 * KIB
+CUT_THROUGH_BYTES: Final = 96 * KIB
 """Messages above this are handed on while they still arrive."""
 STALE_AGE: Final = 0.1
 """A best-effort message that was on its way for longer (a cable was out) gives way to a newer one behind it."""
