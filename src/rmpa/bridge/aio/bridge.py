@@ -535,10 +535,11 @@ class Bridge:
             case act.Retract():
                 attached.inbound.retract(action)
             case act.Describe():
-                route = action.route
+                # This link: of the next one the same number is another source's route.
+                route, link = action.route, attached.link
                 if self._ticker is None:
                     self._ticker = self._loop.call_later(limits.STALE_TICK, self._tick)
-                attached.inbound.describe(action, lambda last: attached.link.mark(FrameKind.ACK, route, last))
+                attached.inbound.describe(action, lambda last: link.mark(FrameKind.ACK, route, last))
             case act.Detach():
                 attached.inbound.detach(action)
 
