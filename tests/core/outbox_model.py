@@ -155,7 +155,8 @@ class Model:
         """So many bytes of an entry, its first or further ones, were put in."""
         before = sum(e.held for e in self.waiting() if e.counts)
         flow = self.flows.get(entry.key, [])
-        full = entry not in flow and len(flow) >= self.bounds(entry.key)[0]
+        others = sum(not e.pinned for e in flow)
+        full = entry not in flow and not entry.pinned and others >= self.bounds(entry.key)[0]
         drops = self.take_drops()
         assert sum(drops.values()) == dropped
         for key, number in drops.items():

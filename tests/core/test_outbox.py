@@ -278,11 +278,12 @@ def test_marks_are_never_dropped_and_push_nothing_out() -> None:
     box = framed(entries=2, max_bytes=20)
     box.push(b"old", 1)
     for number in range(30):
-        assert box.push(b"[%02d]" % number, 1, pinned=True) == (number == 1)
+        assert box.push(b"[%02d]" % number, 1, pinned=True) == 0
     for number in range(5):
         box.push(b"m%d" % number, 1)
-    assert drain(box) == b"".join(b"[%02d]" % n for n in range(30)) + b"m4"
-    assert box.dropped == {1: 5}
+    assert drain(box) == b"".join(b"[%02d]" % n for n in range(30)) + b"m3m4"
+    assert box.dropped == {1: 4}
+    assert [box.push(b"m%d" % number, 1) for number in range(3)] == [0, 0, 1], "marks that left count no more"
 
 
 # --- terms of a key -----------------------------------------------------------------------------------------------

@@ -259,6 +259,11 @@ class Exports:
         gone = self._peers.pop(peer, None)
         for route, source in gone.routes.items() if gone is not None else ():
             actions += self._remove(source, peer, route)
+        return actions + self.unclaimed(peer)
+
+    def unclaimed(self, peer: int) -> list[Action]:
+        """A peer does not go on with its suspended routes."""
+        actions: list[Action] = []
         for source, flow in list(self._flows.items()):
             if flow.away.pop(peer, None) is not None:
                 actions += [RemoveRoute(source, peer, 0), *self._disconnect(source, flow)]

@@ -217,7 +217,9 @@ class Imports:
         for source, entry in list(known.sources.items()):
             keep = briefly or _outlives(entry)
             if entry.route:
-                actions.append(Detach(peer, source, entry.route, keep=keep))
+                # Where nobody listens any more, nothing is to go on.
+                goes_on = keep and entry.state is not RouteState.LINGERING
+                actions.append(Detach(peer, source, entry.route, keep=goes_on))
             entry.route = 0
             if keep:
                 self._suspend(peer, source, entry)
@@ -478,6 +480,8 @@ class Imports:
         if entry.route:
             self._peers[peer].routes.pop(entry.route, None)
             actions += [Send(peer, Close(entry.route)), Detach(peer, source, entry.route)]
+        elif entry.state is RouteState.WAITING and entry.timer is None:
+            actions.append(Detach(peer, source, 0))  # what waited for a new link to go on
         entry.route = 0
         entry.backoff.reset()
         if entry.state is RouteState.OPEN:

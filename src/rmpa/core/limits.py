@@ -263,6 +263,9 @@ ACK_DELAY: Final = 0.010
 RESUME_WINDOW: Final = 30.0
 """How long a reliable route's messages are kept after its link fell: a robot drives through a shadow, an access point
 restarts. Whoever is away for longer begins anew."""
+RESUME_CLAIM: Final = 10.0
+"""From a peer's new link to its asking for a route that waited: its advertisement has been read by then. What it has
+not asked for has no listener any more."""
 RESUMES_MAX: Final = 1024
 """Reliable routes that wait for their links: all of one peer with a thousand topics."""
 RESUME_BYTES_MAX: Final = 256 * MIB

@@ -41,8 +41,6 @@ class Clock:
 
     def __init__(self, now: float = 1000.0) -> None:
         self.now = now
-        self.looked_before = now
-        """As the agent's loop has it: so long a message may have waited here."""
         self._timers: list[tuple[float, int, Timer]] = []
         self._numbers = itertools.count()
 
@@ -74,10 +72,10 @@ class Clock:
         until = self.now + seconds
         while self._timers and self._timers[0][0] <= until:
             when, _, timer = heapq.heappop(self._timers)
-            self.now = self.looked_before = max(self.now, when)
+            self.now = max(self.now, when)
             if timer.call is not None:
                 timer.call()
-        self.now = self.looked_before = until
+        self.now = until
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Meshes on loopback: every wait is for an event, with a generous deadline."""
+"""Meshes on loopback: dialling, accepting, refusing, ends; the lanes are in ``test_mesh_lanes.py``."""
 
 from __future__ import annotations
 
@@ -9,110 +9,20 @@ import fcntl
 import hashlib
 import socket
 import sys
-from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING
 
 import pytest
 
 from rmpa.core import limits
+from rmpa.core.config import LaneSettings
 from rmpa.core.counters import Counters
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
-from rmpa.mesh.aio.mesh import Mesh
 from rmpa.mesh.aio.sockets import tune_express
 from rmpa.mesh.frames import Frame, Kind
-from rmpa.mesh.handshake import Hello, Refusal, Refuse
+from rmpa.mesh.handshake import Refusal, Refuse
+from tests.mesh.aio.meshes import DEADLINE, Peer, peers, raw, until
 
-if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-
-    from rmpa.mesh.aio.link import MeshLink
-
-DEADLINE = 20.0
 _SIOCOUTQNSD = 0x894B  # linux/sockios.h: bytes that were not sent yet
-
-
-async def until(condition: Callable[[], bool], what: str) -> None:
-    """Wait for a condition that the loop's own events bring about."""
-    try:
-        async with asyncio.timeout(DEADLINE):
-            while not condition():
-                await asyncio.sleep(0.002)
-    except TimeoutError:
-        raise AssertionError(f"not within {DEADLINE} s: {what}") from None
-
-
-class Peer:
-    """A mesh and what it was told."""
-
-    def __init__(self, number: int, instance: int = 0, port: int = 0) -> None:
-        sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        sock.bind(("127.0.0.1", port))
-        sock.listen(32)
-        self.number = number
-        self.port = sock.getsockname()[1]
-        instance_id = bytes([number, instance]) + bytes(14)
-        guid = Guid.of("127.0.0.1", self.port, instance)
-        self.identity = Identity(guid, instance_id, f"peer{number}")
-        self.ups: list[MeshLink] = []
-        self.downs: list[tuple[MeshLink, str]] = []
-        self.controls: list[bytes] = []
-        self.data: list[tuple[int, int, int, bytes]] = []
-        self.bytes_got = 0
-        self.keep = True
-        self.mesh = Mesh(
-            self.identity,
-            sock,
-            on_link_up=self.ups.append,
-            on_link_down=lambda link, reason: self.downs.append((link, reason)),
-            on_control=lambda _link, payload: self.controls.append(payload),
-            on_data=self.on_data,
-        )
-
-    def on_data(self, _link: MeshLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
-        self.bytes_got += len(payload)
-        if self.keep:
-            self.data.append((route, sequence, stamp_ns, bytes(payload)))
-
-    def linked(self, *others: Peer) -> bool:
-        return all((link := self.mesh.link(o.identity.guid)) is not None and link.up for o in others)
-
-    def link(self, other: Peer) -> MeshLink:
-        link = self.mesh.link(other.identity.guid)
-        assert link is not None
-        return link
-
-    def kill(self) -> None:
-        """As kill -9: the kernel closes the sockets, nobody says bye."""
-        self.mesh._running = False
-        asyncio.get_running_loop().remove_reader(self.mesh._listen.fileno())
-        self.mesh._listen.close()
-        for timer in (self.mesh._timer, self.mesh._accept_timer):
-            if timer is not None:
-                timer.cancel()
-        for link in self.mesh._links.values():
-            link.abort("killed")
-
-
-@asynccontextmanager
-async def peers(count: int, *, found: bool = True) -> AsyncIterator[list[Peer]]:
-    made = [Peer(n) for n in range(count)]
-    try:
-        for peer in made:
-            await peer.mesh.start()
-        if found:
-            introduce(made)
-        yield made
-    finally:
-        await asyncio.gather(*(p.mesh.close() for p in made))
-
-
-def introduce(made: list[Peer]) -> None:
-    for one in made:
-        for other in made:
-            if one is not other:
-                one.mesh.peer_found(other.identity)
 
 
 @pytest.mark.parametrize("count", [2, 5])
@@ -120,8 +30,9 @@ async def test_a_full_mesh_with_one_link_a_pair(count: int) -> None:
     async with peers(count) as made:
         await until(lambda: all(p.linked(*(o for o in made if o is not p)) for p in made), "a full mesh")
         for peer in made:
-            assert len(peer.mesh.links()) == count - 1
-            for status in peer.mesh.links():
+            used = [status for status in peer.mesh.links() if status.used]
+            assert len(used) == count - 1
+            for status in used:
                 assert status.guid is not None
                 assert status.dialled == (peer.identity.guid < status.guid)
             assert {s.state for s in peer.mesh.peers()} == {"linked"}
@@ -147,19 +58,20 @@ async def test_small_and_large_messages_in_order_and_byte_exact() -> None:
     async with peers(2) as (one, other):
         await until(lambda: one.linked(other) and other.linked(one), "a link")
         link = one.link(other)
-        large = [hashlib.sha256(bytes([i])).digest() * (limits.MIB // 32) for i in range(20)]
         sent: list[tuple[int, int, int, bytes]] = []
         for i in range(10_000):
             sent.append((1, i, i, b"%064d" % i))
-            assert link.send_data(*sent[-1]) == 0
+            assert link.express.send(*sent[-1]) == 0
             if i % 500 == 0:
-                sent.append((2, i, i, large[i // 500]))
-                assert link.send_data(*sent[-1]) == 0
+                large = hashlib.sha256(bytes([i // 500])).digest() * (limits.MIB // 32)
+                sent.append((2, i, i, large))
+                assert link.express.send(*sent[-1]) == 0
             if link.queue_bytes or i % 500 == 0:
                 await until(lambda: link.queue_bytes < 65536, "room")
         link.send_control(b'{"op":"end"}')
         await until(lambda: len(other.data) == len(sent), "all messages")
-        assert other.data == sent
+        for route in (1, 2):
+            assert [m for m in other.data if m[0] == route] == [m for m in sent if m[0] == route]
         assert other.controls == [b'{"op":"end"}']
         assert not link.dropped
 
@@ -205,22 +117,6 @@ async def test_garbage_on_the_port_closes_that_connection_only(
         assert one.linked(other)
 
 
-async def raw(peer: Peer, identity: Identity, **changes: object) -> tuple[socket.socket, Frame]:
-    """A hand-made dialler: its socket, and the first frame that it is answered."""
-    loop = asyncio.get_running_loop()
-    sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
-    await loop.sock_connect(sock, ("127.0.0.1", peer.port))
-    hello = Hello.of(identity, lease=float(str(changes.get("lease", 1.0))), expected=peer.identity.guid)
-    await loop.sock_sendall(sock, Frame(Kind.HELLO, hello.serialize()).serialize())
-    got = b""
-    while (parsed := Frame.parse(got)) is None:
-        chunk = await asyncio.wait_for(loop.sock_recv(sock, 4096), DEADLINE)
-        assert chunk
-        got += chunk
-    return sock, parsed[0]
-
-
 async def test_another_domain_is_refused_with_what_to_do(caplog: pytest.LogCaptureFixture) -> None:
     async with peers(1) as (one,):
         stranger = Identity(Guid.of("127.0.0.1", 9), b"s" * 16, "stranger", domain=7)
@@ -252,9 +148,9 @@ async def test_a_stopped_peer_is_down_after_its_lease_and_its_memory_is_bounded(
         began = asyncio.get_running_loop().time()
         block = bytes(limits.MIB)
         for i in range(64):
-            link.send_data(5, i, i, block)
+            link.express.send(5, i, i, block)
             assert link.queue_bytes <= 6 * limits.MIB
-        assert link.dropped[5] >= 50
+        assert link.dropped >= 50
         assert link.close_route(5) <= 4
         await until(lambda: bool(one.downs), "the lease is over")
         assert asyncio.get_running_loop().time() - began >= 0.4
@@ -278,7 +174,7 @@ def test_little_waits_in_the_kernel_for_a_peer_that_is_slow() -> None:
     """What waits in our own queue can be overtaken and dropped; a pong behind megabytes of data was 5 s late."""
     counters = Counters()
     with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as sock:
-        tune_express(sock, counters)
+        tune_express(sock, LaneSettings(), counters)
         sock.setblocking(False)
         with server.accept()[0]:  # reads nothing
             with contextlib.suppress(BlockingIOError):
@@ -383,8 +279,12 @@ async def test_both_dial_at_once_and_one_link_stays() -> None:
             peer.mesh._peering.handle_timer(asyncio.get_running_loop().time())
             peer.mesh._act()
         await until(
-            lambda: one.linked(other) and other.linked(one) and len(one.mesh.links()) == len(other.mesh.links()) == 1,
-            "one link",
+            lambda: (
+                one.both_lanes(other)
+                and other.both_lanes(one)
+                and all(sorted(s.bulk for s in p.mesh.links()) == [False, True] for p in (one, other))
+            ),
+            "one connection of each lane",
         )
         low, high = sorted((one, other), key=lambda p: p.identity.guid)
         assert low.link(high).dialled

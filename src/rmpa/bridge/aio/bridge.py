@@ -62,6 +62,8 @@ class Attached:
     inbound: Inbound
     away: asyncio.TimerHandle | None = None
     """Runs while the link is gone and reliable routes wait for the peer; ``link`` is the last one."""
+    back: asyncio.TimerHandle | None = None
+    """Runs while it is back and may still ask for routes that waited."""
 
 
 class Bridge:
@@ -169,6 +171,7 @@ class Bridge:
         if back is not None:
             _log.info("= %s is back: reliable topics go on", link.name)
             back.link = link
+            back.back = self._loop.call_later(limits.RESUME_CLAIM, self._unclaimed, back)
             back.inbound.time.resumed_at = lambda: link.resumed_at
             self._by_link[link] = back
             self._act(self._imports.link_up(back.peer))
@@ -197,6 +200,9 @@ class Bridge:
         attached = self._by_link.pop(link, None)
         if attached is None:
             return
+        if attached.back is not None:
+            attached.back.cancel()
+            attached.back = None
         attached.inbound.link_down()
         self._learning = deque(lesson for lesson in self._learning if lesson[0] is not attached)
         self._learning_bytes = sum(len(lesson) for _, lesson in self._learning if isinstance(lesson, bytes))
@@ -221,6 +227,11 @@ class Bridge:
         imports, _ = self._imports.link_away(attached.peer)
         self._act(imports)
         _log.info("= %s is away: its reliable topics wait for %g s", name, limits.RESUME_WINDOW)
+
+    def _unclaimed(self, attached: Attached) -> None:
+        """A peer has been back for a while: what it has not asked for is not wanted any more."""
+        attached.back = None
+        self._act(self._exports.unclaimed(attached.peer))
 
     def clock(self, link: MeshLink) -> None:
         """A link knows its peer's clock better."""
@@ -325,8 +336,9 @@ class Bridge:
 
     def _give_up(self, attached: Attached) -> None:
         """A peer will not come back: retract all that is left of it."""
-        if attached.away is not None:
-            attached.away.cancel()
+        for timer in (attached.away, attached.back):
+            if timer is not None:
+                timer.cancel()
         self._by_number.pop(attached.peer, None)
         self._by_link.pop(attached.link, None)
         for action in self._exports.link_down(attached.peer):
@@ -523,10 +535,11 @@ class Bridge:
             case act.Retract():
                 attached.inbound.retract(action)
             case act.Describe():
-                route = action.route
+                # This link: of the next one the same number is another source's route.
+                route, link = action.route, attached.link
                 if self._ticker is None:
                     self._ticker = self._loop.call_later(limits.STALE_TICK, self._tick)
-                attached.inbound.describe(action, lambda last: attached.link.mark(FrameKind.ACK, route, last))
+                attached.inbound.describe(action, lambda last: link.mark(FrameKind.ACK, route, last))
             case act.Detach():
                 attached.inbound.detach(action)
 
