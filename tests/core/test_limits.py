@@ -34,7 +34,7 @@ def test_limits_fit_each_other() -> None:
 
 def test_the_limits_of_the_lanes_fit_each_other() -> None:
     assert limits.EXPRESS_MESSAGE_MAX <= limits.FRAGMENT_BYTES <= limits.DATA_PAYLOAD_MAX
-    assert limits.FRAGMENT_BYTES <= limits.CUT_THROUGH_BYTES <= limits.DATA_PAYLOAD_MAX
+    assert limits.CUT_THROUGH_BYTES <= limits.FRAGMENT_BYTES <= limits.DATA_PAYLOAD_MAX
     assert limits.COMMIT_BYTES <= 4 * limits.FRAGMENT_BYTES, "what is prepared delays whoever comes next"
     assert limits.BULK_UNSENT_BYTES < limits.LINK_UNSENT_BYTES <= limits.COMMIT_BYTES
     assert limits.LINK_LEASE < limits.LINK_UNACKED < limits.BULK_LEASE, "the lease, which can say why, speaks first"

@@ -486,8 +486,8 @@ async def test_an_adopted_outbox_leaves_behind_what_the_connection_had_to_say(so
     box = large_outbox()
     for number in (1, 2):
         box.push(whole(7, number, 100), 7)
-    big = Parcel(8, 150_000, 3, 150_000)
-    box.extend(big, payload(3, 150_000))
+    big = Parcel(8, 3 * limits.FRAGMENT_BYTES, 3, 3 * limits.FRAGMENT_BYTES)
+    box.extend(big, payload(3, 3 * limits.FRAGMENT_BYTES))
     box.push_urgent(Frame(Kind.PING).serialize())
     sender.stream.adopt(box, pack_fragment_header)
     assert sender.stream.outbox is box
