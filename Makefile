@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := venv
-.PHONY: venv demo demo-kill demo-start test tests style format types imports fuzz bench ros clean
+.PHONY: venv demo demo-kill demo-start test tests style format types imports fuzz soak bench ros clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -43,6 +43,9 @@ imports: $(STAMP)  ## the rooms import one way only; pure rooms stay pure
 
 fuzz: $(STAMP)  ## every fuzz target for longer: make fuzz [SECONDS=60]
 	$(BIN)/python -m tests.fuzz --seconds $(or $(SECONDS),60)
+
+soak: $(STAMP) ros  ## disturb three modules for long and see that nothing leaks: make soak [SECONDS=600] [SEED=N]
+	$(BIN)/python -m tests.soak --seconds $(or $(SECONDS),600) $(if $(SEED),--seed $(SEED))
 
 bench: $(STAMP) ros  ## the measurements, as ratios in one run; results in bench/results
 	$(BIN)/python -m bench $(ARGS)

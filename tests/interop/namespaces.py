@@ -122,11 +122,23 @@ class Host:
         """Take the interface up again."""
         self.ip("link", "set", self.cables[cable].interface, "up")
 
-    def shape(self, rate: str, *, burst: str = "32kb", latency: str = "50ms", cable: int = 0) -> None:
-        """Limit what this host sends to ``rate`` (as ``tc`` writes it: ``100mbit``) by a token bucket."""
-        device = self.cables[cable].interface
-        limits = ["rate", rate, "burst", burst, "latency", latency]
-        _run(["tc", "-n", self.namespace, "qdisc", "replace", "dev", device, "root", "tbf", *limits])
+    def shape(
+        self, rate: str, *, burst: str = "32kb", latency: str = "50ms", bands: bool = False, cable: int = 0
+    ) -> None:
+        """Limit what this host sends to ``rate`` (as ``tc`` writes it: ``100mbit``) by a token bucket.
+
+        Args:
+            rate: Of the cable.
+            burst: What may leave at once.
+            latency: For how long a packet may wait.
+            bands: Whether they leave by the kernel's usual three bands (``pfifo_fast``), which look at SO_PRIORITY,
+                and not in the order in which they came.
+            cable: Which.
+        """
+        qdisc = ["tc", "-n", self.namespace, "qdisc", "replace", "dev", self.cables[cable].interface]
+        _run([*qdisc, "root", "handle", "1:", "tbf", "rate", rate, "burst", burst, "latency", latency])
+        if bands:
+            _run([*qdisc, "parent", "1:1", "handle", "10:", "pfifo_fast"])
 
     def unshape(self, cable: int = 0) -> None:
         """Take the limit away."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from typing import TYPE_CHECKING
 
 import pytest
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
 
     from tests.interop.conftest import ModuleFactory
     from tests.interop.modules import Module
-    from tests.interop.namespaces import Host
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
@@ -35,15 +33,6 @@ priority = "low"
 """
 
 
-def shape(host: Host) -> None:
-    """Limit what a host sends; within the limit the kernel's usual three bands, which look at SO_PRIORITY."""
-    host.shape(f"{MBIT}mbit")
-    bands = ["qdisc", "replace", "dev", host.cables[0].interface, "parent", "1:1", "handle", "10:", "pfifo_fast"]
-    root = ["qdisc", "replace", "dev", host.cables[0].interface, "root", "handle", "1:", "tbf"]
-    for words in ([*root, "rate", f"{MBIT}mbit", "burst", "32kb", "latency", "50ms"], bands):
-        subprocess.run(["tc", "-n", host.namespace, *words], check=True, capture_output=True, timeout=20)
-
-
 def lanes(module: Module, topic: str) -> list[str]:
     """The lane of each route of a topic, as ``rmpa topic info --json`` says."""
     code, output = module.agent.rmpa("topic", "info", topic, "--json")
@@ -54,7 +43,7 @@ def lanes(module: Module, topic: str) -> list[str]:
 def test_commands_cross_a_cable_that_images_fill(modules: ModuleFactory, tmp_path: Path) -> None:
     a, b = modules("a", "b")
     for module in (a, b):
-        shape(module.host)
+        module.host.shape(f"{MBIT}mbit", bands=True)
     images = b.ros.roscpp("listener", "__name:=eye", topic="/image", queue=2)
     commands = b.ros.roscpp("recorder", topic="/command", nodelay=True, commands=True)
     # More than the cable carries, so that an image is always waiting.
@@ -83,14 +72,14 @@ def test_commands_cross_a_cable_that_images_fill(modules: ModuleFactory, tmp_pat
 def test_a_topic_of_small_and_large_messages_keeps_its_order(modules: ModuleFactory, tmp_path: Path) -> None:
     a, b = modules("a", "b")
     for module in (a, b):
-        shape(module.host)
+        module.host.shape(f"{MBIT}mbit", bands=True)
     recorders = [
         b.ros.node(kind, "recorder", topic="/mixed", nodelay=True, commands=True) for kind in ("rospy", "roscpp")
     ]
     teller = a.ros.roscpp("teller", topic="/mixed", nodelay=True, wait=1, commands=True)
     teller.wait_event("connected")
     eventually(lambda: lanes(b, "/mixed") == ["express"], what="the route to /mixed")
-    # 200 KB at 100 Hz would be 160 Mbit/s; each fifth are 32 Mbit/s, and still under way when small ones follow. A row
+    # 200 KB at 100 Hz would be 160 Mbit/s; each fifth are 32 Mbit/s, still under way when small ones follow. A row
     # of small ones takes the topic back to the express lane, 5 s after the last large one.
     told = 0
     for sizes, count, rate, lane in (

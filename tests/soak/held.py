@@ -1,0 +1,136 @@
+"""What an agent holds, seen from outside; and what of it grows that should not."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import psutil
+
+from rmpa.monitor.aio.control_client import ControlClient
+from tests.interop.processes import eventually
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from tests.interop.agents import Agent
+
+MB: Final = 1 << 20
+FLOOR_SPAN: Final = 5
+"""Samples of which the least counts: what a queue or a snapshot held for a moment is no growth."""
+GROWTH_MAX: Final = 3 * MB
+"""That the floor of the resident memory may rise by in the second half, and by no more than a twentieth: an
+allocator's holes are worth a megabyte."""
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """One look at an agent.
+
+    Args:
+        at: Seconds since the soak began.
+        rss: Resident bytes.
+        fds: Open file descriptors.
+        sockets: Of these, sockets.
+        threads: Of its process.
+        tasks: asyncio's, by the name of their coroutine.
+        routes: Open ones, both ways.
+        proxies: Nodes of peers that stand in its graph.
+    """
+
+    at: float
+    rss: int
+    fds: int
+    sockets: int
+    threads: int
+    tasks: Counter[str]
+    routes: int
+    proxies: int
+
+    def __str__(self) -> str:
+        """For the line of progress."""
+        tasks = self.tasks.total()
+        return f"{self.rss / MB:.1f} MB, {self.fds} fds ({self.sockets} sockets), {tasks} tasks, {self.routes} routes"
+
+
+def look(agent: Agent, at: float) -> Held:
+    """Look at a running agent, a ``stage.WatchedAgent``."""
+    process = psutil.Process(agent.pid)
+    path = held_path(agent)
+    path.unlink(missing_ok=True)
+    os.kill(agent.pid, signal.SIGUSR1)
+    eventually(path.exists, what=f"what {agent.name} holds", every=0.01)
+    assert agent.runtime_dir
+    with ControlClient(agent.runtime_dir / f"{agent.name}.sock") as client:
+        snapshot = client.snapshot()
+    routes = [route for topic in snapshot.topics for route in topic.routes if route.state == "open"]
+    fds = [str(entry.readlink()) for entry in Path(f"/proc/{agent.pid}/fd").iterdir() if entry.is_symlink()]
+    return Held(
+        at=at,
+        rss=process.memory_info().rss,
+        fds=len(fds),
+        sockets=sum(name.startswith("socket:") for name in fds),
+        threads=process.num_threads(),
+        tasks=Counter(json.loads(path.read_text(encoding="utf-8"))),
+        routes=len(routes),
+        proxies=len({(route.peer, route.node) for topic in snapshot.topics for route in topic.routes}),
+    )
+
+
+def held_path(agent: Agent) -> Path:
+    """Where an agent writes what it holds."""
+    return agent.home / f"{agent.name}.held"
+
+
+def left(before: Held, after: Held) -> list[str]:
+    """What an agent still holds of what it had to give back; both looks are at an agent alone."""
+    problems = [
+        f"{name}: {was} before, {now} afterwards"
+        for name, was, now in (
+            ("open files", before.fds, after.fds),
+            ("sockets", before.sockets, after.sockets),
+            ("routes", before.routes, after.routes),
+            ("proxies", before.proxies, after.proxies),
+        )
+        if now > was
+    ]
+    more = after.tasks - before.tasks
+    return problems + [f"tasks: {count} more of {name}" for name, count in sorted(more.items())]
+
+
+def floors(samples: Sequence[Held]) -> list[tuple[float, int]]:
+    """The least resident memory of each few samples, and when that began."""
+    spans = [samples[begin : begin + FLOOR_SPAN] for begin in range(0, len(samples), FLOOR_SPAN)]
+    return [(span[0].at, min(held.rss for held in span)) for span in spans if len(span) == FLOOR_SPAN]
+
+
+def slope(points: Sequence[tuple[float, float]]) -> float:
+    """Of the straight line that fits best (least squares); 0 for fewer than two points."""
+    if len(points) < 2:
+        return 0.0
+    mean_x = sum(x for x, _ in points) / len(points)
+    mean_y = sum(y for _, y in points) / len(points)
+    square = sum((x - mean_x) ** 2 for x, _ in points)
+    return sum((x - mean_x) * (y - mean_y) for x, y in points) / square if square else 0.0
+
+
+def growth(samples: Sequence[Held]) -> float | None:
+    """Bytes by which the floor of the resident memory rose in the second half; ``None``: too few samples to tell."""
+    points = floors(samples[len(samples) // 2 :])
+    if len(points) < 3:
+        return None
+    return slope([(at, float(rss)) for at, rss in points]) * (points[-1][0] - points[0][0])
+
+
+def too_much(samples: Sequence[Held]) -> str:
+    """Why the resident memory is not flat, or an empty string."""
+    rose = growth(samples)
+    if rose is None or rose <= min(GROWTH_MAX, samples[-1].rss / 20):
+        return ""
+    shown = ", ".join(f"{rss / MB:.1f}" for _, rss in floors(samples))
+    return f"memory rose by {rose / MB:.1f} MB in the second half: {shown}"
