@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from typing import TYPE_CHECKING
 
@@ -89,6 +90,37 @@ async def outages(world: World) -> None:
 def test_reliable_topics_survive_every_outage_that_is_waited_for(block: int) -> None:
     for seed in range(block * 12, block * 12 + 12):
         play(seed, outages, clocks=bool(seed % 2))
+
+
+async def an_owed_acknowledgement(world: World) -> None:
+    """The next link stands before an acknowledgement of the last one is due; its numbers mean other routes."""
+    a, b = world.sides
+    first, second = world.speak(a, "/sure", "/one"), world.speak(a, "/urgent", "/two")
+    world.link()
+    await world.rest(0.5)
+    listeners = [world.listen(b, "/urgent")]
+    await world.rest(0.5)
+    listeners.append(world.listen(b, "/sure"))
+    await world.rest(0.5)
+    for _ in range(3):
+        second.say(10)
+    world.carry(0, "express", 1 << 20)
+    world.link()
+    for _ in range(20):
+        await asyncio.sleep(0.001)
+        world.carry(1, "express", 1 << 20)
+        if not a.bridge.outbound._legs:  # the answer to what it asked for takes its time
+            world.carry(0, "express", 1 << 20)
+    await world.rest(1.0)
+    for speaker in (first, second):
+        speaker.say(10)
+    await world.rest(1.0)
+    assert (numbers(listeners[0], second), numbers(listeners[1], first)) == ([1, 2, 3, 4], [1])
+
+
+def test_an_acknowledgement_that_is_owed_goes_to_nobody_else() -> None:
+    for seed in range(10):
+        play(seed, an_owed_acknowledgement)
 
 
 # --- everything happens -----------------------------------------------------------------------------------------

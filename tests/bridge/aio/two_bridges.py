@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 import random
 from contextlib import ExitStack, contextmanager
 from types import MappingProxyType, SimpleNamespace
@@ -250,21 +249,25 @@ class World:
     # --- rest -----------------------------------------------------------------------------------------------
 
     async def wait(self, seconds: float) -> None:
-        """Let time go on; a link that nothing came over for as long would be no link."""
+        """Let time go on; a link that nothing came over for as long as a lease would be no link."""
         while seconds > 0:
             await asyncio.sleep(min(seconds, limits.LINK_LEASE / 2))
             seconds -= limits.LINK_LEASE / 2
-            for index in (0, 1):
-                self.carry(index, "express", 1 << 20)
+            if seconds > 0:
+                self._carry_all()
 
     async def rest(self, seconds: float, *, step: float = 0.01) -> None:
         """Let time go on, and everything arrive that can."""
         loop = asyncio.get_running_loop()
         until = loop.time() + seconds
         while loop.time() < until:
-            for index, lane in itertools.product((0, 1), ("express", "bulk")):
-                self.carry(index, lane, 1 << 20)
+            self._carry_all()
             await asyncio.sleep(step)
+
+    def _carry_all(self) -> None:
+        """Every wire in any order, and each of them a little or all that it has."""
+        for index, lane in self.rng.sample([(i, lane) for i in (0, 1) for lane in ("express", "bulk")], 4):
+            self.carry(index, lane, self.rng.choice([100, 1000, 1 << 20]))
 
     def check_nothing_is_left(self) -> None:
         """Nobody listens: nothing is connected, nothing flows, nothing is remembered of it."""

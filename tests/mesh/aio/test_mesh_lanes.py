@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import hashlib
 import socket
 from dataclasses import replace
@@ -115,6 +114,24 @@ async def test_another_instance_gets_no_bulk_lane_beside_a_link_that_is_not_its_
         sock.close()
         express.close()
         await until(lambda: not one.mesh.links(), "closed")
+
+
+async def test_both_sides_promise_the_bulk_lanes_lease() -> None:
+    async with linked_pair() as (one, other):
+        for link in (one.link(other), other.link(one)):
+            leases = [remote.lease for k in (link, bulk_of(link)) if (remote := k._machine.remote) is not None]
+            assert leases == [limits.LINK_LEASE, limits.BULK_LEASE]
+
+
+async def test_whoever_takes_what_comes_takes_it_from_both_lanes() -> None:
+    async with linked_pair() as (one, other):
+        got: list[int] = []
+        link = other.link(one)
+        taken = replace(other.mesh._takers, data=lambda k, r, s, t, p: got.append(s))
+        link.use(taken)
+        one.link(other).bulk.send(7, 1, 0, b"x")
+        one.link(other).express.send(7, 2, 0, b"x")
+        await until(lambda: sorted(got) == [1, 2], "both")
 
 
 async def test_a_bulk_lane_that_cannot_be_reached_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -300,6 +317,30 @@ async def test_cut_in_the_middle_of_large_messages_none_arrives_by_half_and_thos
         assert not other.downs
 
 
+async def test_the_rest_of_a_message_whose_beginning_went_down_with_the_lane_is_not_sent() -> None:
+    async with linked_pair() as (one, other):
+        lane = one.link(other).bulk
+        parcel = lane.open(7, 200_000, 1, 0)
+        lane.extend(parcel, bytes(100_000))
+        await until(lambda: bool(other._begun), "its first half")
+        bulk_of(one.link(other)).sock.shutdown(socket.SHUT_RDWR)
+        await until(lambda: bool(one.lanes_lost and other.lanes_lost), "cut")
+        lane.extend(parcel, bytes(50_000))
+        await until(lambda: one.both_lanes(other) and other.both_lanes(one), "it is back")
+        lane.extend(parcel, bytes(50_000))
+        lane.send(7, 2, 0, b"next")
+        await until(lambda: bool(other.data), "the next one")
+        assert other.data == [(7, 2, 0, b"next")]
+
+
+async def test_a_mesh_ends_while_a_bulk_lane_is_being_dialled() -> None:
+    async with peers(2, found=False) as made:
+        one, other = sorted(made, key=lambda peer: peer.identity.guid)
+        hold_bulk(one, until_set=asyncio.Event())
+        one.mesh.peer_found(other.identity)
+        await until(lambda: one.linked(other) and bool(one.mesh._bulk_dials), "a link, and the dial")
+
+
 async def test_both_lanes_end_with_the_link() -> None:
     async with linked_pair() as (one, other):
         link = one.link(other)
@@ -442,30 +483,29 @@ async def test_a_fence_that_waits_for_the_lanes_connection_is_answered_when_it_i
         assert other.messages(7) == [(2, b"kept")]
 
 
-async def test_a_fence_on_a_bulk_lane_that_was_replaced_is_not_answered() -> None:
-    """Its messages were not taken either: the answer would say that they were."""
+async def test_a_fence_on_a_link_whose_messages_nobody_takes_is_not_answered() -> None:
+    """The answer would say that they were taken."""
     async with peers(1) as (one,):
-        express, _ = await raw(one, HAND_MADE, lease=60.0)
-        first, _ = await raw(one, HAND_MADE, lease=60.0, lane=Lane.BULK)
-        second, _ = await raw(one, HAND_MADE, lease=60.0, lane=Lane.BULK)
-        await until(lambda: len(one.lanes_lost) == 1, "replaced")
+        sock, _ = await raw(one, HAND_MADE, lease=60.0)
+        await until(lambda: bool(one.ups), "a link")
+        one.ups[0].use(None)
+        before = one.ups[0].bytes_in
         loop = asyncio.get_running_loop()
-        old = pack_data_header(3, 7, 1, 0) + b"old" + Frame(Kind.FENCE, route=7, sequence=1).serialize()
-        with contextlib.suppress(ConnectionResetError, BrokenPipeError):
-            await loop.sock_sendall(first, old)
-        new = pack_data_header(3, 7, 2, 0) + b"new" + Frame(Kind.FENCE, route=7, sequence=2).serialize()
-        await loop.sock_sendall(second, new)
+        data = pack_data_header(3, 7, 1, 0) + b"not"
+        await loop.sock_sendall(sock, data + Frame(Kind.FENCE, route=7, sequence=1).serialize())
+        await until(lambda: one.ups[0].bytes_in >= before + 2 * 24 + 3, "read")
+        one.ups[0].use(one.mesh._takers)
+        await loop.sock_sendall(sock, data + Frame(Kind.FENCE, route=7, sequence=2).serialize())
         kept = b""
         answers: list[int] = []
         while not answers:
-            kept += await asyncio.wait_for(loop.sock_recv(express, 4096), DEADLINE)
+            kept += await asyncio.wait_for(loop.sock_recv(sock, 4096), DEADLINE)
             while (parsed := Frame.parse(kept)) is not None:
                 kept = kept[parsed[1] :]
                 answers += [parsed[0].sequence] * (parsed[0].kind is Kind.FENCED)
         assert answers == [2]
-        assert one.data == [(7, 2, 0, b"new")]
-        for sock in (express, first, second):
-            sock.close()
+        assert len(one.data) == 1
+        sock.close()
         await until(lambda: not one.mesh.links(), "closed")
 
 
