@@ -38,8 +38,11 @@ int main(int argc, char** argv) {
       [&](const std_msgs::UInt8MultiArray::ConstPtr& message) {
         const Row row = row_of(message->data);
         if (!folder.empty()) {
-          std::ofstream out(folder + "/" + std::to_string(row.source) + "-" + std::to_string(row.sequence));
+          const std::string path = folder + "/" + std::to_string(row.source) + "-" + std::to_string(row.sequence);
+          std::ofstream out(path + ".part");
           out.write(reinterpret_cast<const char*>(message->data.data()), std::streamsize(message->data.size()));
+          out.close();
+          std::rename((path + ".part").c_str(), path.c_str());
         }
         std::lock_guard<std::mutex> lock(mutex);
         rows.push_back(row);

@@ -42,7 +42,9 @@ def main() -> None:
         noted = row(message.data, time.time_ns())
         if args.save:
             source, sequence = ROW.unpack(noted)[:2]
-            (args.save / f"{source}-{sequence}").write_bytes(message.data)
+            part = args.save / f"{source}-{sequence}.part"
+            part.write_bytes(message.data)
+            part.rename(part.with_suffix(""))
         with lock:
             tally.take(message.data)
             rows.append(noted)
