@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -69,7 +70,7 @@ def look(agent: Agent, at: float) -> Held:
     with ControlClient(agent.runtime_dir / f"{agent.name}.sock") as client:
         snapshot = client.snapshot()
     routes = [route for topic in snapshot.topics for route in topic.routes if route.state == "open"]
-    fds = [str(entry.readlink()) for entry in Path(f"/proc/{agent.pid}/fd").iterdir() if entry.is_symlink()]
+    fds = _open_files(agent.pid)
     return Held(
         at=at,
         rss=process.memory_info().rss,
@@ -80,6 +81,15 @@ def look(agent: Agent, at: float) -> Held:
         routes=len(routes),
         proxies=len({(route.peer, route.node) for topic in snapshot.topics for route in topic.routes}),
     )
+
+
+def _open_files(pid: int) -> list[str]:
+    """What each file descriptor of a process leads to."""
+    found = []
+    for entry in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # closed since
+            found.append(str(entry.readlink()))
+    return found
 
 
 def held_path(agent: Agent) -> Path:
