@@ -179,11 +179,33 @@ class Stream:
             size += len(buffer)
         if sent == size:
             return 0
+        if sent:
+            sent = self._press(parts, sent, size)
+            if sent == size or self._closed:
+                return 0
         self._wait_for_room()
         if not sent and not part:
             return self._queue(b"".join(parts), key)
         self._outbox.push_rest(_behind(parts, sent), key)
         return 0
+
+    def _press(self, parts: Sequence[Buffer], sent: int, size: int) -> int:
+        """Go on with what the socket took in part: it often has room again at once, and to queue is to copy.
+
+        Returns:
+            How many bytes have gone in all.
+        """
+        while sent < size:
+            try:
+                more = self._sock.sendmsg(_rest(parts, sent))
+            except (BlockingIOError, InterruptedError):
+                break
+            except OSError as error:
+                self._lost(error)
+                break
+            sent += more
+            self.bytes_out += more
+        return sent
 
     def _wait_for_room(self) -> None:
         self._writing = True
@@ -295,7 +317,9 @@ class Stream:
             self._lost(error)
             return
         self.bytes_out += sent
-        if sent < size:
+        if 0 < sent < size:
+            sent = self._press([buffer for parts, _, _ in kept for buffer in parts], sent, size)
+        if sent < size and not self._closed:
             self._keep_rest(kept, sent)
 
     def _keep_rest(self, kept: list[tuple[Sequence[Buffer], int, bool]], sent: int) -> None:
@@ -476,11 +500,16 @@ class Stream:
         self._done_draining()
 
 
-def _behind(parts: Sequence[Buffer], sent: int) -> bytes:
-    """What is left of ``parts`` behind the first ``sent`` bytes, copied once."""
+def _rest(parts: Sequence[Buffer], sent: int) -> list[memoryview]:
+    """What is left of ``parts`` behind the first ``sent`` bytes."""
     left: list[memoryview] = []
     for part in parts:
         if sent < len(part):
             left.append(memoryview(part)[sent:])
         sent = max(0, sent - len(part))
-    return b"".join(left)
+    return left
+
+
+def _behind(parts: Sequence[Buffer], sent: int) -> bytes:
+    """The same, copied once."""
+    return b"".join(_rest(parts, sent))
