@@ -9,13 +9,17 @@ import pytest
 
 from rmpa.bridge.actions import Describe, Disconnect, Warn
 from rmpa.bridge.aio.bridge import Bridge
-from rmpa.bridge.messages import Description, Source
+from rmpa.bridge.messages import Advertise, Description, Offer, Source, encode
 from rmpa.bridge.policy import Policy
+from rmpa.core import limits
 from rmpa.core.config import PolicySettings
 from rmpa.core.contract import Contract
+from rmpa.core.errors import LimitExceeded
 
 if TYPE_CHECKING:
     from rmpa.bridge.actions import Action
+    from rmpa.bridge.aio.bridge import Attached
+    from rmpa.mesh.aio.link import MeshLink
     from rmpa.ros.aio.core import RosCore
 
 ABOUT = Description("a/B", "5a9ea5f83505693b71e785041e67a8bb", "", False)
@@ -68,3 +72,19 @@ async def test_an_action_that_fails_does_not_hold_up_the_next_ones(
         bridge._act(list(warnings))
     bridge._act([])
     assert done == warnings
+
+
+def test_the_longest_advertisement_of_ours_is_within_the_limit_of_one() -> None:
+    longest = "/" + "x" * (limits.CROSSING_NAME_MAX - 1)
+    kind = f"a/{'x' * (limits.CROSSING_NAME_MAX - 2)}"
+    offers = tuple(Offer(longest, longest, kind) for _ in range(limits.ADVERTISED_AT_ONCE))
+    assert len(encode(Advertise(added=offers, full=True, more=True))) < limits.ADVERTISEMENT_MAX
+
+
+async def test_a_longer_one_ends_the_link_before_it_is_read(bridge: Bridge) -> None:
+    link = cast("MeshLink", object())
+    bridge._by_link[link] = cast("Attached", object())
+    payload = encode(Advertise()).replace(b"[]", b" " * limits.ADVERTISEMENT_MAX + b"[]", 1)
+    assert payload.startswith(b'{"op":"advertise"')
+    with pytest.raises(LimitExceeded):
+        bridge.control(link, payload)

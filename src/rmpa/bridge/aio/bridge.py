@@ -34,7 +34,7 @@ from rmpa.core import limits
 from rmpa.core.aio.loop import breathe
 from rmpa.core.contract import Priority
 from rmpa.core.counters import Counters, RefusalLog
-from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.names import is_type_name
 from rmpa.mesh.frames import Kind as FrameKind
 from rmpa.ros.aio.slave_server import SlaveNode
@@ -271,6 +271,8 @@ class Bridge:
         if payload[: len(_ADVERTISE)] != _ADVERTISE:
             self._dispatch(attached, decode(payload))
             return
+        if len(payload) > limits.ADVERTISEMENT_MAX:
+            raise LimitExceeded("advertisement", len(payload), limits.ADVERTISEMENT_MAX)
         # It takes long to read, and no data waits for it: this is a reader of data, so not now.
         self._learning.append((attached, bytes(payload)))
         self._learning_bytes += len(payload)
