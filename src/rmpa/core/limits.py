@@ -367,8 +367,8 @@ ROUTES_PER_LINK_MAX: Final = 8192
 """Open routes that one peer may hold with us."""
 ADVERTISED_AT_ONCE: Final = 64
 """Sources in one advertisement of ours; more follow in the next turn of the loop."""
-ADVERTISEMENT_MAX: Final = 256 * KIB
-"""One advertisement, which is read in one piece: as many sources as ours have, with the longest names, are 200 KB."""
+ADVERTISEMENT_MAX: Final = 1 * MIB
+"""One advertisement, which is read in one piece: ours are 200 KB with the longest names, and 5 KB with usual ones."""
 ADVERTISED_WAITING_BYTES: Final = 4 * MIB
 """Advertisements of all peers that wait to be read: some 40,000 topics. Beyond it they are read at once."""
 LEARNT_AT_ONCE: Final = 16
