@@ -52,7 +52,7 @@ class Heard:
 
     @property
     def closed(self) -> bool:
-        return self.ear.stream.closed
+        return bool(self.ear.stream.closed)
 
 
 class Proxied:

@@ -143,8 +143,9 @@ def test_what_is_held_keeps_to_the_depth_and_the_newest_stay(history: History, k
     assert link.numbers == list(range(11 - kept, 11)), "the gap says how many are missing"
 
 
-@pytest.mark.usefixtures("clock")
-def test_what_is_held_keeps_to_the_bytes_but_one_message_always_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_held_keeps_to_the_bytes_but_one_message_always_fits(
+    clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(limits, "LINK_QUEUE_BYTES", 1000)
     link = Link()
     leg = best_effort(link, large=True)
@@ -155,9 +156,11 @@ def test_what_is_held_keeps_to_the_bytes_but_one_message_always_fits(monkeypatch
     assert leg.message(0, bytes(1000)) == 1
     answer(link, leg)
     assert [len(payload) for _, _, payload in link.sent] == [1000]
-    # The count of bytes began anew.
-    leg.lane_lost()
-    assert leg.message(0, bytes(1000)) == 0
+    clock.advance(limits.EXPRESS_AGAIN_AFTER)
+    for _ in range(ROW):
+        leg.message(0, b"")
+    assert link.fences
+    assert leg.message(0, bytes(1000)) == 0, "the count of bytes began anew"
 
 
 @pytest.mark.usefixtures("clock")
