@@ -361,6 +361,22 @@ def test_a_source_that_is_back_within_its_lease_was_never_lost() -> None:
     play(scene)
 
 
+def test_a_source_whose_peer_stays_away_is_lost_when_its_lease_is_over() -> None:
+    async def scene(proxied: Proxied) -> None:
+        await proxied.publish()
+        proxied.describe(Contract(reliability=Reliability.RELIABLE, liveliness_lease=5.0), epoch=5)
+        await asyncio.sleep(10.0)
+        began = proxied.loop.time()
+        proxied.inbound.link_down()
+        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        await asyncio.sleep(20.0)
+        [(lost, occurred)] = proxied.occurred
+        assert occurred.kind is Kind.LIVELINESS_LOST
+        assert 5.0 <= lost - began <= 5.5
+
+    play(scene)
+
+
 def test_one_that_must_say_itself_that_it_lives_is_watched_by_its_messages() -> None:
     async def scene(proxied: Proxied) -> None:
         await proxied.publish()
