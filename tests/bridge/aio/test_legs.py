@@ -611,6 +611,19 @@ def test_over_a_new_link_a_topic_of_large_messages_changes_its_lane_first() -> N
 
 
 @pytest.mark.usefixtures("clock")
+def test_what_was_acknowledged_since_a_peer_said_where_it_is_counts() -> None:
+    """Of two links that come up at once, the word of the one that is given up comes last."""
+    old, new = Link(), Link()
+    leg = reliable(old)
+    for _ in range(3):
+        leg.message(0, SMALL)
+    leg.acknowledged(2)
+    leg.suspend()
+    leg.resume(new, 8, 1)
+    assert new.numbers == [3]
+
+
+@pytest.mark.usefixtures("clock")
 def test_a_peer_cannot_go_on_where_it_never_was() -> None:
     old, new = Link(), Link()
     leg = reliable(old)
