@@ -527,7 +527,10 @@ class Bridge:
                     except RemoteProtocolError as error:
                         # Here, for what waits to be done has other causes. The next link begins a new numbering.
                         self._refuse(attached, error)
-                        self._act(self._exports.closed(action.peer, Close(action.route)))
+                        if attached.away is None:
+                            self._act(self._exports.closed(action.peer, Close(action.route)))
+                        else:
+                            self._act(self._exports.given_up(action.source, action.peer))
             case act.RemoveRoute():
                 self._outbound.remove_route(action)
                 attached = self._by_number.get(action.peer)
