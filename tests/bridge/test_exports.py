@@ -1,14 +1,15 @@
 from __future__ import annotations
 
+import msgspec
 import pytest
 
-from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, Warn
+from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, SuspendRoute, Warn
 from rmpa.bridge.exports import Exports, LocalSource
 from rmpa.bridge.messages import Advertise, Close, Closed, Description, Offer, Open, Opened, Source
 from rmpa.bridge.policy import Decision, Policy
 from rmpa.core import limits
 from rmpa.core.config import PolicySettings
-from rmpa.core.contract import Contract
+from rmpa.core.contract import Contract, Contracts, Durability, Priority, Reliability, Rule
 
 CMD = Source("/cmd", "/joy")
 JOY = LocalSource("sensor_msgs/Joy", "http://127.0.0.1:4000/")
@@ -253,3 +254,145 @@ def test_a_change_costs_what_changed_and_not_what_there_is(exports: Exports) -> 
         Send(1, Advertise(added=(Offer("/t0001", "/m", JOY.type),), removed=(Source("/t0001", "/n"),)))
     ]
     assert asked == ["/t0001"]
+
+
+# --- contracts, and links that come back --------------------------------------------------------------------------
+
+RELIABLE = Contract(reliability=Reliability.RELIABLE)
+SURE = Open(7, "/cmd", "/joy", RELIABLE)
+
+
+def sends(actions: list[Action]) -> list[object]:
+    return [action.message for action in actions if isinstance(action, Send)]
+
+
+@pytest.fixture
+def flowing(exports: Exports) -> Exports:
+    """/cmd flows reliably to peer 1, by epoch 1."""
+    graph(exports, {CMD: JOY})
+    exports.link_up(1)
+    exports.opened(1, SURE)
+    exports.described(CMD, ABOUT)
+    return exports
+
+
+def test_the_stronger_of_both_sides_words_holds_and_both_are_told() -> None:
+    rules = Contracts((Rule(("/cmd",), (), {"depth": 5, "lifespan": 2.0, "durability": Durability.TRANSIENT_LOCAL}),))
+    exports = Exports(Policy(PolicySettings()), rules)
+    graph(exports, {CMD: JOY})
+    exports.link_up(1)
+    asked = Contract(reliability=Reliability.RELIABLE, depth=3, lifespan=1.0, priority=Priority.HIGH)
+    exports.opened(1, Open(7, "/cmd", "/joy", asked))
+    holds = Contract(
+        reliability=Reliability.RELIABLE,
+        durability=Durability.TRANSIENT_LOCAL,
+        depth=5,
+        lifespan=1.0,
+        priority=Priority.HIGH,
+    )
+    about = msgspec.structs.replace(ABOUT, latching=True)  # so that the proxy keeps messages for late subscribers
+    assert exports.described(CMD, ABOUT) == [Send(1, Opened(7, about, holds, 1)), AddRoute(CMD, 1, 7, holds, 1)]
+    assert exports.contract(CMD, 1) == holds
+    assert exports.description(CMD) == ABOUT
+
+
+def test_each_peer_has_the_contract_that_it_asked_for_and_each_reliable_route_a_numbering_of_its_own(
+    exports: Exports,
+) -> None:
+    graph(exports, {CMD: JOY})
+    for peer, contract in ((1, RELIABLE), (2, Contract()), (3, RELIABLE)):
+        exports.link_up(peer)
+        exports.opened(peer, Open(7, "/cmd", "/joy", contract))
+    added = [action for action in exports.described(CMD, ABOUT) if isinstance(action, AddRoute)]
+    assert [(route.peer, route.contract, route.epoch, route.after) for route in added] == [
+        (1, RELIABLE, 1, None),
+        (2, Contract(), 0, None),
+        (3, RELIABLE, 2, None),
+    ]
+
+
+def test_a_reliable_route_outlives_its_link_and_goes_on_where_the_peer_says(flowing: Exports) -> None:
+    assert flowing.link_away(1) == ([SuspendRoute(CMD, 1)], True)
+    assert flowing.waits_for(1)
+    assert flowing.flowing(CMD) == ()
+    flowing.link_up(1)
+    assert flowing.opened(1, Open(2, "/cmd", "/joy", RELIABLE, epoch=1, after=41)) == [
+        Send(1, Opened(2, ABOUT, RELIABLE, 1)),
+        AddRoute(CMD, 1, 2, RELIABLE, 1, 41),
+    ]
+    assert not flowing.waits_for(1)
+    assert flowing.link_away(1) == ([SuspendRoute(CMD, 1)], True)
+    flowing.link_up(1)
+    flowing.opened(1, Open(1, "/cmd", "/joy", RELIABLE, epoch=1, after=50))
+    assert flowing.closed(1, Close(1)) == [RemoveRoute(CMD, 1, 1), Disconnect(CMD)]
+
+
+@pytest.mark.parametrize("asked", [SURE, Open(7, "/cmd", "/joy", RELIABLE, epoch=9, after=3)])
+def test_who_knows_nothing_of_the_old_numbering_gets_a_new_one(flowing: Exports, asked: Open) -> None:
+    flowing.link_away(1)
+    flowing.link_up(1)
+    assert flowing.opened(1, asked) == [
+        Send(1, Opened(7, ABOUT, RELIABLE, 2)),
+        AddRoute(CMD, 1, 7, RELIABLE, 2),
+    ]
+    assert not flowing.waits_for(1)
+
+
+def test_what_is_not_reliable_or_does_not_flow_yet_ends_with_its_link(exports: Exports) -> None:
+    plain, connecting = Source("/plain", "/joy"), Source("/new", "/joy")
+    graph(exports, {plain: JOY, connecting: JOY})
+    exports.link_up(1)
+    exports.opened(1, Open(1, "/plain", "/joy"))
+    exports.described(plain, ABOUT)
+    exports.opened(1, Open(2, "/new", "/joy", RELIABLE))
+    assert exports.link_away(1) == ([RemoveRoute(plain, 1, 1), Disconnect(plain), Disconnect(connecting)], False)
+    assert exports.link_down(1) == []
+
+
+@pytest.mark.parametrize("how", ["link_down", "unclaimed", "given_up"])
+def test_a_suspended_route_that_nobody_asks_for_is_given_up(flowing: Exports, how: str) -> None:
+    flowing.link_away(1)
+    if how == "link_down":
+        assert flowing.link_down(1) == [RemoveRoute(CMD, 1, 0), Disconnect(CMD)]
+    elif how == "unclaimed":
+        flowing.link_up(1)
+        assert flowing.unclaimed(1) == [RemoveRoute(CMD, 1, 0), Disconnect(CMD)]
+    else:
+        assert flowing.given_up(CMD, 1) == [Disconnect(CMD)]
+        assert flowing.given_up(CMD, 1) == []
+    assert not flowing.waits_for(1)
+    assert flowing.link_down(1) == []
+
+
+def test_what_the_peer_asked_for_again_is_not_unclaimed_and_other_peers_stay(flowing: Exports) -> None:
+    flowing.link_up(2)
+    flowing.opened(2, SURE)
+    for peer in (1, 2):
+        flowing.link_away(peer)
+    flowing.link_up(1)
+    flowing.opened(1, Open(1, "/cmd", "/joy", RELIABLE, epoch=1, after=0))
+    assert flowing.unclaimed(1) == []
+    assert flowing.flowing(CMD) == (1,)
+    assert flowing.link_down(2) == [RemoveRoute(CMD, 2, 0)]
+
+
+def test_a_publisher_that_goes_takes_suspended_routes_along(flowing: Exports) -> None:
+    flowing.link_up(2)
+    flowing.opened(2, SURE)
+    flowing.link_away(1)
+    assert flowing.lost(CMD, "it died") == [
+        RemoveRoute(CMD, 1, 0),
+        RemoveRoute(CMD, 2, 7),
+        Send(2, Closed(7, "it died")),
+    ]
+    flowing.link_up(1)
+    assert flowing.opened(1, Open(1, "/cmd", "/joy", RELIABLE, epoch=1, after=3)) == [Connect(CMD, JOY.type, JOY.uri)]
+    [opened] = sends(flowing.described(CMD, ABOUT))
+    assert isinstance(opened, Opened)
+    assert opened.epoch == 3, "never one that was used"
+
+
+def test_a_suspended_route_is_told_of_nothing(flowing: Exports) -> None:
+    flowing.link_away(1)
+    assert graph(flowing, {CMD: JOY, Source("/b", "/joy"): JOY}) == []
+    assert flowing.described(CMD, ABOUT) == []

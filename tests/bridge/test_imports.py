@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import pytest
 
-from rmpa.bridge.actions import Describe, Detach, Publish, Retract, Send, Warn
+from rmpa.bridge.actions import Action, Describe, Detach, Publish, Retract, Send, Warn
 from rmpa.bridge.imports import TRANSITIONS, Imports, RouteState
 from rmpa.bridge.messages import Advertise, Close, Closed, Description, Mismatch, Offer, Open, Opened, Source
 from rmpa.bridge.policy import Policy
 from rmpa.core import limits
 from rmpa.core.config import PolicySettings
-from rmpa.core.contract import Contract
+from rmpa.core.contract import Contract, Contracts, Reliability, Rule
 
 CMD = Source("/cmd", "/joy")
 OFFER = Offer("/cmd", "/joy", "sensor_msgs/Joy")
@@ -264,3 +264,177 @@ def test_a_source_is_known_as_long_as_a_peer_offers_it(imports: Imports) -> None
 def test_every_state_can_be_left() -> None:
     assert set(TRANSITIONS) == set(RouteState)
     assert all(TRANSITIONS.values())
+
+
+# --- contracts, and links that come back --------------------------------------------------------------------------
+
+SURE = Contract(reliability=Reliability.RELIABLE)
+OPENED = Opened(1, ABOUT, SURE, epoch=5, first=1)
+ODOM = Offer("/odom", "/base", "a/B")
+
+
+class Positions:
+    """What the data path says of reliable routes that outlived their links."""
+
+    def __init__(self) -> None:
+        self.known: dict[tuple[int, Source], tuple[int, int]] = {}
+
+    def __call__(self, peer: int, source: Source) -> tuple[int, int] | None:
+        return self.known.get((peer, source))
+
+
+@pytest.fixture
+def positions() -> Positions:
+    return Positions()
+
+
+@pytest.fixture
+def flowing(positions: Positions) -> Imports:
+    """Of peer 1, /cmd flows reliably by route 1 and /odom by best effort by route 2; both are listened to."""
+    rules = Contracts((Rule(("/cmd",), (), {"reliability": Reliability.RELIABLE}),))
+    machine = Imports(Policy(PolicySettings()), lambda: 1.0, rules, positions)
+    machine.link_up(1)
+    machine.advertised(1, Advertise(added=(OFFER, ODOM), full=True))
+    machine.demand(1, CMD, 0.0, wanted=True)
+    machine.demand(1, ODOM.source, 0.0, wanted=True)
+    machine.opened(1, OPENED, 0.0)
+    machine.opened(1, Opened(2, Description("a/B", ABOUT.md5, "", False)), 0.0)
+    return machine
+
+
+def opens(actions: list[Action]) -> list[Open]:
+    return [a.message for a in actions if isinstance(a, Send) and isinstance(a.message, Open)]
+
+
+def test_our_contract_is_asked_for_and_what_holds_is_what_was_answered() -> None:
+    rules = Contracts((Rule(("/cmd",), (), {"depth": 5}),))
+    machine = Imports(Policy(PolicySettings()), lambda: 1.0, rules)
+    machine.link_up(1)
+    machine.advertised(1, Advertise(added=(OFFER,)))
+    assert machine.demand(1, CMD, 0.0, wanted=True) == [Send(1, Open(1, "/cmd", "/joy", Contract(depth=5)))]
+    holds = Contract(depth=7, reliability=Reliability.RELIABLE)
+    assert machine.opened(1, Opened(1, ABOUT, holds, epoch=3, first=12), 0.0) == [
+        Describe(1, CMD, 1, ABOUT, holds, 3, 12)
+    ]
+    entry = machine.get(1, CMD)
+    assert entry is not None
+    assert entry.contract == holds
+
+
+def test_only_what_is_reliable_and_listened_to_waits_for_its_peer(flowing: Imports) -> None:
+    flowing.advertised(1, Advertise(added=(Offer("/idle", "/base", "a/B"),)))
+    assert flowing.link_away(1) == (
+        [
+            Detach(1, CMD, 1, keep=True),
+            Detach(1, ODOM.source, 2),
+            Retract(1, ODOM.source),
+            Retract(1, Source("/idle", "/base")),
+        ],
+        True,
+    )
+    assert state(flowing) is RouteState.WAITING
+    assert flowing.next_timer() is None, "nobody is there to be asked"
+    assert list(flowing.link_down(1)) == [Retract(1, CMD)]
+
+
+def test_where_nothing_waits_the_peer_can_be_forgotten(flowing: Imports) -> None:
+    flowing.demand(1, CMD, 0.0, wanted=False)
+    assert flowing.link_away(1) == (
+        [Detach(1, CMD, 1), Retract(1, CMD), Detach(1, ODOM.source, 2), Retract(1, ODOM.source)],
+        False,
+    )
+
+
+def test_back_it_goes_on_behind_what_came(flowing: Imports, positions: Positions) -> None:
+    flowing.link_away(1)
+    flowing.link_up(1)
+    positions.known[1, CMD] = (5, 41)
+    assert flowing.next_timer() is None, "it may not be offered any more"
+    actions = flowing.advertised(1, Advertise(added=(OFFER, ODOM)), 10.0)
+    assert opens(actions) == [Open(1, "/cmd", "/joy", SURE, epoch=5, after=41)]
+    assert Publish(1, ODOM.source, "a/B") in actions
+    assert Publish(1, CMD, OFFER.type) not in actions, "it never left"
+    assert flowing.opened(1, OPENED, 10.0) == [Describe(1, CMD, 1, ABOUT, SURE, 5, 1)]
+    assert state(flowing) is RouteState.OPEN
+
+
+@pytest.mark.parametrize("moment", ["before_its_offer", "while_asking"])
+def test_a_second_loss_changes_nothing(flowing: Imports, positions: Positions, moment: str) -> None:
+    positions.known[1, CMD] = (5, 41)
+    flowing.link_away(1)
+    flowing.link_up(1)
+    if moment == "while_asking":
+        flowing.advertised(1, Advertise(added=(OFFER,)), 10.0)
+    actions, waits = flowing.link_away(1)
+    assert waits
+    assert actions == ([Detach(1, CMD, 1, keep=True)] if moment == "while_asking" else [])
+    flowing.link_up(1)
+    assert flowing.next_timer() is None
+    actions = flowing.advertised(1, Advertise(added=(OFFER,)), 20.0)
+    assert opens(actions) == [Open(1, "/cmd", "/joy", SURE, epoch=5, after=41)]
+
+
+def test_what_is_offered_no_more_goes_when_the_whole_offer_is_there(flowing: Imports) -> None:
+    flowing.link_away(1)
+    flowing.link_up(1)
+    [portion] = flowing.portions(1, Advertise(added=(ODOM,), full=True, more=True))
+    assert flowing.advertised(1, portion, 10.0) == [Publish(1, ODOM.source, "a/B")]
+    assert state(flowing) is RouteState.WAITING
+    portions = flowing.portions(1, Advertise())
+    actions = [action for portion in portions for action in flowing.advertised(1, portion, 10.0)]
+    assert actions == [Detach(1, CMD, 0), Retract(1, CMD)]
+
+
+def test_who_leaves_while_the_peer_is_away_ends_what_waits(flowing: Imports, positions: Positions) -> None:
+    flowing.link_away(1)
+    assert flowing.demand(1, CMD, 1.0, wanted=False) == [Detach(1, CMD, 0)]
+    assert state(flowing) is RouteState.IDLE
+    flowing.link_up(1)
+    assert flowing.advertised(1, Advertise(added=(OFFER,)), 10.0) == []
+    assert opens(flowing.demand(1, CMD, 11.0, wanted=True)) == [Open(1, "/cmd", "/joy", SURE)]
+
+
+def test_who_comes_while_the_peer_is_away_is_served_when_it_is_back(flowing: Imports) -> None:
+    flowing.link_away(1)
+    flowing.demand(1, CMD, 1.0, wanted=False)
+    assert flowing.demand(1, CMD, 2.0, wanted=True) == []
+    assert state(flowing) is RouteState.WAITING
+    assert flowing.next_timer() is None
+    flowing.link_up(1)
+    assert opens(flowing.advertised(1, Advertise(added=(OFFER,)), 10.0)) == [Open(1, "/cmd", "/joy", SURE)]
+
+
+def test_a_short_silence_leaves_everything_where_it_is(flowing: Imports, positions: Positions) -> None:
+    flowing.advertised(1, Advertise(added=(Offer("/idle", "/base", "a/B"), Offer("/left", "/base", "a/B"))))
+    left = Source("/left", "/base")
+    flowing.demand(1, left, 0.0, wanted=True)
+    flowing.opened(1, Opened(3, Description("a/B", ABOUT.md5, "", False)), 0.0)
+    flowing.demand(1, left, 0.0, wanted=False)
+    assert flowing.link_away(1, briefly=True) == (
+        [Detach(1, CMD, 1, keep=True), Detach(1, ODOM.source, 2, keep=True), Detach(1, left, 3)],
+        True,
+    )
+    assert flowing.next_timer() is None
+    flowing.link_up(1)
+    positions.known[1, CMD] = (5, 41)
+    offers = (OFFER, ODOM, Offer("/idle", "/base", "a/B"), Offer("/left", "/base", "a/B"))
+    actions = flowing.advertised(1, Advertise(added=offers), 10.0)
+    assert opens(actions) == [
+        Open(1, "/cmd", "/joy", SURE, epoch=5, after=41),
+        Open(2, "/odom", "/base"),
+    ]
+    assert len(actions) == 2, "nothing appears and nothing leaves"
+
+
+def test_a_silence_that_lasts_leaves_only_what_waits(flowing: Imports) -> None:
+    flowing.link_away(1, briefly=True)
+    assert flowing.link_away(1) == ([Retract(1, ODOM.source)], True)
+    assert state(flowing) is RouteState.WAITING
+
+
+def test_a_local_topic_of_another_type_ends_what_waits(flowing: Imports) -> None:
+    flowing.link_away(1)
+    actions = flowing.local_type("/cmd", "std_msgs/String")
+    assert actions[:2] == [Detach(1, CMD, 0), Retract(1, CMD)]
+    flowing.link_up(1)
+    assert opens(flowing.advertised(1, Advertise(added=(OFFER,)), 10.0)) == []

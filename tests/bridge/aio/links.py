@@ -100,6 +100,8 @@ class LinkEnd:
         self.clock_offset: float | None = None
         self.clock_error: float | None = None
         self.gone = False
+        self.expects_the_worst = False
+        self.aborted = ""
         self.resumed_at = -math.inf
         self._loop = asyncio.get_running_loop()
         self._heard = self._loop.time()
@@ -135,8 +137,9 @@ class LinkEnd:
         return self.express.close_route(route) + self.bulk.close_route(route)
 
     def abort(self, text: str) -> None:
-        """Nobody breaks a protocol here."""
-        raise AssertionError(text)
+        """The other end has broken the protocol."""
+        assert self.expects_the_worst, text
+        self.aborted = text
 
     def receive(self, frame: Frame) -> None:
         """A frame came from the other end."""

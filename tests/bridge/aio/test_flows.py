@@ -220,6 +220,7 @@ def test_a_publisher_that_dies_in_the_middle_leaves_nothing_whole_behind(latchin
     flow.part(memoryview(bytes(1000)))
     flow.abort()
     assert streams.log[-1] == ("express", "abandon", 7, 1)
+    assert flow._whole is None
     flow.add(3, late, 7, BULKY, 0)
     assert (whole.sent, late.sent, flow.messages) == ([], [], 0)
     give(flow, b"n" * BIG)
@@ -619,11 +620,11 @@ def test_closed_nothing_happens_any_more(clock: Clock) -> None:
     inlet = Inlet(error=0.001, first=2)
     burst(inlet, clock, [9.0])
     inlet.parts(3, bytes(BIG), 50, end=1)
-    burst(inlet, clock, [9.0], first=4)
+    burst(inlet, clock, [9.0, 8.0], first=4)
     inlet.flow.close()
+    assert clock.due == []
     clock.advance(1.0)
     assert inlet.got == []
-    assert clock.due == []
     owes = Inlet(RELIABLE)
     owes.message(1)
     owes.flow.close()

@@ -143,8 +143,9 @@ def test_what_is_held_keeps_to_the_depth_and_the_newest_stay(history: History, k
     assert link.numbers == list(range(11 - kept, 11)), "the gap says how many are missing"
 
 
-@pytest.mark.usefixtures("clock")
-def test_what_is_held_keeps_to_the_bytes_but_one_message_always_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_held_keeps_to_the_bytes_but_one_message_always_fits(
+    clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(limits, "LINK_QUEUE_BYTES", 1000)
     link = Link()
     leg = best_effort(link, large=True)
@@ -155,9 +156,11 @@ def test_what_is_held_keeps_to_the_bytes_but_one_message_always_fits(monkeypatch
     assert leg.message(0, bytes(1000)) == 1
     answer(link, leg)
     assert [len(payload) for _, _, payload in link.sent] == [1000]
-    # The count of bytes began anew.
-    leg.lane_lost()
-    assert leg.message(0, bytes(1000)) == 0
+    clock.advance(limits.EXPRESS_AGAIN_AFTER)
+    for _ in range(ROW):
+        leg.message(0, b"")
+    assert link.fences
+    assert leg.message(0, bytes(1000)) == 0, "the count of bytes began anew"
 
 
 @pytest.mark.usefixtures("clock")
@@ -605,6 +608,19 @@ def test_over_a_new_link_a_topic_of_large_messages_changes_its_lane_first() -> N
     assert not new.sent
     answer(new, leg)
     assert new.sent == [("bulk", 1, LARGE)]
+
+
+@pytest.mark.usefixtures("clock")
+def test_what_was_acknowledged_since_a_peer_said_where_it_is_counts() -> None:
+    """Of two links that come up at once, the word of the one that is given up comes last."""
+    old, new = Link(), Link()
+    leg = reliable(old)
+    for _ in range(3):
+        leg.message(0, SMALL)
+    leg.acknowledged(2)
+    leg.suspend()
+    leg.resume(new, 8, 1)
+    assert new.numbers == [3]
 
 
 @pytest.mark.usefixtures("clock")

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.bridge.messages import Open, encode
 from rmpa.core import limits
-from rmpa.core.contract import Durability, Priority, Reliability, Rule
+from rmpa.core.contract import Contract, Durability, Priority, Reliability, Rule
+from rmpa.mesh.frames import Frame, Kind
 from tests.bridge.aio.two_bridges import World, made_up
 from tests.bridge.aio.virtual import VirtualLoop, run
 
@@ -121,6 +123,36 @@ async def an_owed_acknowledgement(world: World) -> None:
 def test_an_acknowledgement_that_is_owed_goes_to_nobody_else() -> None:
     for seed in range(10):
         play(seed, an_owed_acknowledgement)
+
+
+async def a_lie(world: World) -> None:
+    """A peer says that it has messages that were never sent."""
+    a, b = world.sides
+    speaker = world.speak(a, "/sure", "/one")
+    listener = world.listen(b, "/sure")
+    world.link()
+    await world.rest(0.5)
+    speaker.say(10)
+    await world.rest(0.5)
+    world.link()
+    end = a.link
+    assert end is not None
+    end.expects_the_worst = True
+    lie = Open(1, "/sure", "/one", Contract(reliability=Reliability.RELIABLE), epoch=1, after=99)
+    end.receive(Frame(Kind.CONTROL, encode(lie)))
+    assert "resumes message 99" in end.aborted
+    world.link()
+    await world.rest(0.5)
+    speaker.say(10)
+    await world.rest(0.5)
+    assert numbers(listener, speaker) == [1, 2]
+    world.leave(listener)
+    await world.rest(2 * limits.RESUME_CLAIM)
+    world.check_nothing_is_left()
+
+
+def test_a_peer_that_goes_on_where_it_never_was_loses_its_link_and_nothing_else() -> None:
+    play(0, a_lie)
 
 
 # --- everything happens -----------------------------------------------------------------------------------------

@@ -415,15 +415,19 @@ class Bridge:
             try:
                 message = decode(lesson)
             except RemoteProtocolError as error:
-                text = f"{attached.link.name} broke the protocol: {error}"
-                self._warn("link.malformed", attached.link.remote_endpoint[0], text)
-                attached.link.abort(text)
+                self._refuse(attached, error)
                 return
             if isinstance(message, Advertise):
                 self._learning.appendleft((attached, self._portions(attached, message)))
         elif (portion := next(lesson, None)) is not None:
             self._learning.appendleft((attached, lesson))
             self._act(self._imports.advertised(attached.peer, portion, self._loop.time()))
+
+    def _refuse(self, attached: Attached, error: RemoteProtocolError) -> None:
+        """A peer said what cannot be: close its link."""
+        text = f"{attached.link.name} broke the protocol: {error}"
+        self._warn("link.malformed", attached.link.remote_endpoint[0], text)
+        attached.link.abort(text)
 
     def _portions(self, attached: Attached, message: Advertise) -> Iterator[Advertise]:
         if message.added or message.removed:
@@ -520,7 +524,15 @@ class Bridge:
             case act.AddRoute():
                 attached = self._by_number.get(action.peer)
                 if attached is not None:
-                    self._outbound.add_route(action, attached.link)
+                    try:
+                        self._outbound.add_route(action, attached.link)
+                    except RemoteProtocolError as error:
+                        # Here, for what waits to be done has other causes. The next link begins a new numbering.
+                        self._refuse(attached, error)
+                        if attached.away is None:
+                            self._act(self._exports.closed(action.peer, Close(action.route)))
+                        else:
+                            self._act(self._exports.given_up(action.source, action.peer))
             case act.RemoveRoute():
                 self._outbound.remove_route(action)
                 attached = self._by_number.get(action.peer)

@@ -371,10 +371,7 @@ class ImportFlow:
 
     def _follows(self, sequence: int) -> bool:
         """The long way of a sequence: count what is missing; whether the message is not one from before."""
-        expected = self._expected
-        if expected == _NONE:
-            expected = self._next if self._sequence is None else self._sequence
-        gap = sequence - expected & _SEQUENCE_MASK
+        gap = sequence - (self._next if self._expected == _NONE else self._expected) & _SEQUENCE_MASK
         if gap >= _HALF:
             self.late += 1
             return False

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rmpa.core.outbox import Parcel
 
 _SEQUENCE_MASK: Final = (1 << 32) - 1
+_HALF: Final = 1 << 31
 
 
 class DataLane(Protocol):
@@ -318,10 +319,13 @@ class ReliableLeg(Leg):
     def resume(self, link: DataLink, route: int, after: int) -> None:
         """There is a new link, and the peer has everything up to ``after``.
 
+        An acknowledgement may know better: of two links that came up at once, the older one's word came last.
+
         Raises:
             RemoteProtocolError: It cannot have.
         """
-        self.sender.resume(after)
+        known = self.sender.confirmed
+        self.sender.resume(known if after - known & _SEQUENCE_MASK >= _HALF else after)
         self._keep = None
         self.link, self.route = link, route
         self._switch.restart()
