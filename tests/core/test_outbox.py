@@ -439,3 +439,14 @@ class AgainstModel(RuleBasedStateMachine):
 
 TestAgainstModel = AgainstModel.TestCase
 TestAgainstModel.settings = settings(max_examples=150, stateful_step_count=40, deadline=None)
+
+
+def test_a_spared_key_loses_nothing_to_the_bound_of_all_keys() -> None:
+    box = Outbox(10, 20)
+    box.set_terms(1, 1000, spared=True)
+    for _ in range(10):
+        box.push(bytes(10), 1)
+    assert box.push(bytes(15), 2) == 0
+    assert box.push(bytes(15), 2) == 1
+    assert box.dropped == {2: 1}
+    assert len(drain(box)) == 115

@@ -81,6 +81,7 @@ class _Terms:
     entries: int
     max_age: float | None = None
     strict: bool = False
+    spared: bool = False
 
 
 @dataclass(slots=True)
@@ -142,7 +143,9 @@ class Outbox:
         self._terms.entries = max_entries
         self._max_bytes = max_bytes
 
-    def set_terms(self, key: int, max_entries: int, max_age: float | None = None, *, strict: bool = False) -> None:
+    def set_terms(
+        self, key: int, max_entries: int, max_age: float | None = None, *, strict: bool = False, spared: bool = False
+    ) -> None:
         """Give one key bounds of its own.
 
         Args:
@@ -151,8 +154,9 @@ class Outbox:
             max_age: Seconds that one may wait; ``None``: for ever.
             strict: Drop one that is too old even if none of its key is behind it (a lifespan); else the newest
                 always leaves.
+            spared: Drop none of it for the bytes of all keys together: its owner bounds it.
         """
-        terms = self._special[key] = _Terms(max_entries, max_age, strict)
+        terms = self._special[key] = _Terms(max_entries, max_age, strict, spared)
         if key in self._flows:
             self._flows[key].terms = terms
 
@@ -486,8 +490,15 @@ class Outbox:
         Half of what the key holds may go at once, so that room for one large entry is not searched for by
         looking at all keys before each of a thousand small drops.
         """
-        spared = 0 if newest.sent else newest.held
-        largest, key = max((f.size - spared * (f.parcels[-1] is newest), k) for k, f in self._flows.items())
+        own = 0 if newest.sent else newest.held
+        sizes = [
+            (flow.size - own * (flow.parcels[-1] is newest), key)
+            for key, flow in self._flows.items()
+            if not flow.terms.spared
+        ]
+        if not sizes:
+            return 0
+        largest, key = max(sizes)
         flow = self._flows[key]
         target = flow.size - largest // 2
         dropped = 0

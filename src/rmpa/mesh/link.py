@@ -37,6 +37,8 @@ _log = logging.getLogger(__name__)
 _HEADER: Final = limits.FRAME_HEADER_BYTES
 _DATA: Final = int(Kind.DATA)
 _WHOLE: Final = frames.WHOLE
+_FIRST_PART: Final = 4
+"""Bytes of a message without which its first part says nothing: its length."""
 
 
 class Role(Enum):
@@ -281,7 +283,7 @@ class Link:
                 start = offset + _HEADER
                 end = start + length
                 if end > size:
-                    if kind != _DATA or length <= limits.CUT_THROUGH_BYTES or start == size:
+                    if kind != _DATA or length <= limits.CUT_THROUGH_BYTES or size - start < _FIRST_PART:
                         return offset, end - offset
                     # Handed on as it comes: nobody waits for the end of a large frame, and none is moved about.
                     self._left = end - size

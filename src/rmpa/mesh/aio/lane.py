@@ -108,8 +108,12 @@ class LaneSender:
             self.outbox.push(frame, route, self._loop.time(), pinned=True)
 
     def set_terms(self, route: int, depth: int, max_age: float | None, *, strict: bool) -> None:
-        """Bound what may wait of one route; see ``core.outbox``."""
-        self.outbox.set_terms(route, depth, max_age, strict=strict)
+        """Bound what may wait of one route; see ``core.outbox``.
+
+        A route whose messages never grow too old is a reliable one: its sender's window bounds it, and nothing of it
+        is dropped for the bytes of all routes.
+        """
+        self.outbox.set_terms(route, depth, max_age, strict=strict, spared=max_age is None)
 
     def discard(self, route: int) -> None:
         """Let go of what waits of a route, and of its terms; it goes on."""
