@@ -1,0 +1,39 @@
+"""Messages over simulated meshes: whole and in order whatever breaks, and all of them once it is whole again.
+
+The legs, lanes, links and flows are the agent's own; ``RMPA_SIMULATION_SEEDS=20`` runs twenty times as many;
+``python -m tests.simulation --kind lanes --seed N --peers M`` one.
+"""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from tests.simulation.lanes_scenario import LanesScenario
+
+FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
+BLOCK = 25
+BLOCKS = [(count, block) for count, blocks in ((2, 12), (3, 2)) for block in range(blocks * FACTOR)]
+
+
+@pytest.mark.parametrize(("count", "block"), BLOCKS)
+def test_what_arrives_is_whole_and_in_order_and_after_healing_it_is_all(count: int, block: int) -> None:
+    breaks = 0
+    for seed in range(block * BLOCK, (block + 1) * BLOCK):
+        scenario = LanesScenario(seed, count)
+        scenario.play()
+        breaks += scenario.breaks
+    assert breaks <= BLOCK // 10, "links seldom cross so that a peer has to begin anew"
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_where_nothing_breaks_every_message_arrives(count: int) -> None:
+    for seed in range(60 // count):
+        LanesScenario(seed, count, calm=True).play()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_seed_gives_one_run(seed: int) -> None:
+    first, second = (LanesScenario(seed, 3).play() for _ in range(2))
+    assert first == second
