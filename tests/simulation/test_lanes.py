@@ -10,7 +10,9 @@ import os
 
 import pytest
 
+from rmpa.core.contract import Priority, Reliability
 from tests.simulation.lanes_scenario import LanesScenario
+from tests.simulation.point_scenario import TROUBLES, Course, PointScenario
 
 FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
 BLOCK = 25
@@ -31,6 +33,31 @@ def test_what_arrives_is_whole_and_in_order_and_after_healing_it_is_all(count: i
 def test_where_nothing_breaks_every_message_arrives(count: int) -> None:
     for seed in range(60 // count):
         LanesScenario(seed, count, calm=True).play()
+
+
+COURSES = [
+    Course(reliability, priority, in_parts)
+    for in_parts in (True, False)
+    for reliability in Reliability
+    for priority in (Priority.LOW, Priority.HIGH)
+]
+LENGTH = 5 * 24 + 312
+"""Bytes on the wire of the message in fragments."""
+
+
+@pytest.mark.parametrize("course", COURSES)
+def test_undisturbed_it_arrives_in_as_many_bytes(course: Course) -> None:
+    scenario = PointScenario(course, "", 1 << 30)
+    scenario.run()
+    assert scenario.carried >= LENGTH
+
+
+@pytest.mark.parametrize("trouble", TROUBLES)
+def test_trouble_at_every_byte_of_a_message_leaves_no_half_one_and_the_next_comes(trouble: str) -> None:
+    """Each byte meets one of the courses; with more seeds, more of them."""
+    for point in range(TROUBLES.index(trouble), LENGTH, len(TROUBLES)):
+        for turn in range(min(FACTOR, len(COURSES))):
+            PointScenario(COURSES[(point // len(TROUBLES) + turn) % len(COURSES)], trouble, point).run()
 
 
 @pytest.mark.parametrize("seed", range(3))

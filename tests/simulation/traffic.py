@@ -141,29 +141,41 @@ class Courier(MeshPeer):
         """One more message; a large one comes from its publisher in parts, perhaps, and perhaps not to its end."""
         if self._streaming:
             return  # its publisher's connection carries one at a time
-        self._next += 1
-        message = framed(self._next, size)
-        if size < _CUT_THROUGH or self._rng.random() < 0.3:
-            self.published.append(self._next)
-            self.exports.message(memoryview(message))
+        if size >= _CUT_THROUGH and self._rng.random() < 0.7:
+            self.publish_in_parts(size)
             return
-        self._streaming = True
-        self.exports.begin(len(message))
-        self._stream(message, 0, self._next)
+        self._next += 1
+        self.published.append(self._next)
+        self.exports.message(memoryview(framed(self._next, size)))
 
-    def _stream(self, message: bytes, at: int, number: int) -> None:
-        if not self.stopped and self._rng.random() < 0.05:
+    def publish_in_parts(self, size: int, part: int | None = None) -> None:
+        """One that comes in parts, of so many bytes each."""
+        self._next += 1
+        self._streaming = True
+        message = framed(self._next, size)
+        self.exports.begin(len(message))
+        self._stream(message, 0, self._next, part)
+
+    def abort(self) -> None:
+        """The publisher dies; in the middle of a message, perhaps."""
+        if self._streaming:
             self._streaming = False
             self.aborted += 1
-            self.exports.abort()  # the publisher died
+            self.exports.abort()
+
+    def _stream(self, message: bytes, at: int, number: int, part: int | None) -> None:
+        if not self._streaming or self._next != number:
             return
-        size = self._rng.choice([100_000, 300_000] if self.stopped else [1000, 30_000, 130_000, 300_000])
+        if not self.stopped and self._rng.random() < 0.05:
+            self.abort()
+            return
+        size = part or self._rng.choice([100_000, 300_000] if self.stopped else [1000, 30_000, 130_000, 300_000])
         if at + size >= len(message):
             self._streaming = False
             self.published.append(number)
         self.exports.part(memoryview(message)[at : at + size])
         if self._streaming:
-            self.process.call_later(self._rng.uniform(0, 0.02), self._stream, message, at + size, number)
+            self.process.call_later(self._rng.uniform(0, 0.02), self._stream, message, at + size, number, part)
 
     # --- links ----------------------------------------------------------------------------------------------
 
