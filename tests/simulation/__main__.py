@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
+from tests.simulation.lanes_scenario import LanesScenario
 from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.reliable_scenario import ReliableScenario
 from tests.simulation.scenario import Scenario
@@ -15,13 +16,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.simulation", description=__doc__)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--peers", type=int, default=2, help="not with --kind reliable, where there are always two")
-    parser.add_argument("--kind", choices=["rosters", "mesh", "reliable"], default="rosters")
+    parser.add_argument("--kind", choices=["rosters", "mesh", "lanes", "reliable"], default="rosters")
     arguments = parser.parse_args()
     scenario: Scenario | ReliableScenario
     if arguments.kind == "reliable":
         scenario = ReliableScenario(arguments.seed, keep=True)
     else:
-        make = MeshScenario if arguments.kind == "mesh" else Scenario
+        make = {"rosters": Scenario, "mesh": MeshScenario, "lanes": LanesScenario}[arguments.kind]
         scenario = make(arguments.seed, arguments.peers, keep=True)
     problem = ""
     try:

@@ -1,286 +1,170 @@
-"""One simulated agent with a roster and a mesh: the same machines as the real one, other sockets."""
+"""One simulated agent with a roster and the real mesh: its own code down to the sockets, which are simulated."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import asyncio
+from typing import TYPE_CHECKING, cast
 
-from rmpa.core import limits
-from rmpa.core.errors import RemoteProtocolError
-from rmpa.discovery.events import Event as RosterEvent
 from rmpa.discovery.events import PeerChanged, PeerFound, PeerLost, PeerRestarted
-from rmpa.mesh.link import Closed, HelloReceived, Link, Refused, Role, State, Up
-from rmpa.mesh.link import Event as LinkEvent
-from rmpa.mesh.peering import CloseLink, Dial, LinkDown, LinkRefused, LinkUp, Peering
+from rmpa.mesh.aio.link import Takers
+from rmpa.mesh.aio.mesh import Mesh
+from tests.simulation.process import Process
 from tests.simulation.roster_peer import RosterPeer
+from tests.simulation.sockets import SimListener, SimSocket, connect
 
 if TYPE_CHECKING:
     import random
+    import socket
+    from collections.abc import Callable
 
-    from rmpa.core.guid import Guid
-    from rmpa.mesh.handshake import Refuse
-    from tests.simulation.network import Address, End, World
+    from rmpa.discovery.events import Event as RosterEvent
+    from rmpa.mesh.aio.link import MeshLink
+    from rmpa.mesh.frames import Kind
+    from rmpa.mesh.handshake import Lane
+    from tests.simulation.network import Address, World
 
 
-class SimLink:
-    """Drives one link machine over one end of a simulated stream."""
+class SimClock:
+    """The world's time as the mesh asks for it."""
 
-    def __init__(
-        self, peer: MeshPeer, number: int, end: End, role: Role, expected: Guid | None, endpoint: Address | None
-    ) -> None:
-        self.peer = peer
-        self.number = number
-        self.end = end
-        self.expected = expected
-        self.endpoint = endpoint
-        self.was_up = False
-        self.answered = False
-        self._world: World = peer.world
-        self._buffer = b""
-        self._armed: float | None = None
-        self._draining = False
-        self.machine = Link(
-            role,
-            peer.identity,
-            self._world.now,
-            wall_ns=lambda: round(self._world.now * 1e9),
-            on_event=self._event,
-            on_data=lambda *_: None,
-            expected=expected,
-            lease=peer.link_lease,
-        )
-        end.on_bytes = self._bytes
-        end.on_close = lambda reset: self._lost("reset" if reset else "closed")
-        end.begin()
-        self.after()
+    def __init__(self, world: World) -> None:
+        self._world = world
 
-    @property
-    def up(self) -> bool:
-        """Whether it is used."""
-        return self.machine.state is State.UP
+    def now(self) -> float:
+        """Monotonic seconds."""
+        return self._world.now
 
-    def after(self) -> None:
-        """Send what the machine has to say; set its timer."""
-        if self.machine.has_output:
-            self.end.send(self.machine.take_output())
-        if self.machine.state is State.CLOSING and not self._draining:
-            self._draining = True
-            self._world.after(0.0005, self._drained)
-        due = self.machine.next_timer()
-        if due is not None and (self._armed is None or due < self._armed):
-            self._armed = due
-            self._world.at(due, lambda: self._due(due))
+    def wall_ns(self) -> int:
+        """The wall clock."""
+        return round(self._world.now * 1e9)
 
-    def _drained(self) -> None:
-        if self.peer.owns(self):
-            self.machine.drained()
-            self.peer.settle()
 
-    def _due(self, when: float) -> None:
-        if self._armed == when:
-            self._armed = None
-        if self.peer.owns(self):
-            self.machine.handle_timer(self._world.now)
-            self.after()
-            self.peer.settle()
+class SimMesh(Mesh):
+    """The mesh, but for how it connects."""
 
-    def _bytes(self, data: bytes) -> None:
-        if not self.peer.owns(self):
-            return
-        self._buffer += data
-        try:
-            taken, _ = self.machine.receive(memoryview(self._buffer), self._world.now)
-        except RemoteProtocolError as error:
-            self.peer.note(f"! link {self.number}: {error}")
-        else:
-            self._buffer = self._buffer[taken:]
-        self.after()
-        self.peer.settle()
+    peer: MeshPeer
 
-    def _lost(self, reason: str) -> None:
-        if self.peer.owns(self):
-            self.machine.lost(reason)
-            self.peer.settle()
-
-    def _event(self, event: LinkEvent) -> None:
-        peer, now = self.peer, self._world.now
-        if isinstance(event, HelloReceived):
-            verdict = peer.peering.judge(event.hello)
-            if verdict is None:
-                self.machine.accept(now)
-            else:
-                self.machine.refuse(verdict, now)
-        elif isinstance(event, Up):
-            self.was_up = self.answered = True
-            dialled = self.machine.role is Role.DIALLER
-            peer.peering.link_up(self.number, event.hello.identity, now, dialled=dialled, endpoint=self.endpoint)
-        elif isinstance(event, Refused):
-            self._refused(event.refuse)
-        elif isinstance(event, Closed):
-            self._world.after(0.0, lambda: peer.ended(self, event.reason))
-
-    def _refused(self, refuse: Refuse) -> None:
-        self.peer.note(f"! link {self.number}: {refuse.label}")
-        if self.expected is not None and not self.answered:
-            self.answered = True
-            self.peer.peering.dial_refused(self.expected, refuse, self._world.now)
+    async def _connect(self, endpoint: Address, lane: Lane, within: float = 2.0) -> socket.socket:
+        """Connect through the simulated network."""
+        made = await asyncio.wait_for(self.peer.connect(endpoint), within)
+        made.lane = lane
+        return cast("socket.socket", made)
 
 
 class MeshPeer(RosterPeer):
-    """A roster, and links to all in it."""
-
-    link_lease = limits.LINK_LEASE
+    """A roster, and links with two lanes to all in it."""
 
     def prepare(self, rng: random.Random) -> None:
-        """A mesh for the new run."""
-        self.links: dict[int, SimLink] = {}
-        self._numbers = 0
-        self._mesh_armed: float | None = None
-        self._settling = False
-        self.peering = Peering(self.identity, rng=rng.random, alive=self._alive)
-        self.network.listeners[self.address] = self._accept
+        """A process of its own for the new run, and a mesh in it."""
+        self.process = Process(self.world, f"{self.name}#{self.run}")  # type: ignore[abstract]
+        self.processes = [*getattr(self, "processes", []), self.process]
+        self.process.run(self._build, rng)
+
+    def _build(self, rng: random.Random) -> None:
+        run = self.run
+
+        def ours(action: Callable[..., None]) -> Callable[..., None]:
+            """What a run that is over still says has nothing to do with the next one."""
+            return lambda *values: action(*values) if self.alive and self.run == run else None
+
+        self.mesh = SimMesh(
+            self.identity,
+            cast("socket.socket", SimListener(self.network, self.address, self.process)),
+            on_link_up=ours(self.link_up),
+            on_link_down=ours(self.link_down),
+            on_control=ours(self.control),
+            takers=Takers(
+                ours(self.data), ours(self.part), ours(self.mark), ours(self.clock_known), ours(self.lane_lost)
+            ),
+            clock=SimClock(self.world),
+            rng=rng.random,
+        )
+        self.mesh.peer = self
+        self.process.create_task(self.mesh.start())
+
+    async def connect(self, endpoint: Address) -> SimSocket:
+        """A connection, or the error of a port where nobody listens; nothing at all where no answer comes."""
+        self.note(f"> dials {endpoint[0]}")
+        process = self.process
+        done: asyncio.Future[SimSocket] = process.create_future()
+
+        def connected(sock: SimSocket | None) -> None:
+            if sock is None and not done.done():
+                done.set_exception(ConnectionRefusedError())
+            elif sock is not None and done.done():
+                sock.close()
+            elif sock is not None:
+                done.set_result(sock)
+
+        def arrived(sock: SimSocket | None) -> None:
+            if process.dead and sock is not None:
+                sock.kill()
+            process.run(connected, sock)
+
+        connect(self.network, process, self.host, endpoint, arrived)
+        return await done
 
     def kill(self) -> None:
-        """Gone without a word; the kernel resets its streams."""
-        self._stop_listening()
+        """Gone without a word; the kernel resets its connections."""
         super().kill()
+        self.network.tcp.pop(self.address, None)
+        self.process.kill()
         self.network.kill(self.host)
-        self.links = {}
 
     def end(self) -> None:
-        """Says bye on each link, then goodbye."""
-        self._stop_listening()
-        for link in list(self.links.values()):
-            link.machine.close("the agent ends", self.world.now)
-            link.after()
-            link.end.close()
+        """Says bye on each link, then goodbye; the last bytes have a second to leave."""
         super().end()
-        self.links = {}
+        self.process.run(lambda: self.process.create_task(self._leave(self.mesh, self.process)))
+
+    async def _leave(self, mesh: SimMesh, process: Process) -> None:
+        await mesh.close()
+        process.kill()
 
     def note(self, text: str) -> None:
         """Into the trace."""
         self.world.note(self.name, text)
 
-    def owns(self, link: SimLink) -> bool:
-        """Whether this link is of the present run and not over."""
-        return self.links.get(link.number) is link
+    # --- what the mesh says ---------------------------------------------------------------------------------
 
-    def up_links(self) -> list[SimLink]:
-        """Links that are up, in the order of their peers' GUIDs."""
-        links = [link for link in self.links.values() if link.up and link.machine.remote is not None]
-        return sorted(links, key=lambda link: link.machine.remote.guid if link.machine.remote else self.identity.guid)
+    def link_up(self, link: MeshLink) -> None:
+        """A peer is linked."""
+        self.note(f"= link {link.id} up {link.identity}")
+        self.roster.link_up(link.identity, self.world.now)
+        self.flush()
+
+    def link_down(self, link: MeshLink, reason: str) -> None:
+        """It is no more."""
+        self.note(f"= link {link.id} down {link.identity}: {reason}")
+        self.roster.link_down(link.guid, self.world.now, link.identity.instance)
+        self.flush()
+
+    def control(self, link: MeshLink, payload: bytes) -> None:
+        """A control frame; nothing here."""
+
+    def data(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
+        """A message; nothing here."""
+
+    def part(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
+        """A part of one; nothing here."""
+
+    def mark(self, link: MeshLink, kind: Kind, route: int, sequence: int) -> None:
+        """An acknowledgement or the answer to a fence; nothing here."""
+
+    def clock_known(self, link: MeshLink) -> None:
+        """The peer's clock is known better; nothing here."""
+
+    def lane_lost(self, link: MeshLink) -> None:
+        """The bulk lane fell; nothing here."""
+
+    # --- what discovery says --------------------------------------------------------------------------------
 
     def on_event(self, event: RosterEvent) -> None:
         """What discovery tells the mesh."""
         super().on_event(event)
-        now = self.world.now
         if isinstance(event, PeerFound | PeerRestarted):
-            self.peering.peer_found(event.identity, now, event.source[0] if event.source else None)
+            source = event.source[0] if event.source else None
+            self.process.run(self.mesh.peer_found, event.identity, source)
         elif isinstance(event, PeerChanged):
-            self.peering.peer_found(event.identity, now)
+            self.process.run(self.mesh.peer_found, event.identity)
         elif isinstance(event, PeerLost):
-            self.peering.peer_gone(event.guid, now)
-
-    def flush(self) -> None:
-        """The roster's wishes, then the mesh's."""
-        super().flush()
-        self.settle()
-
-    def settle(self) -> None:
-        """Carry out what the mesh decided, until nothing is left; set its timer."""
-        if self._settling or not self.alive:
-            return
-        self._settling = True
-        try:
-            while outputs := self.peering.take():
-                for output in outputs:
-                    self._act(output)
-                super().flush()
-        finally:
-            self._settling = False
-        due = self.peering.next_timer()
-        if due is not None and (self._mesh_armed is None or due < self._mesh_armed):
-            self._mesh_armed = due
-            run = self.run
-            self.world.at(due, lambda: self._mesh_due(due, run))
-
-    def ended(self, link: SimLink, reason: str) -> None:
-        """A link's machine is over."""
-        if not self.owns(link):
-            return
-        del self.links[link.number]
-        link.end.close()
-        if link.was_up:
-            self.peering.link_down(link.number, reason, self.world.now)
-        elif link.expected is not None and not link.answered:
-            self.peering.dial_failed(link.expected, reason, self.world.now)
-        self.settle()
-
-    def _act(self, output: Dial | CloseLink | LinkUp | LinkDown | LinkRefused) -> None:
-        now = self.world.now
-        if isinstance(output, Dial):
-            self.note(f"> dials {output.guid}")
-            self._dial(output.guid, output.endpoint)
-        elif isinstance(output, CloseLink):
-            link = self.links.get(output.link_id)
-            if link is not None:
-                link.machine.close(output.reason, now)
-                link.after()
-        elif isinstance(output, LinkUp):
-            self.note(f"= link {output.link_id} up {output.identity}")
-            self.roster.link_up(output.identity, now)
-        elif isinstance(output, LinkDown):
-            self.note(f"= link {output.link_id} down {output.identity}: {output.reason}")
-            self.roster.link_down(output.identity.guid, now, output.identity.instance)
-        else:
-            self.note(f"! refused by {output.identity}: {output.refuse.label}")
-
-    def _dial(self, guid: Guid, endpoint: Address) -> None:
-        run, done = self.run, False
-
-        def connected(end: End | None) -> None:
-            nonlocal done
-            if done or not self.alive or run != self.run:
-                if end is not None:
-                    end.close(reset=True)
-                return
-            done = True
-            if end is None:
-                self.peering.dial_failed(guid, "refused", self.world.now)
-            else:
-                self._link(end, Role.DIALLER, guid, endpoint)
-            self.settle()
-
-        def too_late() -> None:
-            nonlocal done
-            if not done and self.alive and run == self.run:
-                done = True
-                self.peering.dial_failed(guid, "timed out", self.world.now)
-                self.settle()
-
-        self.network.dial(self.host, endpoint, connected)
-        self.world.after(limits.DIAL_TIMEOUT, too_late)
-
-    def _accept(self, end: End) -> None:
-        self._link(end, Role.ACCEPTOR, None, None)
-        self.settle()
-
-    def _link(self, end: End, role: Role, expected: Guid | None, endpoint: Address | None) -> None:
-        self._numbers += 1
-        link = SimLink(self, self._numbers, end, role, expected, endpoint)
-        self.links[self._numbers] = link
-        link.after()
-
-    def _alive(self, number: int) -> bool:
-        link = self.links.get(number)
-        return link is not None and self.world.now - link.machine.heard_at <= limits.GHOST_QUIET
-
-    def _mesh_due(self, when: float, run: int) -> None:
-        if not self.alive or run != self.run:
-            return
-        if self._mesh_armed == when:
-            self._mesh_armed = None
-        self.peering.handle_timer(self.world.now)
-        self.settle()
-
-    def _stop_listening(self) -> None:
-        self.network.listeners.pop(self.address, None)
+            self.process.run(self.mesh.peer_gone, event.guid)

@@ -1,13 +1,30 @@
-"""The scenario with links: after healing every pair has one, and both ends mean the same one."""
+"""The scenario with links: after healing every pair has one, with both lanes, and both ends mean the same one."""
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+from unittest import mock
+
+from rmpa.core import limits
+from rmpa.mesh.handshake import Lane
 from tests.simulation.mesh_peer import MeshPeer
-from tests.simulation.scenario import Scenario
+from tests.simulation.scenario import Outcome, Scenario
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rmpa.mesh.aio.link import MeshLink
+    from tests.simulation.sockets import SimSocket
 
 _MANY = 10
-_SLOW_LEASE = 5.0
-"""Seconds; with many peers the keepalives of a second's lease would be most of the work."""
+_SLOWER = 5
+"""With many peers the keepalives of a second's lease would be most of the work."""
+
+
+def socket_of(link: MeshLink) -> SimSocket:
+    """The simulated socket of a link."""
+    return link.sock  # type: ignore[return-value]
 
 
 class MeshScenario(Scenario):
@@ -19,43 +36,93 @@ class MeshScenario(Scenario):
 
     kind = "mesh"
 
-    def __init__(self, seed: int, count: int, *, keep: bool = False, calm: bool = False) -> None:
+    def __init__(
+        self, seed: int, count: int, *, keep: bool = False, calm: bool = False, make_peer: type[MeshPeer] = MeshPeer
+    ) -> None:
         self.calm = calm
-        super().__init__(seed, count, MeshPeer, keep=keep)
+        super().__init__(seed, count, make_peer, keep=keep)
 
     def prepare(self) -> None:
         """A firewall in one of four networks."""
-        if self.count > _MANY:
-            for peer in self.peers:
-                peer.link_lease = _SLOW_LEASE
         if not self.calm and self.world.rng.random() < 0.25:
             self.network.walled.add(self.world.rng.choice(self.peers).host)
+
+    def play(self) -> Outcome:
+        """See ``Scenario.play``."""
+        with self.simulated():
+            return super().play()
+
+    @contextmanager
+    def simulated(self) -> Iterator[None]:
+        """What the code would ask the system for, the simulation tells."""
+        slower = _SLOWER if self.count > _MANY else 1
+        with (
+            mock.patch("rmpa.mesh.aio.mesh.unacknowledged", lambda sock: sock.in_flight),
+            mock.patch.multiple(
+                limits,
+                LINK_LEASE=slower * limits.LINK_LEASE,
+                KEEPALIVE_INTERVAL=slower * limits.KEEPALIVE_INTERVAL,
+                CLOCK_INTERVAL=slower * limits.CLOCK_INTERVAL,
+                BULK_LEASE=slower * limits.BULK_LEASE,
+                GHOST_QUIET=slower * limits.GHOST_QUIET,
+            ),
+        ):
+            yield
 
     def _worsen(self) -> None:
         if not self.calm:
             super()._worsen()
 
     def _mischief(self) -> None:
-        if not self.calm:
+        if self.calm:
+            return
+        if self.world.rng.random() < 0.3:
+            self._hit_connection()
+        else:
             super()._mischief()
 
+    def _hit_connection(self) -> None:
+        """One connection alone breaks, or is forgotten by something on its way."""
+        there = list(self.network.connections.values())
+        if not there:
+            return
+        sock = self.world.rng.choice(there)
+        if self.world.rng.random() < 0.5:
+            self.world.note("network", f"swallows a connection of {sock.host} with {sock.other.host}")
+            sock.swallow()
+        else:
+            self.world.note("network", f"breaks a connection of {sock.host} with {sock.other.host}")
+            sock.kill_both()
+
     def check(self) -> None:
-        """Equal views, and one live link for each pair."""
+        """Equal views, and one live link with two lanes for each pair."""
         super().check()
         living = {peer.identity.instance: peer for peer in self.peers if peer.alive}
         for peer in living.values():
-            remotes = []
-            for link in peer.links.values():
-                assert link.up, f"{peer.name} has a link that is {link.machine.state}"
-                remote = link.machine.remote
-                assert remote is not None
-                remotes.append(remote.instance)
-                other = living[remote.instance]
-                twins = [twin for twin in other.links.values() if twin.up and twin.end is link.end.other]
-                assert len(twins) == 1, f"{peer.name} and {other.name} mean different links"
-                if self.calm and peer.identity.guid < other.identity.guid:
-                    assert link.expected is not None, f"{peer.name} did not dial {other.name}"
-            assert sorted(remotes) == sorted(living.keys() - {peer.identity.instance}), (
-                f"{peer.name} has links to {sorted(living[i].name for i in remotes if i in living)}"
-            )
+            assert not any(process.failures for process in peer.processes), [p.failures for p in peer.processes]
+            others = sorted(living.keys() - {peer.identity.instance})
+            for bulk in (False, True):
+                up = [link for link in peer.mesh._links.values() if link.up and (link.lane == Lane.BULK) == bulk]
+                found = sorted(link.identity.instance for link in up)
+                assert found == others, f"{peer.name}, bulk {bulk}: {self._names(found)}"
+            assert len(peer.mesh._links) == 2 * len(others), f"{peer.name} has connections that are not up"
+            for other in (living[instance] for instance in others):
+                self._check_pair(peer, other)
             assert all(view.linked for view in peer.roster.peers()), f"{peer.name}'s roster does not know its links"
+
+    def _check_pair(self, peer: MeshPeer, other: MeshPeer) -> None:
+        link, twin = peer.mesh.link(other.identity.guid), other.mesh.link(peer.identity.guid)
+        assert link is not None, f"{peer.name} does not use its link to {other.name}"
+        assert twin is not None, f"{other.name} does not use its link to {peer.name}"
+        assert socket_of(link).other is socket_of(twin), f"{peer.name} and {other.name} mean different links"
+        bulk, bulk_twin = link.bulk_link, twin.bulk_link
+        assert bulk is not None, f"{peer.name} has no bulk lane to {other.name}"
+        assert bulk_twin is not None, f"{other.name} has no bulk lane to {peer.name}"
+        assert socket_of(bulk).other is socket_of(bulk_twin), f"{peer.name} and {other.name} mean different lanes"
+        assert link.bulk.connected
+        if self.calm and peer.identity.guid < other.identity.guid:
+            assert link.dialled, f"{peer.name} did not dial {other.name}"
+            assert bulk.dialled, f"{peer.name} did not dial {other.name}'s bulk lane"
+
+    def _names(self, instances: list[bytes]) -> list[str]:
+        return [peer.name for peer in self.peers for i in instances if peer.identity.instance == i]

@@ -12,7 +12,10 @@ import random
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from tests.simulation.sockets import SimListener, SimSocket
 
 Address = tuple[str, int]
 OnDatagram = Callable[[bytes, Address, bool], None]
@@ -48,6 +51,10 @@ class World:
     def after(self, delay: float, action: Callable[[], None]) -> None:
         """Do ``action`` in ``delay`` seconds."""
         self.at(self.now + delay, action)
+
+    def time_ns(self) -> int:
+        """The wall clock of every host."""
+        return round(self.now * 1e9)
 
     def run(self, until: float) -> None:
         """Let everything happen up to ``until``."""
@@ -95,8 +102,14 @@ class Network:
     sockets: dict[Address, OnDatagram] = field(default_factory=dict)
     listeners: dict[Address, OnAccept] = field(default_factory=dict)
     streams: list[Stream] = field(default_factory=list)
+    tcp: dict[Address, SimListener] = field(default_factory=dict)
+    """Who accepts connections; ``listeners`` and ``streams`` are a simpler kind, without sockets."""
+    connections: dict[int, SimSocket] = field(default_factory=dict)
+    """Every open end of a connection, by its descriptor."""
     walled: set[str] = field(default_factory=set)
     """Hosts behind a firewall: they can dial but not be dialled."""
+    slowness: tuple[float, ...] = (1.0, 1.0, 3.0)
+    """How many times the delay a connection takes, by chance one of these."""
     datagrams: int = 0
 
     def reaches(self, host: str, other: str) -> bool:
@@ -156,6 +169,8 @@ class Network:
             for end in (stream.caller, stream.callee):
                 if end.host == host:
                     end.close(reset=True)
+        for sock in [sock for sock in self.connections.values() if sock.host == host]:
+            sock.kill()
 
 
 class Stream:

@@ -1,4 +1,4 @@
-"""Rosters with links: after the network healed every pair has exactly one live link, agreed by both ends.
+"""Rosters with links: after the network healed every pair has exactly one link with both lanes, agreed by both ends.
 
 ``RMPA_SIMULATION_SEEDS=20`` runs twenty times as many;
 ``python -m tests.simulation --kind mesh --seed N --peers M`` one.
@@ -16,10 +16,10 @@ from tests.simulation.network import Weather
 
 FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
 BLOCK = 25
+BLOCKS = [(count, block) for count, blocks in ((2, 16), (3, 6), (4, 2), (5, 1)) for block in range(blocks * FACTOR)]
 
 
-@pytest.mark.parametrize("count", [2, 3, 4, 5])
-@pytest.mark.parametrize("block", range(2 * FACTOR))
+@pytest.mark.parametrize(("count", "block"), BLOCKS)
 def test_small_networks_are_linked_after_healing(count: int, block: int) -> None:
     for seed in range(block * BLOCK, (block + 1) * BLOCK):
         MeshScenario(seed, count).play()
@@ -31,8 +31,8 @@ def test_networks_of_ten_are_linked_after_healing(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(FACTOR))
-def test_a_network_of_fifty_is_linked_after_healing(seed: int) -> None:
-    MeshScenario(seed, 50).play()
+def test_a_network_of_thirty_is_linked_after_healing(seed: int) -> None:
+    MeshScenario(seed, 30).play()
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])
@@ -47,14 +47,16 @@ def test_calls_that_cross_leave_the_lower_guids_link_and_no_flapping(
 ) -> None:
     monkeypatch.setattr(limits, "DIAL_FALLBACK", 0.0)  # the higher GUID does not wait: calls cross
     scenario = MeshScenario(seed, 3, keep=True, calm=True)
-    scenario.network.weather = Weather(delay=(0.1, 0.4))
-    for peer in scenario.peers:
-        scenario.world.after(0, peer.start)
-    scenario.world.run(scenario.world.now + 25)
-    crossed = [line for line in scenario.world.lines if "> dials" in line]
-    assert len(crossed) > 3, "no calls crossed"
-    scenario.check()
-    # The bye on one stream may overtake the welcome on the other; nothing else makes a link fall here.
+    scenario.network.weather = Weather(delay=(0.1, 0.3))
+    scenario.network.slowness = (1.0,)
+    with scenario.simulated():
+        for peer in scenario.peers:
+            scenario.world.after(0, peer.start)
+        scenario.world.run(scenario.world.now + 25)
+        crossed = [line for line in scenario.world.lines if "> dials" in line]
+        assert len(crossed) > 3, "no calls crossed"
+        scenario.check()
+    # The bye on one connection may overtake the welcome on the other; nothing else makes a link fall here.
     fell = [line for line in scenario.world.lines if " down " in line]
     assert all("replaced" in line or "linked already" in line for line in fell), fell
 

@@ -331,6 +331,7 @@ async def test_the_rest_of_a_message_whose_beginning_went_down_with_the_lane_is_
         lane.send(7, 2, 0, b"next")
         await until(lambda: bool(other.data), "the next one")
         assert other.data == [(7, 2, 0, b"next")]
+        assert len(one.lanes_lost) == len(other.lanes_lost) == 1, "nor did its pieces disturb the new one"
 
 
 async def test_a_mesh_ends_while_a_bulk_lane_is_being_dialled() -> None:

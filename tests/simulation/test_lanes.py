@@ -1,0 +1,66 @@
+"""Messages over simulated meshes: whole and in order whatever breaks, and all of them once it is whole again.
+
+The legs, lanes, links and flows are the agent's own; ``RMPA_SIMULATION_SEEDS=20`` runs twenty times as many;
+``python -m tests.simulation --kind lanes --seed N --peers M`` one.
+"""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from rmpa.core.contract import Priority, Reliability
+from tests.simulation.lanes_scenario import LanesScenario
+from tests.simulation.point_scenario import TROUBLES, Course, PointScenario
+
+FACTOR = int(os.environ.get("RMPA_SIMULATION_SEEDS", "1"))
+BLOCK = 25
+BLOCKS = [(count, block) for count, blocks in ((2, 12), (3, 2)) for block in range(blocks * FACTOR)]
+
+
+@pytest.mark.parametrize(("count", "block"), BLOCKS)
+def test_what_arrives_is_whole_and_in_order_and_after_healing_it_is_all(count: int, block: int) -> None:
+    breaks = 0
+    for seed in range(block * BLOCK, (block + 1) * BLOCK):
+        scenario = LanesScenario(seed, count)
+        scenario.play()
+        breaks += scenario.breaks
+    assert breaks <= BLOCK // 10, "links seldom cross so that a peer has to begin anew"
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_where_nothing_breaks_every_message_arrives(count: int) -> None:
+    for seed in range(60 // count):
+        LanesScenario(seed, count, calm=True).play()
+
+
+COURSES = [
+    Course(reliability, priority, in_parts)
+    for in_parts in (True, False)
+    for reliability in Reliability
+    for priority in (Priority.LOW, Priority.HIGH)
+]
+LENGTH = 5 * 24 + 312
+"""Bytes on the wire of the message in fragments."""
+
+
+@pytest.mark.parametrize("course", COURSES)
+def test_undisturbed_it_arrives_in_as_many_bytes(course: Course) -> None:
+    scenario = PointScenario(course, "", 1 << 30)
+    scenario.run()
+    assert scenario.carried >= LENGTH
+
+
+@pytest.mark.parametrize("trouble", TROUBLES)
+def test_trouble_at_every_byte_of_a_message_leaves_no_half_one_and_the_next_comes(trouble: str) -> None:
+    """Each byte meets one of the courses; with more seeds, more of them."""
+    for point in range(TROUBLES.index(trouble), LENGTH, len(TROUBLES)):
+        for turn in range(min(FACTOR, len(COURSES))):
+            PointScenario(COURSES[(point // len(TROUBLES) + turn) % len(COURSES)], trouble, point).run()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_seed_gives_one_run(seed: int) -> None:
+    first, second = (LanesScenario(seed, 3).play() for _ in range(2))
+    assert first == second

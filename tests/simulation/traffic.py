@@ -1,0 +1,296 @@
+"""Messages between simulated agents: the real legs and flows of the bridge over the real lanes of the mesh.
+
+Each agent has one source, and wants those of all others. What the bridge's plans would say to each other is said here
+in two words, ``open`` and ``opened``; everything that touches a message is the agent's own code.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+from rmpa.bridge.aio.flows import ExportFlow, ImportFlow, LinkTime
+from rmpa.bridge.aio.legs import ReliableLeg
+from rmpa.core.contract import Contract, Priority, Reliability
+from rmpa.mesh.frames import Kind
+from tests.simulation.mesh_peer import MeshPeer
+
+if TYPE_CHECKING:
+    import random
+
+    from rmpa.bridge.aio.legs import Leg
+    from rmpa.mesh.aio.link import MeshLink
+
+_RING: Final = bytes(range(256))
+_SIZES: Final = (20, 300, 300, 5000, 9000, 40_000, 150_000, 400_000)
+_CUT_THROUGH: Final = 131_072
+_HEAD: Final = 12
+"""Bytes in front: the length, as ROS has it, and the message's number."""
+
+
+def framed(number: int, size: int) -> bytes:
+    """A message with its length in front, whose every byte tells where it belongs."""
+    start = number * 31 & 0xFF
+    body = number.to_bytes(8, "big") + (_RING * (size // 256 + 2))[start : start + size]
+    return len(body).to_bytes(4, "little") + body
+
+
+def number_of(message: bytes) -> int:
+    """Which message this is; it must be one, and whole."""
+    number = int.from_bytes(message[4:_HEAD], "big")
+    assert message == framed(number, len(message) - _HEAD), f"message {number} is not what was published"
+    return number
+
+
+@dataclass
+class Inbox:
+    """What one agent got of one run of another one.
+
+    Args:
+        contract: What holds for it.
+    """
+
+    contract: Contract
+    flow: ImportFlow | None = None
+    got: list[int] = field(default_factory=list)
+    torn: int = 0
+    breaks: int = 0
+    _begun: bytearray | None = None
+    _size: int = 0
+
+    def publish_framed(self, message: bytes | bytearray | memoryview) -> None:
+        """A whole one."""
+        assert self._begun is None, "a message in the middle of another one"
+        self._take(bytes(message))
+
+    def begin(self, size: int) -> None:
+        """One in parts."""
+        assert self._begun is None, "a message in the middle of another one"
+        self._begun, self._size = bytearray(), size
+
+    def extend(self, part: bytes | bytearray | memoryview) -> None:
+        """A part of it."""
+        assert self._begun is not None
+        self._begun += part
+        assert len(self._begun) <= self._size
+        if len(self._begun) == self._size:
+            whole, self._begun = bytes(self._begun), None
+            self._take(whole)
+
+    def abort(self) -> int:
+        """Nobody gets the half of it."""
+        was = self._begun is not None
+        self._begun = None
+        self.torn += was
+        return was
+
+    def _take(self, message: bytes) -> None:
+        number = number_of(message)
+        assert not self.got or number > self.got[-1], f"message {number} came behind {self.got[-1]}"
+        self.got.append(number)
+
+
+class Courier(MeshPeer):
+    """An agent with a source of its own; the contract is its run's."""
+
+    stopped = False
+    """Whether it publishes nothing of itself any more."""
+    fixed: Contract | None = None
+    """The contract, where it is not left to chance."""
+
+    def prepare(self, rng: random.Random) -> None:
+        """Nothing was published or got yet."""
+        self.contract = self.fixed or Contract(
+            reliability=rng.choice(list(Reliability)),
+            priority=rng.choice([Priority.NORMAL, Priority.NORMAL, *Priority]),
+            depth=1000,
+        )
+        self.published: list[int] = []
+        """Numbers of the messages that were published whole, in order; of one run, but never used again."""
+        self.first: dict[bytes, int] = {}
+        """By instance: the number of the first message that this reliable receiver must have."""
+        self.inboxes: dict[bytes, Inbox] = {}
+        self.legs: dict[tuple[MeshLink, int], Leg] = {}
+        self.flows: dict[tuple[MeshLink, int], ImportFlow] = {}
+        self.times: dict[MeshLink, LinkTime] = {}
+        self._peers: dict[bytes, int] = {}
+        self._place: dict[bytes, int] = {}
+        self._epoch = 0
+        self._next = self.run * 1_000_000
+        self._streaming = False
+        self._rng = rng
+        self.aborted = 0
+        super().prepare(rng)
+        self.exports = ExportFlow()
+        self.process.run(self._publish_later)
+
+    # --- the publisher --------------------------------------------------------------------------------------
+
+    def _publish_later(self) -> None:
+        self.process.call_later(self._rng.uniform(0.2, 4.0), self._burst)
+
+    def _burst(self) -> None:
+        if self.stopped:
+            return
+        for _ in range(self._rng.choice([1, 1, 3, 6])):
+            self.publish(self._rng.choice(_SIZES))
+        self._publish_later()
+
+    def publish(self, size: int) -> None:
+        """One more message; a large one comes from its publisher in parts, perhaps, and perhaps not to its end."""
+        if self._streaming:
+            return  # its publisher's connection carries one at a time
+        if size >= _CUT_THROUGH and self._rng.random() < 0.7:
+            self.publish_in_parts(size)
+            return
+        self._next += 1
+        self.published.append(self._next)
+        self.exports.message(memoryview(framed(self._next, size)))
+
+    def publish_in_parts(self, size: int, part: int | None = None) -> None:
+        """One that comes in parts, of so many bytes each."""
+        self._next += 1
+        self._streaming = True
+        message = framed(self._next, size)
+        self.exports.begin(len(message))
+        self._stream(message, 0, self._next, part)
+
+    def abort(self) -> None:
+        """The publisher dies; in the middle of a message, perhaps."""
+        if self._streaming:
+            self._streaming = False
+            self.aborted += 1
+            self.exports.abort()
+
+    def _stream(self, message: bytes, at: int, number: int, part: int | None) -> None:
+        if not self._streaming or self._next != number:
+            return
+        if not self.stopped and self._rng.random() < 0.05:
+            self.abort()
+            return
+        size = part or self._rng.choice([100_000, 300_000] if self.stopped else [1000, 30_000, 130_000, 300_000])
+        if at + size >= len(message):
+            self._streaming = False
+            self.published.append(number)
+        self.exports.part(memoryview(message)[at : at + size])
+        if self._streaming:
+            self.process.call_later(self._rng.uniform(0, 0.02), self._stream, message, at + size, number, part)
+
+    # --- links ----------------------------------------------------------------------------------------------
+
+    def link_up(self, link: MeshLink) -> None:
+        """Ask for the peer's source; one that restarted is not waited for any more."""
+        super().link_up(link)
+        instance = link.identity.instance
+        for other in [i for i in self.inboxes if i != instance and self._place[i] == link.guid.place]:
+            self.exports.remove(self._peers.pop(other))
+            if (flow := self.inboxes.pop(other).flow) is not None:
+                flow.close()
+        self._peers.setdefault(instance, len(self._place) + 1)
+        self._place[instance] = link.guid.place
+        inbox = self.inboxes.setdefault(instance, Inbox(self.contract))
+        self.times[link] = LinkTime()
+        position = inbox.flow.position if inbox.flow is not None else None
+        epoch, after = position or (0, 0)
+        self._say(link, op="open", epoch=epoch, after=after)
+
+    def link_down(self, link: MeshLink, reason: str) -> None:
+        """Half messages are dropped; what is reliable waits."""
+        super().link_down(link, reason)
+        self.times.pop(link, None)
+        for key in [key for key in self.flows if key[0] is link]:
+            self.flows.pop(key).torn()
+            inbox = self.inboxes[link.identity.instance]
+            if inbox.contract.reliability is not Reliability.RELIABLE and inbox.flow is not None:
+                inbox.flow.close()
+                inbox.flow = None
+        for key in [key for key in self.legs if key[0] is link]:
+            leg = self.legs.pop(key)
+            peer = self._peers[link.identity.instance]
+            if isinstance(leg, ReliableLeg):
+                self.exports.suspend(peer)
+            else:
+                self.exports.remove(peer)
+
+    def lane_lost(self, link: MeshLink) -> None:
+        """As the bridge."""
+        self.note(f"= link {link.id} lost its bulk lane")
+        for (of, _), flow in self.flows.items():
+            if of is link and flow.contract.priority is not Priority.HIGH:
+                flow.torn()
+        for (of, _), leg in list(self.legs.items()):
+            if of is link:
+                leg.lane_lost()
+
+    def clock_known(self, link: MeshLink) -> None:
+        """As the bridge."""
+        if link in self.times:
+            self.times[link].set(link.clock_offset, link.clock_error)
+
+    # --- what comes -----------------------------------------------------------------------------------------
+
+    def control(self, link: MeshLink, payload: bytes) -> None:
+        """The two words."""
+        said: dict[str, Any] = json.loads(payload)
+        if said["op"] == "open":
+            self._opened(link, said["epoch"], said["after"])
+        else:
+            self._begin(link, said)
+
+    def data(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
+        """A message."""
+        flow = self.flows.get((link, route))
+        if flow is not None:
+            flow.message(sequence, stamp_ns, payload)
+
+    def part(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
+        """A part of one."""
+        flow = self.flows.get((link, route))
+        if flow is not None:
+            flow.part(sequence, stamp_ns, flags, part)
+
+    def mark(self, link: MeshLink, kind: Kind, route: int, sequence: int) -> None:
+        """An acknowledgement, or a fence's answer."""
+        leg = self.legs.get((link, route))
+        if leg is not None and kind is Kind.ACK:
+            leg.acknowledged(sequence)
+        elif leg is not None and kind is Kind.FENCED:
+            leg.fenced(sequence)
+
+    # --- inside ---------------------------------------------------------------------------------------------
+
+    def _say(self, link: MeshLink, **what: object) -> None:
+        self.note(f"> link {link.id} {what}")
+        link.send_control(json.dumps(what).encode())
+
+    def _opened(self, link: MeshLink, epoch: int, after: int) -> None:
+        """Somebody wants our source, by the only route of this link."""
+        peer = self._peers[link.identity.instance]
+        leg = self.exports.by_peer.get(peer)
+        contract = {"reliability": self.contract.reliability, "priority": self.contract.priority}
+        if epoch and isinstance(leg, ReliableLeg) and leg.sender.epoch == epoch:
+            self._say(link, op="opened", epoch=epoch, first=leg.sender.first, **contract)
+            leg.resume(link, 1, after)
+        else:
+            self._epoch += 1
+            self.first[link.identity.instance] = self._next + 1
+            self._say(link, op="opened", epoch=self._epoch, first=1, **contract)
+            leg = self.exports.add(peer, link, 1, self.contract, self._epoch)
+        self.legs[link, 1] = leg
+
+    def _begin(self, link: MeshLink, said: dict[str, Any]) -> None:
+        inbox = self.inboxes[link.identity.instance]
+        inbox.contract = Contract(
+            reliability=Reliability(said["reliability"]), priority=Priority(said["priority"]), depth=1000
+        )
+
+        def acknowledge(sequence: int) -> None:
+            link.mark(Kind.ACK, 1, sequence)
+
+        if inbox.flow is not None:
+            inbox.flow.rebind(acknowledge)
+        else:
+            inbox.flow = ImportFlow(inbox, inbox.contract, self.times[link], on_ack=acknowledge)
+        inbox.breaks += not inbox.flow.begin_epoch(said["epoch"], said["first"])
+        self.flows[link, 1] = inbox.flow
