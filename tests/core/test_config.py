@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable
+from errno import EACCES
 from pathlib import Path
 
 import pytest
@@ -424,15 +425,36 @@ def test_where_the_file_is_looked_for(tmp_path: Path) -> None:
     cwd = tmp_path / "work"
     environ = {"HOME": str(tmp_path / "home")}
     home = place("home/.config/rmpa/rmpa.toml")
-    assert find_config_file(None, environ, cwd) == home
+    assert find_config_file(None, environ, cwd, []) == home
     xdg = place("xdg/rmpa/rmpa.toml")
     environ["XDG_CONFIG_HOME"] = str(tmp_path / "xdg")
-    assert find_config_file(None, environ, cwd) == xdg
+    assert find_config_file(None, environ, cwd, []) == xdg
     local = place("work/rmpa.toml")
-    assert find_config_file(None, environ, cwd) == local
+    assert find_config_file(None, environ, cwd, []) == local
     environ["RMPA_CONFIG"] = str(place("var.toml"))
-    assert find_config_file(None, environ, cwd) == tmp_path / "var.toml"
-    assert find_config_file(str(place("flag.toml")), environ, cwd) == tmp_path / "flag.toml"
+    assert find_config_file(None, environ, cwd, []) == tmp_path / "var.toml"
+    assert find_config_file(str(place("flag.toml")), environ, cwd, []) == tmp_path / "flag.toml"
+
+
+def test_a_place_that_this_user_may_not_look_into_counts_as_empty_and_is_told_of(
+    load: Load, refuse: Refuse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = Path.is_file
+
+    def is_file(path: Path) -> bool:
+        if "closed" in path.parts:
+            raise PermissionError(EACCES, "Permission denied", str(path))
+        return real(path)
+
+    monkeypatch.setattr(Path, "is_file", is_file)
+    home = tmp_path / "closed"
+    loaded = load(environ={"HOME": str(home)})
+    assert loaded.settings.config_file is None
+    assert loaded.notes == (f"{home / '.config/rmpa/rmpa.toml'} is not looked for: Permission denied",)
+    assert f"--config: {home}/rmpa.toml: Permission denied" in refuse(None, flags=Flags(config=f"{home}/rmpa.toml"))
+    assert "~nobody_of_that_name/rmpa.toml: there is no such home" in refuse(
+        RMPA_CONFIG="~nobody_of_that_name/rmpa.toml"
+    )
 
 
 def test_lines_are_found_wherever_a_statement_stands() -> None:

@@ -161,7 +161,7 @@ def load_settings(
         ConfigError: A setting cannot be used, or the file that was named cannot be read.
     """
     notes: list[str] = []
-    path = find_config_file(flags.config, environ, cwd or Path())
+    path = find_config_file(flags.config, environ, cwd or Path(), notes)
     file_layer = _file_layer(path) if path is not None else {}
     for name, given in file_layer.items():
         given.read(_OPTIONS[name])  # a mistake in the file is told even where a flag outweighs it
@@ -182,25 +182,46 @@ def load_settings(
     return Loaded(settings, tuple(notes))
 
 
-def find_config_file(flag: str | None, environ: Mapping[str, str], cwd: Path) -> Path | None:
+def find_config_file(flag: str | None, environ: Mapping[str, str], cwd: Path, notes: list[str]) -> Path | None:
     """The file to read: the one that was named, or the first that is there, or ``None``.
+
+    Args:
+        flag: The command line's word.
+        environ: The environment's variables.
+        cwd: Where to look first.
+        notes: Gets a line for each place that this user may not look into; it counts as empty.
 
     Raises:
         ConfigError: A file was named and is not there.
     """
     for source, named in (("--config", flag), ("RMPA_CONFIG", environ.get("RMPA_CONFIG"))):
         if named:
-            path = Path(named).expanduser()
-            if not path.is_file():
-                problem = "is a directory" if path.is_dir() else "no such file"
-                raise ConfigError(source, f"{named}: {problem}", "name a file in TOML, like examples/rmpa.toml")
-            return path
+            return _named_file(named, source)
     config_home = environ.get("XDG_CONFIG_HOME") or (f"{environ['HOME']}/.config" if environ.get("HOME") else "")
     places = [cwd / FILE_NAME]
     if config_home:
         places.append(Path(config_home) / "rmpa" / FILE_NAME)
     places.append(Path("/etc/rmpa") / FILE_NAME)
-    return next((place for place in places if place.is_file()), None)
+    for place in places:
+        try:
+            if place.is_file():
+                return place
+        except OSError as error:
+            notes.append(f"{place} is not looked for: {error.strerror}")
+    return None
+
+
+def _named_file(named: str, source: str) -> Path:
+    try:
+        path = Path(named).expanduser()
+        if path.is_file():
+            return path
+        problem = "is a directory" if path.is_dir() else "no such file"
+    except OSError as error:
+        problem = error.strerror or str(error)
+    except RuntimeError:
+        problem = "there is no such home"
+    raise ConfigError(source, f"{named}: {problem}", "name a file in TOML, like examples/rmpa.toml")
 
 
 _GROUPS: Final[Mapping[str, tuple[Callable[..., object], Mapping[str, str]]]] = {

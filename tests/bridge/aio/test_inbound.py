@@ -207,7 +207,7 @@ def test_a_reliable_source_goes_on_with_the_same_flow() -> None:
         flow.message(2, 0, framed("two"))
         flow.message(5, 0, framed("five"))
         assert listener.texts == ["one", "two", "five"]
-        assert (flow.messages, flow.lost) == (3, 2)
+        assert (flow.quality.messages, flow.lost) == (3, 2)
         assert not listener.closed
         await asyncio.sleep(limits.ACK_DELAY * 2)
         assert proxied.acks[-1] == 5
@@ -284,7 +284,7 @@ def test_a_short_silence_of_a_latched_source_brings_its_message_to_nobody_twice(
         flow.message(1, 0, framed("map"))
         flow.message(2, 0, framed("map"))
         assert listener.texts == late.texts == ["map", "map"]
-        assert flow.messages == 1
+        assert flow.quality.messages == 1
         assert publication.latched == (bytes(framed("map")),)
 
     play(scene)

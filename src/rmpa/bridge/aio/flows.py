@@ -256,8 +256,6 @@ class ImportFlow:
         self._ack_timer: asyncio.TimerHandle | None = None
         self.quality = Quality()
         self.watch = Watch(contract, now)
-        self.messages = 0
-        self.bytes = 0
         self.lost = 0
         """Messages that never came: the sender's queue, or a link, lost them."""
         self.late = 0
@@ -266,8 +264,6 @@ class ImportFlow:
         """Best-effort messages that an outage had held up and that gave way to newer ones."""
         self.expired = 0
         """Messages that came after their lifespan."""
-        self.last_stamp_ns = 0
-        self.last_wall_ns = 0
         self._last_size = 0
 
     @property
@@ -361,10 +357,6 @@ class ImportFlow:
 
     def _note(self, stamp_ns: int, now_ns: int, size: int) -> None:
         now = self._loop.time()
-        self.messages += 1
-        self.bytes += size
-        self.last_stamp_ns = stamp_ns
-        self.last_wall_ns = now_ns
         self._last_size = size
         self.watch.last = now
         self.quality.arrived(now, now_ns, stamp_ns, size)

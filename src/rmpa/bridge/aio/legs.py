@@ -299,7 +299,7 @@ class ReliableLeg(Leg):
             return
         # What still waits for the lane comes again too, in its place: in front of those torn it would be a gap.
         self._discard_bulk()
-        self.sender.resume(self.sender.confirmed)
+        self.sender.rewind()
         if self._switch.lane_lost():
             self._go_on()
         else:
