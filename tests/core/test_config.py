@@ -453,7 +453,7 @@ def test_a_place_that_this_user_may_not_look_into_counts_as_empty_and_is_told_of
     assert loaded.notes == (f"{home / '.config/rmpa/rmpa.toml'} is not looked for: Permission denied",)
     assert f"--config: {home}/rmpa.toml: Permission denied" in refuse(None, flags=Flags(config=f"{home}/rmpa.toml"))
     assert "~nobody_of_that_name/rmpa.toml: there is no such home" in refuse(
-        RMPA_CONFIG="~nobody_of_that_name/rmpa.toml"
+        None, environ={"RMPA_CONFIG": "~nobody_of_that_name/rmpa.toml"}
     )
 
 
