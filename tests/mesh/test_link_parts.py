@@ -171,7 +171,7 @@ def test_marks_come_in_the_order_of_the_messages(kind: Kind, chunk: int) -> None
     said: list[object] = []
     for link in (dialler.link, acceptor.link):
         link.on_data = lambda _r, sequence, _t, _v: said.append(sequence)
-        link._on_event = said.append
+        link.on_event = said.append
     mark = Frame(kind, route=7, sequence=0xFFFFFFFF).serialize()
     wire = pack_data_header(1, 7, 1, 0) + b"x" + mark + pack_data_header(1, 7, 2, 0) + b"x"
     for link in (dialler.link, acceptor.link):

@@ -212,7 +212,7 @@ class Link:
         self.remote: Hello | None = None
         self._ours = ours
         self._wall_ns = wall_ns
-        self._on_event = on_event
+        self.on_event = on_event
         self.on_data = on_data
         self.on_part = on_part if on_part is not None else _no_parts
         self._left = 0
@@ -439,16 +439,16 @@ class Link:
             t1, t2 = frames.parse_pong(payload)
             sample = self.clock.ponged(t1, t2, stamp_ns, self._wall_ns(), now)
             if sample is not None:
-                self._on_event(Ponged(t1, sample.rtt))
+                self.on_event(Ponged(t1, sample.rtt))
         elif kind is Kind.CONTROL:
-            self._on_event(ControlReceived(bytes(payload)))
+            self.on_event(ControlReceived(bytes(payload)))
         elif kind in {Kind.ACK, Kind.FENCE, Kind.FENCED}:
-            self._on_event(Marked(kind, route, sequence))
+            self.on_event(Marked(kind, route, sequence))
         elif kind is Kind.BYE:
             self._end(f"{self._name} left: {frames.parse_text(payload)}", orderly=True)
         elif kind is Kind.REFUSE:
             refuse = Refuse.parse(payload)
-            self._on_event(Refused(refuse, by_us=False))
+            self.on_event(Refused(refuse, by_us=False))
             self._end(f"{self._label} refused: {refuse}", orderly=True)
         else:
             self._handshake(payload, now)
@@ -461,7 +461,7 @@ class Link:
             return
         if self.role is Role.ACCEPTOR:
             self.remote = hello
-            self._on_event(HelloReceived(hello))
+            self.on_event(HelloReceived(hello))
         elif refuse := judge_welcome(hello, self._ours, self._expected):
             self._refuse(refuse, now)
         else:
@@ -478,12 +478,12 @@ class Link:
         self._heard = self._welcomed = now
         _log.debug("= %s: up", self._name)
         self._ping(now)
-        self._on_event(Up(hello))
+        self.on_event(Up(hello))
 
     def _refuse(self, refuse: Refuse, now: float) -> None:
         self._send(Frame(Kind.REFUSE, refuse.serialize()) if self.role is Role.ACCEPTOR else _bye(refuse.text))
         self._leave(_Act.REFUSING, f"refused: {refuse}", now)
-        self._on_event(Refused(refuse, by_us=True))
+        self.on_event(Refused(refuse, by_us=True))
 
     def _leave(self, act: _Act, reason: str, now: float) -> None:
         self._state = _NEXT[self._state, act]
@@ -497,7 +497,7 @@ class Link:
         self._state = _NEXT[self._state, _Act.ENDED]
         self._reason = reason
         _log.debug("= %s: closed: %s", self._name, reason)
-        self._on_event(Closed(reason, orderly))
+        self.on_event(Closed(reason, orderly))
 
     def _ping(self, now: float) -> int:
         stamp = self._wall_ns()

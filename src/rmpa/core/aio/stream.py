@@ -382,6 +382,8 @@ class Stream:
         if self._writing:
             self._loop.remove_writer(self._fd)
         self._sock.close()
+        # Nobody is called any more: who holds the stream would stay with it as a cycle until the collector looks.
+        self._on_bytes, self._on_close = _no_bytes, _no_close
         self._view = memoryview(b"")
         self._buffer = bytearray()
         if not self._keep:
@@ -399,9 +401,14 @@ class Stream:
 
     def _lost(self, error: Exception | None) -> None:
         if not self._closed:
+            on_close = self._on_close
             self._shut()
             # Not from here: this may be a ``send`` in the middle of the owner's loop over its streams.
-            self._report = self._loop.call_soon(self._on_close, error)
+            self._report = self._loop.call_soon(self._report_end, on_close, error)
+
+    def _report_end(self, on_close: OnClose, error: Exception | None) -> None:
+        self._report = None
+        on_close(error)
 
     def _reserve(self, size: int) -> None:
         if size > len(self._buffer):
@@ -508,6 +515,15 @@ def _rest(parts: Sequence[Buffer], sent: int) -> list[memoryview]:
             left.append(memoryview(part)[sent:])
         sent = max(0, sent - len(part))
     return left
+
+
+def _no_bytes(view: memoryview) -> tuple[int, int]:
+    """Of a closed stream."""
+    return len(view), 0
+
+
+def _no_close(_error: Exception | None) -> None:
+    """The same."""
 
 
 def _behind(parts: Sequence[Buffer], sent: int) -> bytes:

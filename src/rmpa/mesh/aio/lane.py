@@ -56,6 +56,11 @@ class LaneSender:
         self.ended = True
         self._stream = None
 
+    def clear(self) -> None:
+        """The link is gone: let go of what its drain time was too short for."""
+        self.outbox.clear()
+        self._open.clear()
+
     def send(self, route: int, sequence: int, stamp_ns: int, payload: Buffer) -> int:
         """Send one message; what the socket does not take is queued, keep-last, and copied only then.
 

@@ -143,7 +143,8 @@ class MeshLink:
         self._ended = False
         self._leaving = False
         self._mark_to: Callable[[Kind, int, int], None] | None = None
-        self._of = self
+        self._of: MeshLink | None = None
+        """Of a bulk lane's connection: the express lane's."""
         self._malformed = False
         self.silent = False
         """Once it has ended: whether nobody said so; its peer may be there, and the cable is not."""
@@ -360,7 +361,7 @@ class MeshLink:
         self._machine.on_data = _ignore if takers is None else partial(takers.data, link)
         self._machine.on_part = _ignore_part if takers is None else partial(takers.part, link)
         self._mark_to = None if takers is None else partial(takers.mark, link)
-        self._of = link
+        self._of = link if link is not self else None
 
     @property
     def _hello(self) -> Hello:
@@ -416,7 +417,7 @@ class MeshLink:
         if self._mark_to is None:
             return
         if event.kind is Kind.FENCE:
-            self._of.mark(Kind.FENCED, event.route, event.sequence)
+            (self._of or self).mark(Kind.FENCED, event.route, event.sequence)
         else:
             self._mark_to(event.kind, event.route, event.sequence)
 
@@ -468,8 +469,15 @@ class MeshLink:
     def _report_end(self, reason: str) -> None:
         self._stream.close()
         self.use(None)
+        self._let_go()
         self._end.set_result(None)
         self._owner.link_ended(self, reason, malformed=self._malformed, was_up=self.since is not None)
+
+    def _let_go(self) -> None:
+        """Break what would make a cycle: the collector finds an old one late, and what waits here may be large."""
+        self.express.clear()
+        self.bulk.clear()
+        self._machine.on_event = _ignore_event
 
     def _arm(self) -> None:
         due = self._machine.next_timer()
@@ -494,6 +502,10 @@ class MeshLink:
 
 def _ignore(_route: int, _sequence: int, _stamp_ns: int, _payload: memoryview) -> None:
     """Data on a link that is not used (another one with the same peer is)."""
+
+
+def _ignore_event(_event: Event) -> None:
+    """What a link that has ended still says."""
 
 
 def _ignore_part(_route: int, _sequence: int, _stamp_ns: int, _flags: int, _part: memoryview) -> None:
