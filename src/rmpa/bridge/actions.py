@@ -1,6 +1,7 @@
 """What the bridge's machines ask their driver to do; frozen values, acted on elsewhere.
 
-``peer`` is a number that the driver gave to one link; it is never used again for another one.
+``peer`` is a number that the driver gave to one run of a peer. It stays the same when its link comes back,
+and is never used again for another one.
 """
 
 from __future__ import annotations
