@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
+from rmpa.ros.std_header import HEADER_PART
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
@@ -19,21 +21,7 @@ ARRAY_DEFINITION: Final = (
     "# This message is used to send diagnostic information about the state of the robot\n"
     "Header header #for timestamp\n"
     "DiagnosticStatus[] status # an array of components being reported on\n"
-    "================================================================================\n"
-    "MSG: std_msgs/Header\n"
-    "# Standard metadata for higher-level stamped data types.\n"
-    "# This is generally used to communicate timestamped data \n"
-    "# in a particular coordinate frame.\n"
-    "# \n"
-    "# sequence ID: consecutively increasing ID \n"
-    "uint32 seq\n"
-    "#Two-integer timestamp that is expressed as:\n"
-    "# * stamp.sec: seconds (stamp_secs) since epoch (in Python the variable is called 'secs')\n"
-    "# * stamp.nsec: nanoseconds since stamp_secs (in Python the variable is called 'nsecs')\n"
-    "# time-handling sugar is provided by the client library\n"
-    "time stamp\n"
-    "#Frame this data is associated with\n"
-    "string frame_id\n"
+    f"{HEADER_PART}"
     "\n"
     "================================================================================\n"
     "MSG: diagnostic_msgs/DiagnosticStatus\n"

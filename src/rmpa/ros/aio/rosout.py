@@ -12,6 +12,7 @@ from rmpa.core import limits
 from rmpa.ros.aio.publication import Publication
 from rmpa.ros.aio.slave_server import SlaveNode
 from rmpa.ros.aio.subscription import PublisherConnection, Subscription
+from rmpa.ros.std_header import HEADER_PART
 from rmpa.ros.tcpros import Description
 
 if TYPE_CHECKING:
@@ -48,21 +49,7 @@ _DEFINITION: Final = (
     "uint32 line # line the message came from\n"
     "string[] topics # topic names that the node publishes\n"
     "\n"
-    "================================================================================\n"
-    "MSG: std_msgs/Header\n"
-    "# Standard metadata for higher-level stamped data types.\n"
-    "# This is generally used to communicate timestamped data \n"
-    "# in a particular coordinate frame.\n"
-    "# \n"
-    "# sequence ID: consecutively increasing ID \n"
-    "uint32 seq\n"
-    "#Two-integer timestamp that is expressed as:\n"
-    "# * stamp.sec: seconds (stamp_secs) since epoch (in Python the variable is called 'secs')\n"
-    "# * stamp.nsec: nanoseconds since stamp_secs (in Python the variable is called 'nsecs')\n"
-    "# time-handling sugar is provided by the client library\n"
-    "time stamp\n"
-    "#Frame this data is associated with\n"
-    "string frame_id\n"
+    f"{HEADER_PART}"
 )
 """As ROS's own publishers send it: rosbag and others compute the md5 sum from it."""
 
