@@ -99,6 +99,23 @@ def test_a_late_peer_gets_the_latched_message_once_and_before_later_ones() -> No
     assert two.stamps[0] == one.stamps[0], "as old as it is"
 
 
+def test_a_source_that_is_left_keeps_nothing() -> None:
+    flow, one, late = ExportFlow(), Link(), Link()
+    flow.latch()
+    flow.add(1, one, 7, BEST, 0)
+    flow.message(memoryview(b"map"))
+    flow.close()
+    flow.message(memoryview(b"new"))
+    assert got(one) == [(1, b"map")]
+    assert flow.by_peer == {}
+    flow = ExportFlow()
+    flow.latch()
+    flow.message(memoryview(b"map"))
+    flow.close()
+    flow.add(2, late, 9, BEST, 0)
+    assert late.sent == []
+
+
 def test_what_is_not_latched_is_not_replayed() -> None:
     flow, link = ExportFlow(), Link()
     flow.add(9, Link(), 7, BEST, 0)

@@ -132,6 +132,13 @@ class ExportFlow:
             if leg in self._streaming:
                 self._streaming.remove(leg)
 
+    def close(self) -> None:
+        """The source is left: let go of what was kept of it, which may be large."""
+        for peer in tuple(self.by_peer):
+            self.remove(peer)
+        self._latched.clear()
+        self._whole = None
+
     def message(self, framed: memoryview) -> None:
         """Hand one message on; ``framed`` has its length in front and is valid during the call only."""
         stamp = time.time_ns()

@@ -187,6 +187,6 @@ class Outbound:
             for peer in list(flow.by_peer):
                 self._parked.claim((peer, source), None, 0.0)
                 self._forget(flow.by_peer[peer], peer)
-                flow.remove(peer)
+            flow.close()
         if flow is not None and not any(s.topic == source.topic for s in self._flows):
             self._core.call("unregisterSubscriber", OWN_NODE, source.topic, self._node.uri)
