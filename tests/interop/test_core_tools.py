@@ -142,17 +142,20 @@ def test_services(shell: ShellFactory, library: str) -> None:
                 ("rosservice", "args", "/server/set_logger_level"),
                 ("rosservice", "node", "/server/set_logger_level"),
                 ("rosservice", "uri", "/server/set_logger_level"),
-                # Not to debug: roscpp may hang itself by logging what its logging does.
-                ("rosservice", "call", "/server/set_logger_level", logger, "warn"),
                 ("rosservice", "call", "/server/get_loggers"),
                 (PYTHON, "-c", wait, "/server/get_loggers"),
+                ("rosservice", "call", "/server/set_logger_level", logger, "warn"),
             )
+            # roscpp now and then hangs itself when its level is set: it logs what its logging does.
+            if library == "rospy" or words[2] != "/server/set_logger_level" or words[1] != "call"
         }
         # Which others there are depends on what roscpp has logged until then.
         loggers = re.findall(r'name: "?([\w.]+)"?', found["call /server/get_loggers"])
         found["call /server/get_loggers"] = f"{logger} among them: {logger in loggers}"
         # It leaves out a service whose server does not answer its probe at once.
-        found["find"] = eventually(lambda: _find(ros, "/server/set_logger_level"), what="the service among those found")
+        found["find"] = eventually(
+            lambda: _find(ros, "/server/set_logger_level"), what="the service among those found"
+        )
         node.terminate()
         gone = ros.start("rosservice", "call", "/nobody/get_loggers", name="rosservice call")
         found["unknown"] = f"{gone.wait(DEADLINE)} {gone.output}"
