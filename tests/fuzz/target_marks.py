@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from rmpa.bridge.aio.legs import Leg, make_leg
+from rmpa.bridge.aio.legs import Leg, ReliableLeg, make_leg
 from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import Parcel
@@ -102,6 +102,8 @@ def _fuzz(data: bytes) -> None:
     sent = [n for one in links for lane in (one.express, one.bulk) for n in lane.numbers if n > 0]
     if sent and max(sent) > published:
         raise AssertionError(f"message {max(sent)} was sent, of {published}")
+    if isinstance(leg, ReliableLeg) and leg.sender.confirmed > max(sent, default=0):
+        raise AssertionError(f"message {leg.sender.confirmed} counts as acknowledged, of {max(sent, default=0)} sent")
     if len(leg._held) > contract.depth:
         raise AssertionError(f"{len(leg._held)} messages are held, of {contract.depth} that may be")
     leg.close()

@@ -38,6 +38,7 @@ SEEDS: list[bytes] = [
     b"R" + _wire(_WHOLE, *_PARTS, (3, WHOLE, b"\0\0\0\0")),
     b"B" + _wire(*_PARTS[:2], (2, LAST | ABORT, b""), (3, WHOLE, b"\x01\0\0\0x")),
     b"R" + _wire(*_PARTS[:2], (2, LAST | ABORT, b""), (3, WHOLE, b"\x01\0\0\0x")),
+    b"B" + _wire((1, FIRST, b"\x04\0"), (1, LAST, b"\0\0abcd")),
     b"B" + _wire(*_PARTS[:2], _WHOLE, _PARTS[2], *_PARTS[:1], *_PARTS),
     b"R" + _wire(*_PARTS[:2], _WHOLE, _PARTS[2], *_PARTS[:1], *_PARTS),
     b"B" + _wire((0xFFFFFFFF, WHOLE, b"\0\0\0\0"), (0, FIRST, b"\xff\xff\xff\x0f"), (1, WHOLE, b"\0\0\0\0")),
