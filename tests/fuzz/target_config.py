@@ -5,8 +5,11 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
+from rmpa.bridge.messages import Open, decode, encode
 from rmpa.core import config_values as values
+from rmpa.core.config_contract import read_contracts, read_duration, read_rate
 from rmpa.core.config_file import known_keys, parse_config
+from rmpa.core.contract import Contracts
 from rmpa.core.errors import ConfigError
 
 _EXAMPLE = Path(__file__).parents[2] / "examples" / "rmpa.toml"
@@ -22,6 +25,8 @@ _READERS = (
     values.read_topic_glob,
     values.read_type_glob,
     lambda raw: values.read_list(raw, values.read_host_port),
+    read_duration,
+    read_rate,
 )
 
 SEEDS: list[bytes] = [
@@ -34,6 +39,19 @@ SEEDS: list[bytes] = [
     b"/camera/**",
     b"sensor_msgs/*",
     b"10.0.0.1:40001;far.example.org",
+    b"".join(
+        line.removeprefix(b"# ") for line in _EXAMPLE.read_bytes().partition(b"# [[contract]]")[2].splitlines(True)
+    ).join([b"[[contract]]", b""]),
+    b'[[contract]]\ntopics = ["/a/**"]\ntypes = ["a/B", "std_msgs/*"]\ndepth = 5\nhistory = "keep_all"\n',
+    b'[[contract]]\ntopics = ["/**"]\nliveliness = "manual_by_topic"\nliveliness_lease_duration = "1.5 s"\n',
+    b'contract = [{topics = "/a;/b", max_rate = "10 Hz", deadline = 1e-3, lifespan = inf, priority = "LOW"}]\n',
+    b"[[contract]]\ntypes = ['*/*']\nreliability = 'reliable'\ndurability = 'transient_local'\ndepth = 100_000\n",
+    b"[[contract]]\ntopics = ['/**']\ndeadline = 1e-9\nlifespan = 1e9\nmax_rate = 1e-9\ndepth = 0\n",
+    b"[[contract]]\ntopics = ['/**']\nlifespan = '86401 s'\n",
+    b"100 ms",
+    b"86400.000000000 s",
+    b"infinite",
+    b"1000000 Hz",
 ]
 
 
@@ -41,8 +59,10 @@ def fuzz(data: bytes) -> None:
     """Known keys or a ConfigError that names a line of the file; a value or a BadValue."""
     try:
         found = parse_config(data, Path("rmpa.toml"))
+        rules = found.pop(("contract",), [])
         if not set(found) <= set(known_keys()):
             raise AssertionError(f"unknown keys came through: {set(found) - set(known_keys())}")
+        _check_contracts(rules)
     except ConfigError as error:
         if error.line is not None and not 1 <= error.line <= data.count(b"\n") + 1:
             raise AssertionError(f"line {error.line} is not in the file") from error
@@ -51,3 +71,21 @@ def fuzz(data: bytes) -> None:
     for read in _READERS:
         with contextlib.suppress(values.BadValue):
             read(text)
+
+
+def _check_contracts(raw: object) -> None:
+    """Rules, or a BadValue that says where; what they come to is what a peer would take for a contract."""
+    try:
+        read = read_contracts(raw)
+    except values.BadValue as error:
+        if not error.at or not isinstance(error.at[0], int):
+            raise AssertionError(f"a wrong contract, but nothing says which: {error.at}") from error
+        return
+    contracts = Contracts(read.rules)
+    for topic, type_name in (("/a/b", "a/B"), ("/cmd_vel", "geometry_msgs/Twist"), ("/map", "*"), ("/a", "")):
+        contract = contracts.of(topic, type_name)
+        message = Open(7, topic, "/n", contract)
+        if decode(encode(message)) != message:
+            raise AssertionError(f"{contract} does not survive its way to a peer")
+        if set(contracts.explain(topic, type_name)) != set(type(contract).__dataclass_fields__):
+            raise AssertionError("an explanation has other keys than a contract")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.frames import Frame, Kind, parse_pong, parse_text, pong
 
 SEEDS: list[bytes] = [
@@ -12,6 +13,10 @@ SEEDS: list[bytes] = [
     Frame(Kind.CONTROL, b'{"op":"x"}').serialize(),
     Frame(Kind.DATA, b"\x04\x00\x00\x00abcd", 7, 1, 99).serialize(),
     Frame(Kind.BYE, b"ends").serialize() + Frame(Kind.DATA, flags=1).serialize(),
+    Frame(Kind.DATA, b"\x08\x00\x00\x00abcd", 7, 1, 99, FIRST).serialize(),
+    Frame(Kind.DATA, b"efgh", 7, 1, 99, LAST).serialize(),
+    Frame(Kind.DATA, b"", 7, 1, 99, LAST | ABORT).serialize(),
+    *(Frame(kind, route=7, sequence=0xFFFFFFFF).serialize() for kind in (Kind.ACK, Kind.FENCE, Kind.FENCED)),
 ]
 
 

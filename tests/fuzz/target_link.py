@@ -5,6 +5,7 @@ from __future__ import annotations
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
+from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.frames import Frame, Kind, pack_data_header, pong
 from rmpa.mesh.handshake import Hello, Refuse
 from rmpa.mesh.link import Event, HelloReceived, Link, Role, State
@@ -16,6 +17,20 @@ _WELCOME = Frame(Kind.WELCOME, Hello.of(_THEIRS, lease=1.0, expected=_OURS.guid)
 _TALK = Frame(Kind.PING, stamp_ns=5).serialize() + pong(1, 2, 3).serialize() + Frame(Kind.CONTROL, b"{}").serialize()
 _DATA = pack_data_header(4, 1, 1, 9) + b"\0\0\0\0"
 
+_PARTS = b"".join(
+    Frame(Kind.DATA, part, route, 1, 9, flags).serialize()
+    for part, route, flags in (
+        (b"\x08\0\0\0ab", 1, FIRST),
+        (b"\x04\0\0\0", 2, FIRST),
+        (b"cd", 1, 0),
+        (b"", 2, LAST | ABORT),
+        (b"efgh", 1, LAST),
+    )
+)
+_MARKS = b"".join(Frame(kind, route=1, sequence=7).serialize() for kind in (Kind.ACK, Kind.FENCE, Kind.FENCED))
+_LONG = pack_data_header(200_000, 1, 1, 9) + bytes(50)
+"""The beginning of a frame that is handed on as it comes."""
+
 SEEDS: list[bytes] = [
     b"",
     _HELLO,
@@ -23,6 +38,9 @@ SEEDS: list[bytes] = [
     Frame(Kind.REFUSE, Refuse(8, "busy").serialize()).serialize(),
     _HELLO + _TALK + _DATA,
     _TALK + _DATA + Frame(Kind.BYE, b"ends").serialize(),
+    _PARTS + _MARKS,
+    _MARKS + _DATA + _LONG,
+    _PARTS[:60] + _LONG,
 ]
 
 
@@ -36,9 +54,10 @@ def fuzz(data: bytes) -> None:
                 raise AssertionError(f"{whole} whole, but {parts} in pieces")
 
 
-def _feed(role: Role, pieces: list[bytes]) -> tuple[str, int, int]:
-    """What the link says and how it ends."""
+def _feed(role: Role, pieces: list[bytes]) -> tuple[str, int, int, list[list[object]]]:
+    """What the link says and how it ends; of parts, what they are put together."""
     events: list[Event] = []
+    parts: list[list[object]] = []
     data = 0
 
     def on_event(event: Event) -> None:
@@ -50,7 +69,14 @@ def _feed(role: Role, pieces: list[bytes]) -> tuple[str, int, int]:
         nonlocal data
         data += len(payload)
 
-    link = Link(role, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event, on_data=on_data)
+    def on_part(route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
+        whose = (route, sequence, stamp_ns)
+        if flags & FIRST or not parts or parts[-1][0] != whose or parts[-1][2]:
+            parts.append([whose, flags & FIRST, flags & (LAST | ABORT), bytes(part)])
+        else:
+            parts[-1][2:] = [flags & (LAST | ABORT), bytes(parts[-1][3]) + bytes(part)]  # type: ignore[call-overload]
+
+    link = Link(role, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event, on_data=on_data, on_part=on_part)
 
     def closed() -> bool:
         return link.state is State.CLOSED
@@ -70,4 +96,4 @@ def _feed(role: Role, pieces: list[bytes]) -> tuple[str, int, int]:
         if not 0 <= consumed <= len(kept) or wanted < 0:
             raise AssertionError(f"consumed {consumed} of {len(kept)}, wants {wanted}")
         kept = kept[consumed:]
-    return repr(events), data, link.state.value
+    return repr(events), data, link.state.value, parts

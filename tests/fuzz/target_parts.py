@@ -1,0 +1,133 @@
+"""Fuzz target: what a peer sends on a route, whole or in parts, on its way to local subscribers."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rmpa.bridge.aio.flows import ImportFlow, LinkTime
+from rmpa.core import limits
+from rmpa.core.contract import Contract, Reliability
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.mesh.frames import WHOLE, Frame, Kind
+from rmpa.mesh.handshake import Hello
+from rmpa.mesh.link import HelloReceived, Link, Role
+from tests.simulation.network import World
+from tests.simulation.process import Process
+
+if TYPE_CHECKING:
+    from rmpa.mesh.link import Event
+
+_OURS = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")
+_THEIRS = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")
+_HELLO = Frame(Kind.HELLO, Hello.of(_THEIRS, lease=1.0, expected=_OURS.guid).serialize()).serialize()
+
+
+def _wire(*frames: tuple[int, int, bytes]) -> bytes:
+    return b"".join(Frame(Kind.DATA, part, 1, number, 9, flags).serialize() for number, flags, part in frames)
+
+
+_WHOLE = (1, WHOLE, b"\x02\0\0\0ab")
+_PARTS = ((2, FIRST, b"\x08\0\0\0ab"), (2, 0, b"cd"), (2, LAST, b"efgh"))
+
+SEEDS: list[bytes] = [
+    b"",
+    b"B" + _wire(_WHOLE, *_PARTS, (3, WHOLE, b"\0\0\0\0")),
+    b"R" + _wire(_WHOLE, *_PARTS, (3, WHOLE, b"\0\0\0\0")),
+    b"B" + _wire(*_PARTS[:2], (2, LAST | ABORT, b""), (3, WHOLE, b"\x01\0\0\0x")),
+    b"R" + _wire(*_PARTS[:2], (2, LAST | ABORT, b""), (3, WHOLE, b"\x01\0\0\0x")),
+    b"B" + _wire((1, FIRST, b"\x04\0"), (1, LAST, b"\0\0abcd")),
+    b"B" + _wire(*_PARTS[:2], _WHOLE, _PARTS[2], *_PARTS[:1], *_PARTS),
+    b"R" + _wire(*_PARTS[:2], _WHOLE, _PARTS[2], *_PARTS[:1], *_PARTS),
+    b"B" + _wire((0xFFFFFFFF, WHOLE, b"\0\0\0\0"), (0, FIRST, b"\xff\xff\xff\x0f"), (1, WHOLE, b"\0\0\0\0")),
+    b"R" + _wire((0xFFFFFFFF, WHOLE, b"\0\0\0\0"), (0, FIRST, b"\xff\xff\xff\x0f"), (1, WHOLE, b"\0\0\0\0")),
+]
+
+
+class _Subscribers:
+    """What a publication must be able to rely on."""
+
+    def __init__(self) -> None:
+        self.size = 0
+        self.got = -1
+        """Bytes of the message that comes in parts; -1: none does."""
+
+    def publish_framed(self, framed: bytes | bytearray | memoryview) -> None:
+        if self.got >= 0:
+            raise AssertionError("a message in the middle of another one")
+        self._check(len(framed), bytes(framed[:4]))
+
+    def begin(self, size: int) -> None:
+        if self.got >= 0:
+            raise AssertionError("a message begins in the middle of another one")
+        if not 4 <= size <= limits.MESSAGE_MAX:
+            raise AssertionError(f"a message of {size} bytes")
+        self.size, self.got = size, 0
+
+    def extend(self, part: bytes | bytearray | memoryview) -> None:
+        if self.got < 0:
+            raise AssertionError("a part of no message")
+        if self.got == 0:
+            self._check(self.size, bytes(part[:4]))
+        self.got += len(part)
+        if self.got > self.size:
+            raise AssertionError(f"{self.got} bytes of a message of {self.size}")
+        if self.got == self.size:
+            self.got = -1
+
+    def abort(self) -> int:
+        was, self.got = self.got, -1
+        return int(was >= 0)
+
+    def _check(self, size: int, head: bytes) -> None:
+        if len(head) < 4 or int.from_bytes(head, "little") != size - 4:
+            raise AssertionError("what a subscriber reads is not one message")
+
+
+def fuzz(data: bytes) -> None:
+    """Whole messages, one after the other, or a documented error; at the end nobody holds half of one."""
+    Process(World(1), "fuzz").run(_fuzz, data)  # type: ignore[abstract]
+
+
+def _fuzz(data: bytes) -> None:
+    subscribers = _Subscribers()
+    acknowledged: list[int] = []
+    reliable = data[:1] == b"R"
+    contract = Contract(reliability=Reliability.RELIABLE if reliable else Reliability.BEST_EFFORT)
+    flow = ImportFlow(subscribers, contract, LinkTime(), on_ack=acknowledged.append)
+    flow.begin_epoch(int(reliable), 1)
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, HelloReceived):
+            link.accept(0.0)
+
+    def on_data(_route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
+        # As the bridge: a whole one that is none ends the link.
+        if len(payload) < 4 or int.from_bytes(payload[:4], "little") != len(payload) - 4:
+            raise RemoteProtocolError("a data frame that holds no message")
+        flow.message(sequence, stamp_ns, payload)
+
+    def on_part(_route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
+        flow.part(sequence, stamp_ns, flags, part)
+
+    link = Link(Role.ACCEPTOR, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event, on_data=on_data, on_part=on_part)
+    link.receive(memoryview(_HELLO), 0.0)
+    wire = data[1:]
+    try:
+        taken, _ = link.receive(memoryview(wire[: len(wire) // 2]), 0.0)
+        link.receive(memoryview(wire[taken:]), 0.0)
+    except RemoteProtocolError as error:
+        str(error)
+    flow.torn()
+    if subscribers.got >= 0:
+        raise AssertionError("half a message stays where it is")
+    flow.message(flow_next(flow, reliable), 9, memoryview(b"\0\0\0\0"))
+    flow.close()
+
+
+def flow_next(flow: ImportFlow, reliable: bool) -> int:
+    """A number that the flow takes."""
+    position = flow.position
+    return ((position[1] if reliable and position else 0x40000000) + 1) & 0xFFFFFFFF
