@@ -110,6 +110,9 @@ class SlaveNode:
         await self._http.close()
         for subscription in subscriptions.values():
             await subscription.closed()
+        # We and our servers know each other, and wait for the collector; what our owner knows must not.
+        self._on_shutdown, self._on_publisher_update = _ignore, _ignore
+        self._on_param_update, self._taps = _not_followed, tuple
 
     def next_number(self) -> int:
         """A number for a connection of this node."""

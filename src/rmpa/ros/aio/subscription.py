@@ -147,6 +147,7 @@ class PublisherConnection:
     def start(self) -> None:
         """Connect, in a task of its own."""
         self._task = asyncio.get_running_loop().create_task(self._run(), name=f"subscribe {self.topic} {self.uri}")
+        self._task.add_done_callback(self._forget_task)
 
     def close(self) -> None:
         """Leave the publisher at once; no callback comes any more."""
@@ -165,6 +166,10 @@ class PublisherConnection:
         return Connection(
             self.number, self.uri, INBOUND, self.topic, self.connected, self._info, self.bytes, self.messages
         )
+
+    def _forget_task(self, _: asyncio.Task[None]) -> None:
+        """A cancelled one remembers where it was, and so us."""
+        self._task = None
 
     async def _run(self) -> None:
         loop = asyncio.get_running_loop()

@@ -96,6 +96,7 @@ class TcprosServer:
         for link, timer in waiting.items():
             timer.cancel()
             link.close()
+        self._accepted.clear()  # they know us: a cycle otherwise, with all that the publications know
 
     def _listen(self) -> None:
         self._resume = None
