@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 
@@ -161,7 +161,129 @@ class Mismatch(msgspec.Struct, frozen=True, tag_field="op", tag="mismatch"):
         return Source(self.topic, self.node)
 
 
-Message = Advertise | Open | Opened | Close | Closed | Mismatch
+class Audience(msgspec.Struct, frozen=True, tag_field="op", tag="audience"):
+    """Which nodes of mine listen to a route of yours; said where a publisher looks at who listens (actions).
+
+    Args:
+        route: The id.
+        nodes: Their global names, in my graph.
+    """
+
+    route: int
+    nodes: tuple[str, ...] = ()
+
+
+class ServiceOffer(msgspec.Struct, frozen=True):
+    """A service that the sender's graph has.
+
+    Args:
+        service: Its global name, as the receiver is to see it unless it renames it.
+        node: The node that provides it.
+    """
+
+    service: str
+    node: str
+
+
+class AdvertiseServices(msgspec.Struct, frozen=True, tag_field="op", tag="services"):
+    """What the sender's graph provides, as ``Advertise`` does for topics; ``removed`` are names of services."""
+
+    added: tuple[ServiceOffer, ...] = ()
+    removed: tuple[str, ...] = ()
+    full: bool = False
+    more: bool = False
+
+
+class OpenService(msgspec.Struct, frozen=True, tag_field="op", tag="service_open"):
+    """I want to call this service of yours; send replies on this route, which I chose.
+
+    Args:
+        route: The id, from ``limits.SERVICE_ROUTES`` on. Each reply is one message on it, whose sequence is the
+            call's; its body is TCPROS's reply: the byte ``ok``, then the response or the text of the error.
+        service: Its name, as it was offered.
+    """
+
+    route: int
+    service: str
+
+
+class ServiceOpened(msgspec.Struct, frozen=True, tag_field="op", tag="service_opened"):
+    """The service can be called.
+
+    Args:
+        route: The caller's id.
+        requests: The route that calls go to: each is one message, whose sequence the caller chooses.
+        type: The service's type, ``package/Name``.
+        md5: Its MD5 sum, never ``*``.
+        request_type: The type of its requests, as the server says it; may be empty.
+        response_type: Likewise.
+    """
+
+    route: int
+    requests: int
+    type: str
+    md5: str
+    request_type: str = ""
+    response_type: str = ""
+
+
+class CloseService(msgspec.Struct, frozen=True, tag_field="op", tag="service_close"):
+    """I will not call it any more (by the caller's route)."""
+
+    route: int
+
+
+class ServiceClosed(msgspec.Struct, frozen=True, tag_field="op", tag="service_closed"):
+    """The service cannot be called, or no longer; calls on their way were not answered. ``reason`` is for people."""
+
+    route: int
+    reason: str
+
+
+class Ask(msgspec.Struct, frozen=True, tag_field="op", tag="ask"):
+    """A question of one agent to another; ``bridge.aio.asks`` has those that are answered.
+
+    Args:
+        number: The asker's number for it.
+        what: A handler's name.
+        args: What that handler wants, by name.
+    """
+
+    number: int
+    what: str
+    args: dict[str, Any] = {}
+
+
+class Answer(msgspec.Struct, frozen=True, tag_field="op", tag="answer"):
+    """What came of a question.
+
+    Args:
+        number: The asker's number.
+        ok: Whether ``value`` is the answer; else ``error`` says why not and ``remedy`` what to do.
+        value: Anything that JSON can say.
+        error: What happened.
+        remedy: What to do; may be empty.
+    """
+
+    number: int
+    ok: bool
+    value: Any = None
+    error: str = ""
+    remedy: str = ""
+
+
+class Tell(msgspec.Struct, frozen=True, tag_field="op", tag="tell"):
+    """News for another agent that nobody answers; its handler is found by ``what``, as for ``Ask``."""
+
+    what: str
+    args: dict[str, Any] = {}
+
+
+RouteMessage = Open | Opened | Close | Closed | Audience
+TopicMessage = Advertise | Mismatch | RouteMessage
+ServiceMessage = AdvertiseServices | OpenService | ServiceOpened | CloseService | ServiceClosed
+AgentMessage = Ask | Answer | Tell
+Message = TopicMessage | ServiceMessage | AgentMessage
 
 _ENCODER: Final = msgspec.json.Encoder()
 _DECODER: Final = msgspec.json.Decoder(Message)
@@ -202,30 +324,86 @@ def decode(payload: bytes | bytearray | memoryview) -> Message:
 
 
 def _validate(message: Message) -> None:
-    if not isinstance(message, Advertise | Mismatch) and not 0 < message.route <= _ROUTE_MAX:
-        raise RemoteProtocolError(f"route {message.route} is not a 32-bit number above 0")
-    if isinstance(message, Advertise):
-        if len(message.added) > limits.TOPICS_PER_PEER_MAX:
-            raise LimitExceeded("advertisement (in topics)", len(message.added), limits.TOPICS_PER_PEER_MAX)
+    match message:
+        case Advertise():
+            _validate_advertise(message)
+        case Mismatch():
+            _check_names(message.topic, message.node)
+            _check_text(message.subscriber)
+            _check_text(message.text)
+        case Ask() | Answer() | Tell():
+            _validate_agent(message)
+        case AdvertiseServices() | OpenService() | ServiceOpened() | CloseService() | ServiceClosed():
+            _validate_service(message)
+        case _:
+            _validate_route(message)
+
+
+def _validate_advertise(message: Advertise) -> None:
+    if len(message.added) > limits.TOPICS_PER_PEER_MAX:
+        raise LimitExceeded("advertisement (in topics)", len(message.added), limits.TOPICS_PER_PEER_MAX)
+    for offer in message.added:
+        _check_names(offer.topic, offer.node)
+        if not is_crossing_type(offer.type):
+            raise RemoteProtocolError(f"{offer.type[:200]!r}, offered for {offer.topic}, is not a message type")
+    for source in message.removed:
+        _check_names(source.topic, source.node)
+
+
+def _validate_route(message: RouteMessage) -> None:
+    if not 0 < message.route < limits.SERVICE_ROUTES:
+        raise RemoteProtocolError(f"route {message.route} is not a 31-bit number above 0")
+    match message:
+        case Open():
+            _check_names(message.topic, message.node)
+            _check_terms(message)
+        case Closed():
+            _check_text(message.reason)
+        case Opened():
+            if message.description.problem:
+                raise RemoteProtocolError(f"route {message.route}: {message.description.problem}")
+            _check_terms(message)
+        case Audience():
+            if len(message.nodes) > limits.AUDIENCE_MAX:
+                raise LimitExceeded("audience (in nodes)", len(message.nodes), limits.AUDIENCE_MAX)
+            _check_names(*message.nodes)
+
+
+def _validate_service(message: ServiceMessage) -> None:
+    if isinstance(message, AdvertiseServices):
+        if len(message.added) > limits.SERVICES_PER_PEER_MAX:
+            raise LimitExceeded("advertisement (in services)", len(message.added), limits.SERVICES_PER_PEER_MAX)
         for offer in message.added:
-            _check_names(offer.topic, offer.node)
-            if not is_crossing_type(offer.type):
-                raise RemoteProtocolError(f"{offer.type[:200]!r}, offered for {offer.topic}, is not a message type")
-        for source in message.removed:
-            _check_names(source.topic, source.node)
-    elif isinstance(message, Open):
-        _check_names(message.topic, message.node)
-        _check_terms(message)
-    elif isinstance(message, Mismatch):
-        _check_names(message.topic, message.node)
-        _check_text(message.subscriber)
-        _check_text(message.text)
-    elif isinstance(message, Closed):
+            _check_names(offer.service, offer.node)
+        _check_names(*message.removed)
+        return
+    _check_service_route(message.route)
+    if isinstance(message, OpenService):
+        _check_names(message.service)
+    elif isinstance(message, ServiceClosed):
         _check_text(message.reason)
-    elif isinstance(message, Opened):
-        if message.description.problem:
-            raise RemoteProtocolError(f"route {message.route}: {message.description.problem}")
-        _check_terms(message)
+    elif isinstance(message, ServiceOpened):
+        _check_service_route(message.requests)
+        if not is_crossing_type(message.type) or not _MD5.fullmatch(message.md5):
+            raise RemoteProtocolError(f"a service of type {message.type[:200]!r} and md5 sum {message.md5[:64]!r}")
+        for name in (message.request_type, message.response_type):
+            if name and not is_crossing_type(name):
+                raise RemoteProtocolError(f"{name[:200]!r} is not a type of requests or responses")
+
+
+def _check_service_route(route: int) -> None:
+    if not limits.SERVICE_ROUTES <= route <= _ROUTE_MAX:
+        raise RemoteProtocolError(f"route {route} of a service is not from {limits.SERVICE_ROUTES} to {_ROUTE_MAX}")
+
+
+def _validate_agent(message: AgentMessage) -> None:
+    if isinstance(message, Answer):
+        _check_text(message.error)
+        _check_text(message.remedy)
+    elif len(message.what) > limits.ASK_NAME_MAX:
+        raise LimitExceeded("name of a question", len(message.what), limits.ASK_NAME_MAX)
+    if isinstance(message, Ask | Answer) and not 0 < message.number <= _ROUTE_MAX:
+        raise RemoteProtocolError(f"question {message.number} is not a 32-bit number above 0")
 
 
 def _check_terms(message: Open | Opened) -> None:
@@ -248,8 +426,8 @@ def _check_terms(message: Open | Opened) -> None:
     raise RemoteProtocolError(f"route {message.route}: a contract with {problem} cannot be")
 
 
-def _check_names(topic: str, node: str) -> None:
-    for name in (topic, node):
+def _check_names(*names: str) -> None:
+    for name in names:
         if not is_crossing_name(name):
             raise RemoteProtocolError(f"{name[:200]!r} is not a global ROS name")
 

@@ -381,6 +381,18 @@ NODES_PER_PEER_MAX: Final = 256
 """Nodes of one peer that get a proxy here: each takes two listening sockets; large robots have some 100 nodes."""
 MISMATCHES_MAX: Final = 16
 """Refused subscribers of one source that are remembered for the user."""
+SERVICE_ROUTES: Final = 1 << 31
+"""Routes from here on are those of services: topics' are counted from 1."""
+SERVICES_PER_PEER_MAX: Final = 8192
+"""Services that one peer may advertise; a large robot's nodes have some 500, loggers left out."""
+AUDIENCE_MAX: Final = 64
+"""Nodes that listen to one topic and are named to its publisher's agent."""
+ASK_NAME_MAX: Final = 64
+"""Characters of a question's name."""
+ASKS_AT_ONCE: Final = 64
+"""Questions of one peer that are being answered; further ones are refused at once."""
+ASK_TIMEOUT: Final = 5.0
+"""For another agent's answer."""
 CROSSING_NAME_MAX: Final = 1024
 """Characters of a topic's, node's or type's name that crosses the mesh; the longest seen have some 200."""
 CONTROL_TEXT_MAX: Final = 16 * KIB

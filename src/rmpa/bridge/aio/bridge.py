@@ -6,11 +6,12 @@ import asyncio
 import itertools
 import logging
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import actions as act
+from rmpa.bridge.aio.asks import Asks
 from rmpa.bridge.aio.inbound import Inbound
 from rmpa.bridge.aio.outbound import Outbound
 from rmpa.bridge.exports import Exports, LocalSource
@@ -43,6 +44,7 @@ from rmpa.ros.master.effects import GraphChange, Kind
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from rmpa.bridge.aio.part import DataTaker, Part
     from rmpa.bridge.policy import Policy
     from rmpa.bridge.watch import Occurred
     from rmpa.core.contract import Contracts
@@ -64,6 +66,8 @@ class Attached:
     """Runs while the link is gone and reliable routes wait for the peer; ``link`` is the last one."""
     back: asyncio.TimerHandle | None = None
     """Runs while it is back and may still ask for routes that waited."""
+    takers: dict[int, DataTaker] = field(default_factory=dict)
+    """What comes on routes that are not topics'; by the parts."""
 
 
 class Bridge:
@@ -109,6 +113,12 @@ class Bridge:
         self._acting = False
         self._mismatches: dict[Source, dict[str, str]] = {}
         self._refusals = RefusalLog(_log, self.counters)
+        self.asks = Asks(self.counters)
+        self._parts: list[Part] = [self.asks]
+
+    def add(self, part: Part) -> None:
+        """Let a part hear of everything; before ``start()``."""
+        self._parts.append(part)
 
     @property
     def node(self) -> SlaveNode:
@@ -149,6 +159,8 @@ class Bridge:
         self._core.on_change(self._graph_changed)
         self._scan_all()
         self._reconciler = self._loop.call_later(limits.RECONCILE_INTERVAL, self._reconcile)
+        for part in self._parts:
+            part.start()
 
     async def close(self) -> None:
         """Retract all that came from elsewhere and leave all local publishers."""
@@ -160,6 +172,8 @@ class Bridge:
             self._give_up(attached)
         if self._closing:
             await asyncio.gather(*self._closing)
+        for part in reversed(self._parts):
+            await part.close()
         self._outbound.close()
         await self._node.close()
 
@@ -176,6 +190,7 @@ class Bridge:
             self._by_link[link] = back
             self._act(self._imports.link_up(back.peer))
             self._act(self._exports.link_up(back.peer))
+            self._parts_link_up(back)
             self._schedule()
             return
         peer = next(self._numbers)
@@ -193,7 +208,12 @@ class Bridge:
         self._by_number[peer] = self._by_link[link] = attached
         self._act(self._imports.link_up(peer))
         self._act(self._exports.link_up(peer))
+        self._parts_link_up(attached)
         self._schedule()
+
+    def _parts_link_up(self, attached: Attached) -> None:
+        for part in self._parts:
+            part.link_up(attached)
 
     def link_down(self, link: MeshLink) -> None:
         """A link is gone: retract what came over it, but for what a reliable route brings back."""
@@ -204,6 +224,9 @@ class Bridge:
             attached.back.cancel()
             attached.back = None
         attached.inbound.link_down()
+        for part in self._parts:
+            part.link_down(attached)
+        attached.takers.clear()
         self._learning = deque(lesson for lesson in self._learning if lesson[0] is not attached)
         self._learning_bytes = sum(len(lesson) for _, lesson in self._learning if isinstance(lesson, bytes))
         exports, _ = self._exports.link_away(attached.peer)
@@ -247,6 +270,8 @@ class Bridge:
                 if flow.contract.priority is not Priority.HIGH:
                     flow.torn()
             self._outbound.lane_lost(attached.peer)
+            for part in self._parts:
+                part.lane_lost(attached)
 
     def mark(self, link: MeshLink, kind: FrameKind, route: int, sequence: int) -> None:
         """An acknowledgement or the answer to a fence came; one for a route that was closed meanwhile is dropped."""
@@ -283,20 +308,24 @@ class Bridge:
     def data(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
         """A data frame came: the hot path. One for a route that was closed meanwhile is dropped."""
         attached = self._by_link.get(link)
-        flow = attached.inbound.flows.get(route) if attached is not None else None
+        flow: DataTaker | None = attached.inbound.flows.get(route) if attached is not None else None
         if flow is None:
-            self.counters.add("route.unknown")
-        elif len(payload) < 4 or int.from_bytes(payload[:4], "little") != len(payload) - 4:
+            flow = attached.takers.get(route) if attached is not None else None
+            if flow is None:
+                self.counters.add("route.unknown")
+                return
+        if len(payload) < 4 or int.from_bytes(payload[:4], "little") != len(payload) - 4:
             raise RemoteProtocolError(
                 f"a data frame of {len(payload)} bytes on route {route} does not hold one message"
             )
-        else:
-            flow.message(sequence, stamp_ns, payload)
+        flow.message(sequence, stamp_ns, payload)
 
     def part(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
         """A part of a large message came; one for a route that was closed meanwhile is dropped."""
         attached = self._by_link.get(link)
-        flow = attached.inbound.flows.get(route) if attached is not None else None
+        if attached is None:
+            return
+        flow: DataTaker | None = attached.inbound.flows.get(route) or attached.takers.get(route)
         if flow is None:
             self.counters.add("route.unknown")
         else:
@@ -318,10 +347,14 @@ class Bridge:
                 if actions := self._imports.closed(peer, message, now):
                     _log.info("< %s closes route %d: %s", attached.link.name, message.route, message.reason)
                     self._act(actions)
-            case Mismatch() if message.source in self._exports.offered:
+            case Mismatch() if message.source not in self._exports.offered:
+                pass  # it went meanwhile
+            case Mismatch():
                 who = f"{attached.link.name}: {message.source}"
                 self._remember(message.source, f"{attached.link.name}{message.subscriber}", message.text)
                 self._warn("mismatch.remote", who, f"{who}: {message.text}")
+            case _ if not any(part.message(attached, message) for part in self._parts):
+                raise RemoteProtocolError(f"a message of kind {type(message).__name__} that nobody here takes")
 
     def _claim(self, link: MeshLink) -> Attached | None:
         """The peer that was away, if it is this one; another instance in its place shows that it will not come."""
@@ -342,7 +375,11 @@ class Bridge:
             if timer is not None:
                 timer.cancel()
         self._by_number.pop(attached.peer, None)
-        self._by_link.pop(attached.link, None)
+        if self._by_link.pop(attached.link, None) is not None:
+            for part in self._parts:
+                part.link_down(attached)
+        for part in self._parts:
+            part.gone(attached)
         for action in self._exports.link_down(attached.peer):
             self._act([action])
         # Its actions are what closing the inbound side does at once.
@@ -376,6 +413,8 @@ class Bridge:
         if change.kind is not Kind.SERVICE:
             self._changed[change.name] = None
             self._schedule()
+        for part in self._parts:
+            part.graph_changed(change)
 
     def _schedule(self) -> None:
         if self._rescan is None and not self._closed:
@@ -450,6 +489,9 @@ class Bridge:
             breathe()
             if again := attached.inbound.reconcile(publishers):
                 self.counters.add("proxy.registered_again", again)
+        for part in self._parts:
+            breathe()
+            part.reconcile()
 
     def _demand(self, peer: int, source: Source, *, wanted: bool) -> None:
         self._act(self._imports.demand(peer, source, self._loop.time(), wanted=wanted))
