@@ -246,7 +246,7 @@ def test_fields_of_later_versions_are_ignored() -> None:
 _names = st.from_regex(r"/[a-z][a-z0-9_]{0,8}(/[a-z][a-z0-9_]{0,8}){0,3}", fullmatch=True)
 _types = st.from_regex(r"[a-z][a-z_]{0,8}/[A-Z][A-Za-z]{0,8}", fullmatch=True)
 _md5s = st.from_regex(r"[0-9a-f]{32}", fullmatch=True)
-_routes = st.integers(1, (1 << 32) - 1)
+_routes = st.integers(1, (1 << 31) - 1)
 _numbers = st.integers(0, (1 << 32) - 1)
 _times = st.none() | st.floats(limits.CONTRACT_TIME_MIN, limits.CONTRACT_TIME_MAX)
 _contracts = st.builds(
