@@ -48,6 +48,7 @@ soak: $(STAMP) ros  ## disturb three modules for long and see that nothing leaks
 	$(BIN)/python -m tests.soak --seconds $(or $(SECONDS),600) $(if $(SEED),--seed $(SEED))
 
 bench: $(STAMP) ros  ## the measurements, as ratios in one run; results in bench/results
+	-$(BIN)/pip install -q -c constraints.txt -e '.[bench,bench-peers]'  # who cannot have a peer measures without it
 	$(BIN)/python -m bench $(ARGS)
 
 clean:  ## remove what the commands above made
