@@ -298,6 +298,14 @@ TCP_KEEPALIVE_INTERVAL: Final = 10
 """Seconds between such questions."""
 TCP_KEEPALIVE_COUNT: Final = 9
 """Unanswered questions before the connection is dead."""
+SERVICE_MESSAGE_MAX: Final = 64 * MIB
+"""One request or response of a service: maps and point clouds reach some 10 MB, and each is held as a whole."""
+SERVICE_TIMEOUT: Final = 60.0
+"""For a call, where nobody says otherwise: planners take tens of seconds; rospy and roscpp wait for ever."""
+SERVICE_OPEN_TIMEOUT: Final = 5.0
+"""For the connection to a server and its header."""
+SERVICE_STALL: Final = 30.0
+"""For the next bytes of a request that has begun, or the first ones of a client that wants to call only once."""
 SUBSCRIBER_QUEUE_MESSAGES: Final = 1000
 """Messages that wait for one slow local subscriber; the oldest is dropped beyond it."""
 LATCHED_MAX: Final = 100

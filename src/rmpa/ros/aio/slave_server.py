@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from rmpa.ros.aio.publication import Publication
+    from rmpa.ros.aio.service_server import ServiceEndpoint
     from rmpa.ros.aio.subscription import PublisherConnection, Subscription
     from rmpa.ros.slave import Connection
     from rmpa.ros.xmlrpc import XmlRpcValue
@@ -71,6 +72,7 @@ class SlaveNode:
         self._advertised = advertised_host or host
         self._publications: dict[str, Publication] = {}
         self._subscriptions: dict[str, Subscription] = {}
+        self._services: dict[str, ServiceEndpoint] = {}
         self._numbers = itertools.count(1)
         self._on_shutdown = on_shutdown
         self._on_param_update = on_param_update
@@ -78,7 +80,9 @@ class SlaveNode:
         self._taps = taps
         self._api = SlaveApi(name, master_uri, os.getpid(), self)
         self._http = XmlRpcServer(self._call, host, port, counters=self.counters, name=f"node {name}")
-        self._tcpros = TcprosServer(name, self._publications, counters=self.counters, numbers=self._numbers)
+        self._tcpros = TcprosServer(
+            name, self._publications, services=self._services, counters=self.counters, numbers=self._numbers
+        )
 
     @property
     def uri(self) -> str:
@@ -103,6 +107,8 @@ class SlaveNode:
         """Close the topics, then the servers; unregister before."""
         for topic in tuple(self._publications):
             self.remove_publication(topic)
+        for service in tuple(self._services):
+            self.remove_service(service)
         subscriptions, self._subscriptions = self._subscriptions, {}
         for subscription in subscriptions.values():
             subscription.close()
@@ -144,6 +150,27 @@ class SlaveNode:
         if subscription is not None:
             subscription.close()
             await subscription.closed()
+
+    @property
+    def service_uri(self) -> str:
+        """Where this node's services are called, ``rosrpc://host:port``; only after ``start()``."""
+        return f"rosrpc://{self._advertised}:{self._tcpros.address[1]}"
+
+    def add_service(self, endpoint: ServiceEndpoint) -> None:
+        """Serve a service from now on.
+
+        Raises:
+            ValueError: The node serves one of that name already.
+        """
+        if endpoint.service in self._services:
+            raise ValueError(f"{self.name} serves {endpoint.service} already")
+        self._services[endpoint.service] = endpoint
+
+    def remove_service(self, service: str, text: str = "") -> None:
+        """Serve a service no longer; calls under way get an error with ``text``. Nothing happens if it is not served."""
+        endpoint = self._services.pop(service, None)
+        if endpoint is not None:
+            endpoint.withdraw(text)
 
     # --- ros.slave.NodeView -----------------------------------------------------------------------------------
 

@@ -17,10 +17,11 @@ from rmpa.ros.aio.inbound import Inbound
 from rmpa.ros.tcpros import check_request, printable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
 
     from rmpa.core.clock import Clock
     from rmpa.ros.aio.publication import Publication
+    from rmpa.ros.aio.service_server import ServiceEndpoint
     from rmpa.ros.tcpros import Header
 
 _log = logging.getLogger(__name__)
@@ -35,7 +36,7 @@ class TcprosServer:
         publications: By topic; read at each header, so the owner just changes it.
         counters: Counts ``tcpros.refused.*``.
         numbers: Gives each connection its number; shared with the node's outgoing ones.
-        on_service: Takes a connection whose header names a service; without it such a header gets an error.
+        services: By name; read at each header too.
         clock: For the rate limit of the log.
     """
 
@@ -44,16 +45,16 @@ class TcprosServer:
         name: str,
         publications: Mapping[str, Publication],
         *,
+        services: Mapping[str, ServiceEndpoint] | None = None,
         counters: Counters | None = None,
         numbers: Iterator[int] | None = None,
-        on_service: Callable[[Inbound], None] | None = None,
         clock: Clock | None = None,
     ) -> None:
         self._name = name
         self._publications = publications
+        self._services: Mapping[str, ServiceEndpoint] = services if services is not None else {}
         self._refusals = RefusalLog(_log, counters if counters is not None else Counters())
         self._numbers = numbers if numbers is not None else itertools.count(1)
-        self._on_service = on_service
         self._clock = clock if clock is not None else SystemClock()
         self._socket: socket.socket | None = None
         self._listening = False
@@ -154,15 +155,16 @@ class TcprosServer:
         timer = self._waiting.pop(link, None)
         if timer is not None:
             timer.cancel()
-        if "service" in fields and self._on_service is not None:
-            self._on_service(link)
-            return
         problem = check_request(fields)
         if problem is not None:
             self._refuse("header", link.peer[0], f"{self._name}: a connection from {link.peer[0]}: {problem}")
             link.refuse(problem)
             return
         if "service" in fields:
+            endpoint = self._services.get(fields["service"])
+            if endpoint is not None:
+                endpoint.attach(link)
+                return
             # Quiet: a client, or only its probe, that was told of a service which is gone.
             _log.debug("! %s: no service %s", self._name, printable(fields["service"]))
             link.refuse(f"[{self._name}] does not offer the service [{printable(fields['service'])}]")
