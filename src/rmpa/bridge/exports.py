@@ -141,6 +141,10 @@ class Exports:
         """What peers are told of."""
         return self._local
 
+    def source(self, peer: int, route: int) -> Source | None:
+        """What a peer has open on a route."""
+        return known.routes.get(route) if (known := self._peers.get(peer)) is not None else None
+
     def flowing(self, source: Source) -> tuple[int, ...]:
         """The peers that a source goes to now."""
         flow = self._flows.get(source)

@@ -14,6 +14,7 @@ from rmpa.bridge import actions as act
 from rmpa.bridge.aio.asks import Asks
 from rmpa.bridge.aio.inbound import Inbound
 from rmpa.bridge.aio.outbound import Outbound
+from rmpa.bridge.aio.presence import Presence
 from rmpa.bridge.exports import Exports, LocalSource
 from rmpa.bridge.imports import Imports
 from rmpa.bridge.messages import (
@@ -114,7 +115,8 @@ class Bridge:
         self._mismatches: dict[Source, dict[str, str]] = {}
         self._refusals = RefusalLog(_log, self.counters)
         self.asks = Asks(self.counters)
-        self._parts: list[Part] = [self.asks]
+        self._presence = Presence(self._exports, self._imports, self._by_number.get, self._refusals)
+        self._parts: list[Part] = [self.asks, self._presence]
 
     def add(self, part: Part) -> None:
         """Let a part hear of everything; before ``start()``."""
@@ -202,6 +204,7 @@ class Bridge:
             on_demand=lambda source, wanted: self._demand(peer, source, wanted=wanted),
             on_mismatch=lambda source, subscriber, text: self._mismatched(peer, source, subscriber, text),
             on_occurred=lambda source, occurred: self._occurred(peer, source, occurred),
+            on_listeners=lambda source: self._presence.changed(peer, source),
         )
         inbound.time.resumed_at = lambda: link.resumed_at
         attached = Attached(peer, link, inbound)
@@ -562,6 +565,7 @@ class Bridge:
             case act.Disconnect():
                 self._outbound.disconnect(action.source)
             case act.SuspendRoute():
+                self._presence.route_over(action.peer, action.source)
                 self._outbound.suspend_route(action)
             case act.AddRoute():
                 attached = self._by_number.get(action.peer)
@@ -576,6 +580,7 @@ class Bridge:
                         else:
                             self._act(self._exports.given_up(action.source, action.peer))
             case act.RemoveRoute():
+                self._presence.route_over(action.peer, action.source)
                 self._outbound.remove_route(action)
                 attached = self._by_number.get(action.peer)
                 if attached is not None and attached.away is None:
@@ -596,6 +601,7 @@ class Bridge:
                 if self._ticker is None:
                     self._ticker = self._loop.call_later(limits.STALE_TICK, self._tick)
                 attached.inbound.describe(action, lambda last: link.mark(FrameKind.ACK, route, last))
+                self._presence.changed(action.peer, action.source)
             case act.Detach():
                 attached.inbound.detach(action)
 

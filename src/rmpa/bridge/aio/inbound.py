@@ -57,6 +57,7 @@ class Inbound:
         on_demand: Called with a source and whether somebody local listens to it.
         on_mismatch: Called with a source, the caller id of a refused subscriber and the text it was told.
         on_occurred: Called with a source and what became of its contract.
+        on_listeners: Called with a source when other nodes than before are served with it.
     """
 
     def __init__(
@@ -68,7 +69,9 @@ class Inbound:
         on_demand: Callable[[Source, bool], None],
         on_mismatch: Callable[[Source, str, str], None],
         on_occurred: Callable[[Source, Occurred], None],
+        on_listeners: Callable[[Source], None] = lambda _: None,
     ) -> None:
+        self._on_listeners = on_listeners
         self._on_occurred = on_occurred
         self.prefix = prefix
         self._core = core
@@ -299,6 +302,7 @@ class Inbound:
             on_first_subscriber=lambda: self._on_demand(source, True),
             on_last_subscriber=lambda: self._on_demand(source, False),
             on_mismatch=lambda fields, text: self._on_mismatch(source, printable(fields.get("callerid", "")), text),
+            on_listeners=lambda: self._on_listeners(source),
         )
         proxy.node.add_publication(publication)
         proxy.publications[source.topic] = publication

@@ -42,6 +42,7 @@ class Publication:
         on_first_subscriber: Somebody listens: open the route.
         on_last_subscriber: Nobody listens any more.
         on_mismatch: ``(fields, text)``: a subscriber was refused; its header and what it was told.
+        on_listeners: Who is served has changed; see ``listeners``.
         queue_messages: Messages that wait for one slow subscriber; the oldest is dropped beyond it.
         queue_bytes: The same in bytes; one message always fits.
     """
@@ -55,6 +56,7 @@ class Publication:
         on_first_subscriber: Callable[[], None] = _ignore,
         on_last_subscriber: Callable[[], None] = _ignore,
         on_mismatch: Callable[[Mapping[str, str], str], None] = _ignore,
+        on_listeners: Callable[[], None] = _ignore,
         queue_messages: int = limits.SUBSCRIBER_QUEUE_MESSAGES,
         queue_bytes: int = limits.SUBSCRIBER_QUEUE_BYTES,
     ) -> None:
@@ -69,6 +71,7 @@ class Publication:
         self._on_first = on_first_subscriber
         self._on_last = on_last_subscriber
         self._on_mismatch = on_mismatch
+        self._on_listeners = on_listeners
         self._queue_messages = queue_messages
         self._queue_bytes = queue_bytes
         self._held: tuple[Inbound, ...] = ()
@@ -96,6 +99,11 @@ class Publication:
     def subscribers(self) -> int:
         """Connections, held ones included."""
         return len(self._held) + len(self._open)
+
+    @property
+    def listeners(self) -> tuple[str, ...]:
+        """The caller ids of those that are served, as they gave them."""
+        return tuple(link.caller_id for link in self._open)
 
     @property
     def dropped(self) -> int:
@@ -153,6 +161,7 @@ class Publication:
         if self._reply and self._reply != reply:
             self._latched.clear()
             old, self._open = self._open, ()
+            self._on_listeners()
             for link in old:
                 self._count_out(link)
                 link.close()
@@ -233,6 +242,7 @@ class Publication:
             self._count_out(link)
             link.close()
         self._open = tuple(link for link in self._open if link not in torn)
+        self._on_listeners()
         if before and not self.subscribers:
             self._on_last()
         return len(torn)
@@ -274,6 +284,7 @@ class Publication:
             link.send(framed)
         if not link.stream.closed:
             self._open += (link,)
+            self._on_listeners()
 
     def _refuse(self, link: Inbound, text: str) -> None:
         _log.debug("! %s: refuses subscriber %s: %s", self.topic, printable(link.caller_id), text)
@@ -290,5 +301,6 @@ class Publication:
         self._parcels = [(other, parcel) for other, parcel in self._parcels if other is not link]
         self._held = tuple(other for other in self._held if other is not link)
         self._open = tuple(other for other in self._open if other is not link)
+        self._on_listeners()
         if before and not self.subscribers and not self._withdrawn:
             self._on_last()
