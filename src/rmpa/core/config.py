@@ -43,6 +43,40 @@ class PolicySettings:
 
 
 @dataclass(frozen=True, slots=True)
+class Remap:
+    """One name that is another one at a peer, or a namespace: both ends with ``/**``.
+
+    Args:
+        source: The name before, or ``/namespace/**``; ``{peer}`` in it is the peer's name.
+        target: The name after, likewise.
+        types: Globs over message types, one of which must fit; empty: topics of any type, services, parameters.
+    """
+
+    source: str
+    target: str
+    types: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class PeerRule:
+    """One ``[[peer]]``: what holds between us and the peers of some name. All that fit a peer apply, in order.
+
+    Args:
+        name: A glob over peers' names.
+        prefix: What is put in front of their names here, and taken from ours there; ``{peer}`` is the peer's name.
+        remap_in: Their names (before) and what they are here (after); the first that fits.
+        remap_out: Our names (before) and what they are there (after).
+        policy: What may cross to and from them, on top of ``[bridge]``; in our names.
+    """
+
+    name: str
+    prefix: str = ""
+    remap_in: tuple[Remap, ...] = ()
+    remap_out: tuple[Remap, ...] = ()
+    policy: PolicySettings = field(default_factory=PolicySettings)
+
+
+@dataclass(frozen=True, slots=True)
 class LaneSettings:
     """How the packets of each lane are marked.
 
@@ -92,6 +126,7 @@ class Settings:
         group_port: Its port before the domain is added.
         multicast: Whether beacons are sent to the group at all (``ROS_AUTOMATIC_DISCOVERY_RANGE=OFF`` says no).
         policy: What may cross.
+        peers: What holds for single peers, in the order of the file.
         contracts: What the topics need, in the order of the file (``core.contract.Contracts``).
         lanes: How the lanes are marked.
         realtime: What is asked of the kernel.
@@ -112,6 +147,7 @@ class Settings:
     group_port: int = limits.MULTICAST_PORT
     multicast: bool = True
     policy: PolicySettings = field(default_factory=PolicySettings)
+    peers: tuple[PeerRule, ...] = ()
     contracts: tuple[Rule, ...] = ()
     lanes: LaneSettings = field(default_factory=LaneSettings)
     realtime: RealtimeSettings = field(default_factory=RealtimeSettings)

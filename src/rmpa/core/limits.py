@@ -45,6 +45,8 @@ CONFIG_FILE_MAX: Final = 256 * KIB
 """A settings file; ours is some 4 KB, and finding a line in a huge one takes long."""
 CONTRACTS_REMEMBERED: Final = 4096
 """(topic, type) pairs whose contract is remembered; the oldest is forgotten first, and found again by the rules."""
+NAMES_REMEMBERED: Final = 256
+"""Peers whose names' rules are remembered: as many as peers have names in a large network; found again by the rules."""
 CONTRACT_DEPTH_MAX: Final = 100_000
 """Messages that a contract may let wait: 100 s of a 1 kHz topic. ``LINK_QUEUE_BYTES`` bounds their bytes."""
 CONTRACT_TIME_MIN: Final = 0.001
