@@ -20,6 +20,7 @@ SEEDS: list[bytes] = [
     ),
     b'{"op":"closed","route":7,"reason":"the node has gone"}',
     b'{"op":"mismatch","topic":"/cmd","node":"/joy","subscriber":"/base","text":"md5"}',
+    b'{"op":"audience","route":7,"nodes":["/arm","/move_base"]}',
 ]
 
 
