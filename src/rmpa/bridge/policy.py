@@ -5,20 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.names import matches
+from rmpa.core.names import NEVER_CROSSING, matches
 
 if TYPE_CHECKING:
-    from rmpa.core.config import PolicySettings
+    from rmpa.core.config import PeerRule, PolicySettings
 
 OWN_NODE: Final = "/rmpa"
 """The agent's own node; what it stands for lives below: ``/rmpa/<peer>/<node>``."""
 
-BUILT_IN_DENY: Final = {
-    "/rosout": "log messages stay home: a bridged /rosout would loop",
-    "/rosout_agg": "log messages stay home: a bridged /rosout would loop",
-    "/clock": "time stays home: two clocks in one graph make it jump",
-    "/rmpa/**": "the agent's own topics stay home",
-}
+BUILT_IN_DENY: Final = NEVER_CROSSING
 """Topics that never cross, and why."""
 
 
@@ -39,29 +34,63 @@ class Policy:
     """Judges sources by their topic, type and node.
 
     Args:
-        settings: The user's globs.
+        settings: The user's globs for all peers.
+        peers: And those for single ones, on top.
     """
 
-    def __init__(self, settings: PolicySettings) -> None:
+    def __init__(self, settings: PolicySettings, peers: tuple[PeerRule, ...] = ()) -> None:
         self._settings = settings
+        self._peers = peers
 
     def judge(self, topic: str, type_name: str, node: str) -> Decision:
         """Decide about one source; the first "no" wins, in the order of the table below."""
         if is_own(node):
             return Decision(False, f"{node} stands for a node of another module, or is the agent itself")
-        for pattern, why in BUILT_IN_DENY.items():
-            if matches(pattern, topic):
-                return Decision(False, f"built in: {why}")
-        for key, patterns, name in (
-            ("bridge.deny", self._settings.deny, topic),
-            ("bridge.deny_types", self._settings.deny_types, type_name),
-        ):
-            for pattern in patterns:
-                if matches(pattern, name):
-                    return Decision(False, f"{key} has {pattern!r}")
-        if not any(matches(pattern, type_name) for pattern in self._settings.allow_types):
-            return Decision(False, f"no glob of bridge.allow_types fits {type_name}")
-        for pattern in self._settings.allow:
-            if matches(pattern, topic):
-                return Decision(True, f"bridge.allow has {pattern!r}")
-        return Decision(False, f"no glob of bridge.allow fits {topic}")
+        if why := never_crosses(topic):
+            return Decision(False, f"built in: {why}")
+        return _judge(self._settings, "bridge", topic, type_name)
+
+    def has_rules_for(self, peer: str) -> bool:
+        """Whether ``judge_for`` has anything to say about a peer."""
+        return any(matches(rule.name, peer) for rule in self._peers)
+
+    def judge_for(self, peer: str, name: str, type_name: str | None = None, wire: str = "") -> Decision:
+        """Decide whether what ``judge`` lets cross may do so between us and one peer.
+
+        Args:
+            peer: The peer's name.
+            name: What it is here: a topic or a service.
+            type_name: A topic's message type; ``None`` where there is none to judge by.
+            wire: What it is called on its way, where that is another name.
+        """
+        decision = Decision(True, "")
+        if wire and wire != name and (why := never_crosses(wire)):
+            return Decision(False, f"built in: {why} (it is {wire} there)")
+        for rule in self._peers:
+            if matches(rule.name, peer):
+                decision = _judge(rule.policy, f'peer "{rule.name}"', name, type_name)
+                if not decision.allowed:
+                    return decision
+        return decision
+
+
+def never_crosses(topic: str) -> str:
+    """Why a topic never crosses, or empty."""
+    return next((why for pattern, why in BUILT_IN_DENY.items() if matches(pattern, topic)), "")
+
+
+def _judge(settings: PolicySettings, where: str, name: str, type_name: str | None) -> Decision:
+    """Decide by one set of globs; ``where`` is its place in the file, to show."""
+    for pattern in settings.deny:
+        if matches(pattern, name):
+            return Decision(False, f"{where}.deny has {pattern!r}")
+    if type_name is not None:
+        for pattern in settings.deny_types:
+            if matches(pattern, type_name):
+                return Decision(False, f"{where}.deny_types has {pattern!r}")
+        if not any(matches(pattern, type_name) for pattern in settings.allow_types):
+            return Decision(False, f"no glob of {where}.allow_types fits {type_name}")
+    for pattern in settings.allow:
+        if matches(pattern, name):
+            return Decision(True, f"{where}.allow has {pattern!r}")
+    return Decision(False, f"no glob of {where}.allow fits {name}")

@@ -7,6 +7,13 @@ from functools import lru_cache
 from typing import Final
 
 _LEGAL: Final = re.compile(r"[~/A-Za-z][\w/]*", re.ASCII)
+NEVER_CROSSING: Final = {
+    "/rosout": "log messages stay home: a bridged /rosout would loop",
+    "/rosout_agg": "log messages stay home: a bridged /rosout would loop",
+    "/clock": "time stays home: two clocks in one graph make it jump",
+    "/rmpa/**": "the agent's own topics stay home",
+}
+"""Topics that stay in their module under every policy, and why."""
 _TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*")
 
 
@@ -57,14 +64,17 @@ def resolve_name(name: str, namespace: str = "/", node: str = "") -> str:
 
 @lru_cache(maxsize=4096)
 def _compile_glob(pattern: str) -> re.Pattern[str]:
-    wild = {"**": ".*", "*": "[^/]*", "?": "[^/]"}
-    return re.compile("".join(wild.get(piece) or re.escape(piece) for piece in re.split(r"(\*\*|\*|\?)", pattern)))
+    # "/**/" may also be one slash: any number of parts between, none too.
+    wild = {"/**/": "/(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
+    pieces = re.split(r"(/\*\*/|\*\*|\*|\?)", pattern)
+    return re.compile("".join(wild.get(piece) or re.escape(piece) for piece in pieces))
 
 
 def matches(pattern: str, name: str) -> bool:
     """Whether a name fits a glob: ``*`` and ``?`` stay within one part of the name, ``**`` crosses slashes.
 
-    ``/camera/**`` also fits ``/camera`` itself, as people expect of a namespace.
+    ``/camera/**`` also fits ``/camera`` itself, as people expect of a namespace; likewise ``/**/cmd_vel`` fits
+    ``/cmd_vel``, and ``/a/**/b`` fits ``/a/b``.
     """
     if pattern.endswith("/**") and pattern[:-3] and _compile_glob(pattern[:-3]).fullmatch(name):
         return True
