@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 
 from rmpa.core import limits
 from rmpa.core.config import HostPort, LaneSettings, PolicySettings, RealtimeSettings, Settings
-from rmpa.core.config_file import known_keys, line_of, parse_config
+from rmpa.core.config_file import LISTS, known_keys, line_of, parse_config
 from rmpa.core.config_sources import Flags, Loaded, find_config_file, load_settings
 from rmpa.core.contract import Rule
 from rmpa.core.errors import ConfigError
+from tests.core.example import EXAMPLE, uncommented
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "rmpa.toml"
 Load = Callable[..., Loaded]
 Refuse = Callable[..., str]
 
@@ -59,7 +59,7 @@ def test_the_example_says_the_defaults(load: Load) -> None:
 
 
 def test_the_example_shows_every_key_and_its_commented_lines_load() -> None:
-    lines = EXAMPLE.read_text().partition("# [[contract]]")[0].split("\n")
+    lines = EXAMPLE.read_text().partition("# [[")[0].split("\n")
     shown = [line.removeprefix("# ") if line.startswith("# ") and " = " in line else line for line in lines]
     # A commented alternative takes the place of the default above it.
     kept: dict[tuple[str, str], str] = {}
@@ -71,7 +71,17 @@ def test_the_example_shows_every_key_and_its_commented_lines_load() -> None:
     text = ""
     for name in dict.fromkeys(t for t, _ in kept):
         text += name + "\n" + "\n".join(line for (t, _), line in kept.items() if t == name) + "\n"
-    assert set(parse_config(text.encode(), None)) == set(known_keys()) - {("contract",)}
+    assert set(parse_config(text.encode(), None)) == set(known_keys()) - {(name,) for name in LISTS}
+
+
+def test_the_examples_lists_of_tables_load_and_show_every_key(load: Load) -> None:
+    text = uncommented(EXAMPLE.read_text())
+    found = parse_config(text.encode(), None)
+    for name, keys in LISTS.items():
+        tables = found[name,]
+        assert isinstance(tables, list)
+        assert {key for table in tables for key in table} == set(keys), name
+    assert load(text).notes == ()
 
 
 def test_each_source_outweighs_the_one_before(load: Load) -> None:

@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from rmpa.core import limits
 from rmpa.core.config import Settings
 from rmpa.core.config_contract import read_duration, read_rate
-from rmpa.core.config_file import CONTRACT_KEYS, line_of, parse_config
+from rmpa.core.config_file import LISTS, line_of
 from rmpa.core.config_sources import Flags, Loaded, load_settings
 from rmpa.core.config_values import BadValue
 from rmpa.core.contract import KEYS, Contract, Contracts, Durability, History, Liveliness, Priority, Reliability, Rule
 from rmpa.core.errors import ConfigError
+from tests.core.example import EXAMPLE, uncommented
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "rmpa.toml"
 DOCUMENT = Path(__file__).parents[2] / "docs" / "contracts.md"
 Load = Callable[[str], Loaded]
 
@@ -85,13 +85,8 @@ def test_no_rules_are_no_rules(load: Load) -> None:
     assert load("contract = []").settings.contracts == ()
 
 
-def test_the_examples_rules_load_and_show_every_key(load: Load) -> None:
-    head, mark, tail = EXAMPLE.read_text().partition("# [[contract]]")
-    rules = "\n".join(line.removeprefix("#").strip() for line in (mark + tail).split("\n"))
-    found = parse_config((head + rules).encode(), None)["contract",]
-    assert isinstance(found, list)
-    assert {key for table in found for key in table} == set(CONTRACT_KEYS)
-    loaded = load(head + rules)
+def test_the_examples_rules_load(load: Load) -> None:
+    loaded = load(uncommented(EXAMPLE.read_text()))
     contracts = Contracts(loaded.settings.contracts)
     assert loaded.notes == ()
     assert contracts.of("/base/cmd_vel", "geometry_msgs/Twist").deadline == 0.2
@@ -119,7 +114,7 @@ def test_the_documentation_has_every_key_and_every_default() -> None:
         key: str(
             getattr(Contract(), key.removesuffix("_duration")) or ("unlimited" if key == "max_rate" else "infinite")
         )
-        for key in CONTRACT_KEYS[2:]
+        for key in LISTS["contract"][2:]
     }
     assert {key: value for key, value in written.items() if key in defaults} == defaults
 

@@ -7,8 +7,10 @@ from pathlib import Path
 
 from rmpa.bridge.messages import Open, decode, encode
 from rmpa.core import config_values as values
+from rmpa.core import limits
 from rmpa.core.config_contract import read_contracts, read_duration, read_rate
 from rmpa.core.config_file import known_keys, parse_config
+from rmpa.core.config_param import overlap, read_follow_rules, untouchable
 from rmpa.core.contract import Contracts
 from rmpa.core.errors import ConfigError
 
@@ -40,7 +42,8 @@ SEEDS: list[bytes] = [
     b"sensor_msgs/*",
     b"10.0.0.1:40001;far.example.org",
     b"".join(
-        line.removeprefix(b"# ") for line in _EXAMPLE.read_bytes().partition(b"# [[contract]]")[2].splitlines(True)
+        line.removeprefix(b"# ")
+        for line in _EXAMPLE.read_bytes().partition(b"# [[contract]]")[2].partition(b"\n\n")[0].splitlines(True)
     ).join([b"[[contract]]", b""]),
     b'[[contract]]\ntopics = ["/a/**"]\ntypes = ["a/B", "std_msgs/*"]\ndepth = 5\nhistory = "keep_all"\n',
     b'[[contract]]\ntopics = ["/**"]\nliveliness = "manual_by_topic"\nliveliness_lease_duration = "1.5 s"\n',
@@ -48,6 +51,7 @@ SEEDS: list[bytes] = [
     b"[[contract]]\ntypes = ['*/*']\nreliability = 'reliable'\ndurability = 'transient_local'\ndepth = 100_000\n",
     b"[[contract]]\ntopics = ['/**']\ndeadline = 1e-9\nlifespan = 1e9\nmax_rate = 1e-9\ndepth = 0\n",
     b"[[contract]]\ntopics = ['/**']\nlifespan = '86401 s'\n",
+    b'[[param]]\nkey = "/a/b"\nfrom = "base"\nto = "/c"\n[[param]]\nkey = "c/d"\nfrom = "arm"\n[time]\nfollow = ""\n',
     b"100 ms",
     b"86400.000000000 s",
     b"infinite",
@@ -60,6 +64,7 @@ def fuzz(data: bytes) -> None:
     try:
         found = parse_config(data, Path("rmpa.toml"))
         rules = found.pop(("contract",), [])
+        _check_follow_rules(found.pop(("param",), []))
         if not set(found) <= set(known_keys()):
             raise AssertionError(f"unknown keys came through: {set(found) - set(known_keys())}")
         _check_contracts(rules)
@@ -71,6 +76,19 @@ def fuzz(data: bytes) -> None:
     for read in _READERS:
         with contextlib.suppress(values.BadValue):
             read(text)
+
+
+def _check_follow_rules(raw: object) -> None:
+    """Rules of which no two touch each other, or a BadValue that says where."""
+    try:
+        rules = read_follow_rules(raw)
+    except values.BadValue as error:
+        if error.at == () and isinstance(raw, list) and len(raw) <= limits.FOLLOWED_MAX:
+            raise AssertionError("a wrong rule, but nothing says which") from error
+        return
+    for index, rule in enumerate(rules):
+        if untouchable(rule.to) or any(overlap(rule.to, other.to) for other in rules[:index]):
+            raise AssertionError(f"{rule} must not be")
 
 
 def _check_contracts(raw: object) -> None:

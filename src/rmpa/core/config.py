@@ -77,6 +77,53 @@ class PeerRule:
 
 
 @dataclass(frozen=True, slots=True)
+class FollowRule:
+    """A parameter, or a namespace as a whole, of another module that this one follows (``[[param]]``).
+
+    Args:
+        key: Its global name over there.
+        owner: The peer's name.
+        to: Its global name here.
+    """
+
+    key: str
+    owner: str
+    to: str
+
+    def __str__(self) -> str:
+        """``base:/robot_description as /base/robot_description``."""
+        return f"{self.owner}:{self.key}" + (f" as {self.to}" if self.to != self.key else "")
+
+
+@dataclass(frozen=True, slots=True)
+class ParamSettings:
+    """What crosses of the parameters.
+
+    Args:
+        remote_get: Globs over what peers may read and follow.
+        remote_set: Globs over what they may set and delete.
+        follow: What this module follows, no two of them within each other.
+    """
+
+    remote_get: tuple[str, ...] = ("/**",)
+    remote_set: tuple[str, ...] = ("/**",)
+    follow: tuple[FollowRule, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class TimeSettings:
+    """Simulated time (``/use_sim_time`` and ``/clock``) across modules.
+
+    Args:
+        follow: The peer whose time holds here; empty for none.
+        share: Whether peers may have ours.
+    """
+
+    follow: str = ""
+    share: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class LaneSettings:
     """How the packets of each lane are marked.
 
@@ -128,6 +175,8 @@ class Settings:
         policy: What may cross.
         peers: What holds for single peers, in the order of the file.
         contracts: What the topics need, in the order of the file (``core.contract.Contracts``).
+        params: What crosses of the parameters.
+        time: Whose simulated time holds.
         lanes: How the lanes are marked.
         realtime: What is asked of the kernel.
         log_level: ``debug``, ``info``, ``warning`` or ``error``.
@@ -149,6 +198,8 @@ class Settings:
     policy: PolicySettings = field(default_factory=PolicySettings)
     peers: tuple[PeerRule, ...] = ()
     contracts: tuple[Rule, ...] = ()
+    params: ParamSettings = field(default_factory=ParamSettings)
+    time: TimeSettings = field(default_factory=TimeSettings)
     lanes: LaneSettings = field(default_factory=LaneSettings)
     realtime: RealtimeSettings = field(default_factory=RealtimeSettings)
     log_level: str = "info"

@@ -84,6 +84,28 @@ class ContractTable(_Table, kw_only=True):
     max_rate: object | UnsetType = UNSET
 
 
+class ParamsTable(_Table, kw_only=True):
+    """``[params]``: what peers may do with this module's parameters."""
+
+    remote_get: list[str] | UnsetType = UNSET
+    remote_set: list[str] | UnsetType = UNSET
+
+
+class ParamTable(_Table, kw_only=True):
+    """``[[param]]``: a parameter of a peer that is followed; ``core.config_param`` reads the values."""
+
+    key: str | UnsetType = UNSET
+    from_: str | UnsetType = msgspec.field(default=UNSET, name="from")
+    to: str | UnsetType = UNSET
+
+
+class TimeTable(_Table, kw_only=True):
+    """``[time]``: whose simulated time this module has, and who may have ours."""
+
+    follow: str | UnsetType = UNSET
+    share: bool | UnsetType = UNSET
+
+
 class LanesTable(_Table, kw_only=True):
     """``[lanes]``: how the packets of each lane are marked."""
 
@@ -119,6 +141,9 @@ class ConfigFile(_Table, kw_only=True):
     discovery: DiscoveryTable = msgspec.field(default_factory=DiscoveryTable)
     bridge: BridgeTable = msgspec.field(default_factory=BridgeTable)
     contract: list[ContractTable] | UnsetType = UNSET
+    params: ParamsTable = msgspec.field(default_factory=ParamsTable)
+    param: list[ParamTable] | UnsetType = UNSET
+    time: TimeTable = msgspec.field(default_factory=TimeTable)
     lanes: LanesTable = msgspec.field(default_factory=LanesTable)
     realtime: RealtimeTable = msgspec.field(default_factory=RealtimeTable)
     log: LogTable = msgspec.field(default_factory=LogTable)
@@ -136,7 +161,7 @@ def _keys(table: type[msgspec.Struct]) -> dict[str, type[msgspec.Struct] | None]
 def known_keys() -> list[Key]:
     """Every key that a file may have: ``("name",)``, ``("core", "port")`` and so on.
 
-    ``("contract",)`` is one: its value is the list of all ``[[contract]]``, each a dict of ``CONTRACT_KEYS``.
+    Each of ``LISTS`` is one: ``("contract",)`` has the list of all ``[[contract]]``, each a dict of its keys.
     """
     found: list[Key] = []
     for name, table in _keys(ConfigFile).items():
@@ -144,8 +169,8 @@ def known_keys() -> list[Key]:
     return found
 
 
-CONTRACT_KEYS: Final = tuple(_keys(ContractTable))
-"""What a ``[[contract]]`` may have."""
+LISTS: Final = {name: tuple(_keys(table)) for name, table in (("contract", ContractTable), ("param", ParamTable))}
+"""The tables that there may be many of (``[[contract]]``), and the keys that each may have."""
 
 
 def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
@@ -185,14 +210,8 @@ def parse_config(data: bytes, path: Path | None) -> dict[Key, object]:
             value = getattr(value, part)
         if value is not UNSET:
             found[key] = value
-    if parsed.contract is not UNSET:
-        found["contract",] = [_written(table) for table in parsed.contract]
+    found.update(((name,), table[name]) for name in LISTS if name in table)
     return found
-
-
-def _written(contract: ContractTable) -> dict[str, object]:
-    values = {key: getattr(contract, key) for key in CONTRACT_KEYS}
-    return {key: value for key, value in values.items() if value is not UNSET}
 
 
 def _parse_toml(text: str, path: Path | None) -> dict[str, Any]:
@@ -226,8 +245,8 @@ def dotted(place: Place) -> str:
 
 def _unknown(table: dict[str, Any]) -> Iterator[tuple[Place, str]]:
     """Unknown keys, each with what was probably meant."""
-    everywhere = [key for key in known_keys() if key != ("contract",)]
-    everywhere += [("contract", key) for key in CONTRACT_KEYS]
+    everywhere = [key for key in known_keys() if key[0] not in LISTS]
+    everywhere += [(name, key) for name, keys in LISTS.items() for key in keys]
     tables = _keys(ConfigFile)
     for name, value in table.items():
         if name not in tables:
@@ -242,10 +261,10 @@ def _inside(name: str, value: object, struct: type[msgspec.Struct] | None) -> It
     """The tables below one key of the file, each with its place and the keys that it may have."""
     if struct is not None and isinstance(value, dict):
         yield (name,), value, list(_keys(struct))
-    if name == "contract":
+    if name in LISTS:
         for index, element in enumerate(value if isinstance(value, list) else ()):
             if isinstance(element, dict):
-                yield (name, index), element, list(CONTRACT_KEYS)
+                yield (name, index), element, list(LISTS[name])
 
 
 def _meant(word: str, table: Key, everywhere: list[Key], here: list[str]) -> str:
@@ -265,7 +284,7 @@ def _meant(word: str, table: Key, everywhere: list[Key], here: list[str]) -> str
 def _home(key: Key) -> str:
     if len(key) == 1:
         return "above the first table"
-    return "in a [[contract]]" if key[0] == "contract" else f"in [{key[0]}]"
+    return f"in a [[{key[0]}]]" if key[0] in LISTS else f"in [{key[0]}]"
 
 
 def _wrong_type(error: msgspec.ValidationError, table: dict[str, Any], text: str, path: Path | None) -> ConfigError:
@@ -279,8 +298,8 @@ def _wrong_type(error: msgspec.ValidationError, table: dict[str, Any], text: str
     wanted = " or ".join(_TYPES.get(t, t) for t in (expected[1].split(" | ") if expected else []))
     problem = f"{_shown(value)} is not {wanted}" if wanted else message
     remedy = ""
-    if place == ("contract",) and isinstance(value, dict):
-        problem, remedy = "one table, where a list of them is expected", "write [[contract]], in two brackets"
+    if len(place) == 1 and place[0] in LISTS and isinstance(value, dict):
+        problem, remedy = "one table, where a list of them is expected", f"write [[{place[0]}]], in two brackets"
     elif expected and expected[1] == "array" and isinstance(value, str):
         remedy = f'did you mean ["{value}"]?'
     return ConfigError(dotted(place) or "the file", problem, remedy, path, line_of(text, place))

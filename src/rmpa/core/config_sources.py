@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
 from rmpa.core import config_values as values
-from rmpa.core.config import LaneSettings, PolicySettings, RealtimeSettings, Settings
+from rmpa.core.config import LaneSettings, ParamSettings, PolicySettings, RealtimeSettings, Settings, TimeSettings
 from rmpa.core.config_contract import ContractRules, read_contracts
 from rmpa.core.config_file import Key, Place, dotted, line_of, parse_config
+from rmpa.core.config_param import problems, read_follow_rules, read_key_glob
 from rmpa.core.config_values import BadValue, Multicast
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import peer_name_from
@@ -89,6 +90,11 @@ _OPTIONS: Final[Mapping[str, _Option]] = {
     "allow_types": _Option(_list_of(values.read_type_glob), ("bridge", "allow_types"), "RMPA_ALLOW_TYPES"),
     "deny_types": _Option(_list_of(values.read_type_glob), ("bridge", "deny_types"), "RMPA_DENY_TYPES"),
     "contracts": _Option(read_contracts, ("contract",)),
+    "remote_get": _Option(_list_of(read_key_glob), ("params", "remote_get"), "RMPA_REMOTE_GET"),
+    "remote_set": _Option(_list_of(read_key_glob), ("params", "remote_set"), "RMPA_REMOTE_SET"),
+    "follow": _Option(read_follow_rules, ("param",)),
+    "time_follow": _Option(values.read_name_or_none, ("time", "follow"), "RMPA_TIME_FOLLOW"),
+    "time_share": _Option(values.read_bool, ("time", "share"), "RMPA_TIME_SHARE"),
     "express_dscp": _Option(values.read_dscp, ("lanes", "express_dscp"), "RMPA_EXPRESS_DSCP"),
     "express_priority": _Option(values.read_packet_priority, ("lanes", "express_priority"), "RMPA_EXPRESS_PRIORITY"),
     "bulk_dscp": _Option(values.read_dscp, ("lanes", "bulk_dscp"), "RMPA_BULK_DSCP"),
@@ -179,6 +185,8 @@ def load_settings(
         source = strongest["multicast"].source if "multicast" in strongest else "domain"
         problem = f"port {settings.group_port} plus domain {settings.domain} is beyond 65535"
         raise ConfigError(source, problem, "choose a lower port")
+    for name, at, problem in problems(settings.params.follow, settings.time.follow, settings.name):
+        raise strongest[name].error(problem, "name another module", at)
     return Loaded(settings, tuple(notes))
 
 
@@ -226,6 +234,8 @@ def _named_file(named: str, source: str) -> Path:
 
 _GROUPS: Final[Mapping[str, tuple[Callable[..., object], Mapping[str, str]]]] = {
     "policy": (PolicySettings, {key: key for key in ("allow", "deny", "allow_types", "deny_types")}),
+    "params": (ParamSettings, {key: key for key in ("remote_get", "remote_set", "follow")}),
+    "time": (TimeSettings, {"time_follow": "follow", "time_share": "share"}),
     "lanes": (
         LaneSettings,
         {key: key for key in ("express_dscp", "express_priority", "bulk_dscp", "bulk_priority")},

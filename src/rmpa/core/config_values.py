@@ -83,6 +83,11 @@ def read_name(raw: object) -> str:
     return name
 
 
+def read_name_or_none(raw: object) -> str:
+    """A peer's name, or an empty text for none."""
+    return read_name(raw) if raw != "" else ""
+
+
 def read_bool(raw: object) -> bool:
     """``true`` or ``false``, also as 1, 0, yes, no, on, off."""
     if isinstance(raw, bool):

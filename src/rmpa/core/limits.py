@@ -57,6 +57,8 @@ CONTRACT_RATE_MIN: Final = 0.001
 """Lowest ``max_rate`` in messages a second: one in a quarter of an hour."""
 CONTRACT_RATE_MAX: Final = 1_000_000.0
 """Highest ``max_rate`` in messages a second: more than any topic reaches."""
+FOLLOWED_MAX: Final = 256
+"""Parameters that one module follows: a namespace counts as one."""
 CPU_MAX: Final = 1023
 """Highest number of a CPU that an affinity can name: CPU_SETSIZE less one."""
 
@@ -147,6 +149,9 @@ DIAL_ATTEMPTS: Final = (0.3, 0.5, 1.2)
 """For each of the TCP connects that make a dial."""
 DIAL_TIMEOUT: Final = 2.0
 """For all of them."""
+DIAL_STAGGER: Final = 0.1
+"""Before the next of a peer's addresses is tried beside those that have not answered: the least that RFC 8305 allows;
+networks of robots are near."""
 DIAL_FALLBACK: Final = 2.0
 """The higher GUID waits this long for the lower one's call, then dials itself (NAT, firewall)."""
 BACKOFF_FIRST: Final = 0.1
