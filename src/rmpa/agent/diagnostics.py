@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rmpa.agent.clocks import Clocks
     from rmpa.agent.view import View
     from rmpa.bridge.aio.bridge import Bridge
-    from rmpa.ros.aio.core import RosCore
+    from rmpa.ros.aio.core_api import Core
 
 _log = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ class Diagnostics:
         clocks: Those of the peers.
     """
 
-    def __init__(self, core: RosCore, bridge: Bridge, view: View, clocks: Clocks) -> None:
+    def __init__(self, core: Core, bridge: Bridge, view: View, clocks: Clocks) -> None:
         self._core = core
         self._bridge = bridge
         self._view = view

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rmpa.core.aio.realtime import Wish
     from rmpa.core.config import Settings
     from rmpa.core.counters import Counters
-    from rmpa.ros.aio.core import RosCore
+    from rmpa.ros.aio.core_api import Core
 
 
 class View:
@@ -45,7 +45,7 @@ class View:
     def __init__(
         self,
         settings: Settings,
-        core: RosCore,
+        core: Core,
         bridge: Bridge,
         clocks: Clocks,
         *counters: Counters,
@@ -90,6 +90,7 @@ class View:
 
     def _notes(self) -> tuple[str, ...]:
         notes = tuple(self.station.discovery.notes()) if self.station is not None else ()
+        notes += self._core.notes()
         missing = refused(self._wishes)
         return (*notes, missing) if missing else notes
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.quality import QualitySummary
     from rmpa.core.config import Settings
     from rmpa.core.stats import Summary
-    from rmpa.ros.aio.core import RosCore
+    from rmpa.ros.aio.core_api import Core
 
 _DEFAULT = Contract()
 
@@ -42,7 +42,7 @@ class TopicsView:
         clocks: Those of its peers.
     """
 
-    def __init__(self, settings: Settings, core: RosCore, bridge: Bridge, clocks: Clocks) -> None:
+    def __init__(self, settings: Settings, core: Core, bridge: Bridge, clocks: Clocks) -> None:
         self._core = core
         self._clocks = clocks
         self._bridge = bridge

@@ -77,6 +77,8 @@ def read(framed: bytes) -> tuple[int, int]:
 class Core:
     """A master with nothing around it."""
 
+    node_host = node_address = "127.0.0.1"
+
     def __init__(self, side: Place) -> None:
         self.uri = f"http://core-{side.name}/"
         self._side = side

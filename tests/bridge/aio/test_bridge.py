@@ -29,6 +29,7 @@ class Core:
     """What making a bridge needs of a core."""
 
     uri = "http://127.0.0.1:1/"
+    node_host = node_address = "127.0.0.1"
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ from rmpa.bridge.messages import (
     encode,
 )
 from rmpa.bridge.policy import OWN_NODE, is_own
-from rmpa.bridge.proxy_names import LOOPBACK, proxy_prefix
+from rmpa.bridge.proxy_names import proxy_prefix
 from rmpa.core import limits
 from rmpa.core.aio.loop import breathe
 from rmpa.core.contract import Priority
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.watch import Occurred
     from rmpa.core.contract import Contracts
     from rmpa.mesh.aio.link import MeshLink
-    from rmpa.ros.aio.core import RosCore
+    from rmpa.ros.aio.core_api import Core
 
 _log = logging.getLogger(__name__)
 _ADVERTISE: Final = b'{"op":"advertise"'
@@ -82,14 +82,19 @@ class Bridge:
     """
 
     def __init__(
-        self, core: RosCore, policy: Policy, *, rng: Callable[[], float], contracts: Contracts | None = None
+        self, core: Core, policy: Policy, *, rng: Callable[[], float], contracts: Contracts | None = None
     ) -> None:
         self._core = core
         self._exports = Exports(policy, contracts)
         self._imports = Imports(policy, rng, contracts, self._position)
         self.counters = Counters()
         self._node = SlaveNode(
-            OWN_NODE, LOOPBACK, core.uri, counters=self.counters, taps=lambda: self._outbound.connections
+            OWN_NODE,
+            core.node_host,
+            core.uri,
+            advertised_host=core.node_address,
+            counters=self.counters,
+            taps=lambda: self._outbound.connections,
         )
         self._outbound = Outbound(
             core, self._node, on_described=self._described, on_lost=self._lost, on_given_up=self._given_up

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.bridge.actions import Publish
 from rmpa.bridge.aio.flows import ImportFlow, LinkTime
-from rmpa.bridge.proxy_names import LOOPBACK, proxy_name
+from rmpa.bridge.proxy_names import proxy_name
 from rmpa.core import limits
 from rmpa.core.aio.loop import breathing
 from rmpa.core.contract import Durability, Reliability
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.messages import Source
     from rmpa.bridge.watch import Occurred
     from rmpa.core.counters import Counters
-    from rmpa.ros.aio.core import RosCore
+    from rmpa.ros.aio.core_api import Core
 
 _log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ class Inbound:
 
     def __init__(
         self,
-        core: RosCore,
+        core: Core,
         prefix: str,
         *,
         counters: Counters | None = None,
@@ -284,8 +284,9 @@ class Inbound:
             name = proxy_name(self.prefix, source.node)
             node = SlaveNode(
                 name,
-                LOOPBACK,
+                self._core.node_host,
                 self._core.uri,
+                advertised_host=self._core.node_address,
                 counters=self._counters,
                 on_shutdown=lambda reason: _not_here(name, reason),
             )

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.actions import AddRoute, Connect, RemoveRoute, SuspendRoute
     from rmpa.bridge.aio.legs import DataLink, Leg
-    from rmpa.ros.aio.core import RosCore
+    from rmpa.ros.aio.core_api import Core
     from rmpa.ros.aio.slave_server import SlaveNode
 
 _log = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ class Outbound:
 
     def __init__(
         self,
-        core: RosCore,
+        core: Core,
         node: SlaveNode,
         *,
         on_described: Callable[[Source, Description], None],

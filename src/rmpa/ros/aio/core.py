@@ -31,6 +31,7 @@ _log = logging.getLogger(__name__)
 
 DEFAULT_PORT: Final = 11311
 CALLER_ID: Final = "/rmpa_core"
+_LOOPBACK: Final = "127.0.0.1"
 ROS_DISTRO: Final = "noetic\n"
 """With the line break that roscore's ``rosversion -d`` leaves in it; programs strip it."""
 ROS_VERSION: Final = "1.15.15\n"
@@ -121,6 +122,16 @@ class RosCore:
         """The port that it listens at."""
         return self._server.port
 
+    @property
+    def node_host(self) -> str:
+        """Loopback: only nodes of this machine may reach the agent's."""
+        return _LOOPBACK
+
+    @property
+    def node_address(self) -> str:
+        """Likewise."""
+        return _LOOPBACK
+
     # --- asking it --------------------------------------------------------------------------------------------
 
     def call(self, method: str, *params: XmlRpcValue) -> Reply:
@@ -138,6 +149,10 @@ class RosCore:
         reply = self._api.call(method, params)
         self._carry_out()
         return reply
+
+    async def ask(self, method: str, *params: XmlRpcValue) -> Reply:
+        """The same as ``call``, for who can wait: a real roscore's answer takes its time."""
+        return self.call(method, *params)
 
     def state(self) -> GraphState:
         """All registrations at this moment; the same object until one changes."""
@@ -157,6 +172,10 @@ class RosCore:
         A callback may call the core; an exception of one is logged and does not reach the node.
         """
         self._callbacks.append(callback)
+
+    def notes(self) -> tuple[str, ...]:
+        """None: it is there as long as the agent is."""
+        return ()
 
     def suspect(self, node: str) -> None:
         """Say that this node may be dead: it is checked now, and purged if it is."""
