@@ -1,0 +1,246 @@
+"""The most similar profile: which System Profile serves best what all clients ask (paper, section 3.1).
+
+For each attribute that is asked for, a profile's *shortfall* is how far its value lies on the wrong side of the
+bound, as a part of the attribute's tolerance, or else of its range over all profiles (0 or 1 where that is 0); better
+than asked is no shortfall. Its *distance* is the weighted root mean square of the shortfalls, plus a little for its
+cost::
+
+    delta = max(0, shortfall) / s        D = sqrt(sum(w * delta^2) / sum(w)) + EPSILON * cost
+
+Of the profiles that meet every hard requirement the nearest serves. If none does: the declared best-effort profile,
+or the one with the smallest (largest weighted hard shortfall, D, cost). Ties go to the one declared first.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core.config_values import did_you_mean
+from rmpa.core.errors import ConfigError
+from rmpa.resource.profiles import check_profiles
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from rmpa.resource.attributes import Attribute, Value
+    from rmpa.resource.profiles import Profile
+    from rmpa.resource.requirements import Bound
+
+EPSILON: Final = 1e-3
+"""What one unit of cost adds to the distance: it decides among profiles that serve nearly alike."""
+_MISSING: Final = 1.0
+"""The shortfall of an attribute that a profile does not offer: as far as the whole range."""
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One attribute's part in a profile's distance.
+
+    Args:
+        attribute: Its name.
+        offered: The profile's value, ``None`` if it has none.
+        wanted: What is asked, ready to read.
+        delta: The shortfall, 0 where the request is met.
+        weight: Of the attribute.
+        hard: Whether a shortfall excludes.
+    """
+
+    attribute: str
+    offered: Value | None
+    wanted: str
+    delta: float
+    weight: float
+    hard: bool
+
+    @property
+    def met(self) -> bool:
+        """Whether the profile satisfies the request."""
+        return self.delta == 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """How one profile does.
+
+    Args:
+        profile: Its name.
+        distance: ``D``.
+        hard_shortfall: The largest weighted shortfall of a hard requirement; 0: it is feasible.
+        excluded: Why it is left out (a precondition, a failure within the cool-down), or empty.
+        terms: The parts of the distance, in the order of the attributes asked for.
+    """
+
+    profile: str
+    distance: float
+    hard_shortfall: float
+    excluded: str = ""
+    terms: tuple[Term, ...] = ()
+
+    @property
+    def feasible(self) -> bool:
+        """Whether it meets every hard requirement and may be taken."""
+        return self.hard_shortfall == 0.0 and not self.excluded
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """Which profile serves best.
+
+    Args:
+        profile: Its name; empty if all are left out.
+        distance: Its ``D``.
+        feasible: Whether it meets every hard requirement; if not, this is a non-adaptable event.
+        best_effort: Whether it was taken because it is the declared best-effort profile.
+    """
+
+    profile: str
+    distance: float
+    feasible: bool
+    best_effort: bool = False
+
+
+class Decider:
+    """Decides for one resource; what does not change between decisions is worked out once.
+
+    Args:
+        resource: Its name, for errors.
+        attributes: Declared ones, by name.
+        profiles: In order of declaration.
+
+    Raises:
+        ConfigError: See ``check_profiles``.
+    """
+
+    def __init__(self, resource: str, attributes: Mapping[str, Attribute], profiles: Sequence[Profile]) -> None:
+        check_profiles(profiles, attributes, resource)
+        self._resource = resource
+        self._attributes = attributes
+        self._profiles = {profile.name: profile for profile in profiles}
+        self._costs = [EPSILON * profile.cost for profile in profiles]
+        self._places: dict[str, list[float | None]] = {}
+        self._spans: dict[str, float] = {}
+        for name, attribute in attributes.items():
+            places = [attribute.place(p.offers[name]) if name in p.offers else None for p in profiles]
+            known = [place for place in places if place is not None]
+            self._places[name] = places
+            span = attribute.tolerated
+            self._spans[name] = span if span is not None else (max(known) - min(known) if known else 0.0)
+        self._best_effort = next((profile.name for profile in profiles if profile.best_effort), "")
+
+    @property
+    def profiles(self) -> Sequence[str]:
+        """The names, in order of declaration."""
+        return tuple(self._profiles)
+
+    def profile(self, name: str) -> Profile:
+        """One of them.
+
+        Raises:
+            ConfigError: There is none of that name.
+        """
+        found = self._profiles.get(name)
+        if found is None:
+            near = did_you_mean(name, self._profiles)
+            remedy = f"did you mean {near}?" if near else f"it has {', '.join(self._profiles)}"
+            raise ConfigError(f"profile {name}", f"{self._resource} has no such profile", remedy)
+        return found
+
+    def decide(self, bounds: Mapping[str, Bound], excluded: Mapping[str, str] | None = None) -> Decision:
+        """The profile that serves best what is asked.
+
+        Args:
+            bounds: By attribute; those of attributes that are not declared raise ``KeyError``.
+            excluded: Profiles that are left out, by name, and why.
+        """
+        distances, hard = self._judge(bounds)
+        left_out = excluded or {}
+        allowed = [index for index, name in enumerate(self._profiles) if name not in left_out]
+        names = self.profiles
+        feasible = [index for index in allowed if hard[index] == 0.0]
+        if feasible:
+            best = min(feasible, key=distances.__getitem__)
+            return Decision(names[best], distances[best], feasible=True)
+        if self._best_effort and self._best_effort not in left_out:
+            best = names.index(self._best_effort)
+            return Decision(names[best], distances[best], feasible=False, best_effort=True)
+        if not allowed:
+            return Decision("", math.inf, feasible=False)
+        best = min(allowed, key=lambda index: (hard[index], distances[index], self._costs[index]))
+        return Decision(names[best], distances[best], feasible=False)
+
+    def explain(self, bounds: Mapping[str, Bound], excluded: Mapping[str, str] | None = None) -> tuple[Score, ...]:
+        """Every profile's score with all its terms, in order of declaration."""
+        distances, hard = self._judge(bounds)
+        left_out = excluded or {}
+        return tuple(
+            Score(name, distances[index], hard[index], left_out.get(name, ""), self._terms(index, bounds))
+            for index, name in enumerate(self._profiles)
+        )
+
+    def distance(self, name: str, bounds: Mapping[str, Bound]) -> float:
+        """One profile's distance."""
+        return self._judge(bounds)[0][self.profiles.index(name)]
+
+    def _judge(self, bounds: Mapping[str, Bound]) -> tuple[list[float], list[float]]:
+        """Distances, and largest weighted hard shortfalls, by profile."""
+        sums = [0.0] * len(self._profiles)
+        hard = [0.0] * len(self._profiles)
+        weights = 0.0
+        for name, bound in bounds.items():
+            deltas = self._deltas(name, bound)
+            weight = bound.weight
+            weights += weight
+            sums = [total + weight * delta * delta for total, delta in zip(sums, deltas, strict=True)]
+            if bound.hard:
+                hard = [max(most, weight * delta) for most, delta in zip(hard, deltas, strict=True)]
+        scale = weights or 1.0
+        return [math.sqrt(s / scale) + cost for s, cost in zip(sums, self._costs, strict=True)], hard
+
+    def _deltas(self, name: str, bound: Bound) -> list[float]:
+        places, span = self._places[name], self._spans[name]
+        if bound.words:
+            words = self._attributes[name].words
+            wanted = {float(words.index(word)) for word in bound.words}
+            return [0.0 if place in wanted else _MISSING for place in places]
+        low, high = bound.low, bound.high
+        if span > 0:
+            return [
+                _MISSING
+                if place is None
+                else (low - place) / span
+                if place < low
+                else (place - high) / span
+                if place > high
+                else 0.0
+                for place in places
+            ]
+        return [_MISSING if place is None or not low <= place <= high else 0.0 for place in places]
+
+    def _terms(self, index: int, bounds: Mapping[str, Bound]) -> tuple[Term, ...]:
+        profile = self._profiles[self.profiles[index]]
+        return tuple(
+            Term(
+                name,
+                profile.offers.get(name),
+                _wanted(self._attributes[name], bound),
+                self._deltas(name, bound)[index],
+                bound.weight,
+                bound.hard,
+            )
+            for name, bound in bounds.items()
+        )
+
+
+def _wanted(attribute: Attribute, bound: Bound) -> str:
+    """What is asked, for people: ``at least 20 Hz``."""
+    if bound.words:
+        return " or ".join(word for word in attribute.words if word in bound.words)
+    low = attribute.show(attribute.value(bound.low)) if bound.low > -math.inf else ""
+    high = attribute.show(attribute.value(bound.high)) if bound.high < math.inf else ""
+    if low == high:
+        return f"exactly {low}"
+    if low and high:
+        return f"{low} to {high}"
+    return f"at least {low}" if low else f"at most {high}"
