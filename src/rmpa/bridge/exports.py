@@ -12,6 +12,9 @@ A source is connected while at least one peer wants it::
 Who lost a route asks again: the one that wants the data is the one that retries. A reliable route outlives its
 link: it is suspended, its source stays connected, and the peer's next ``Open`` goes on where it was (``link_away``).
 
+Peers know sources by their wire names (``bridge.naming``); here all is keyed by the local ones but for what a peer
+says and is told.
+
 A change of the graph costs what changed, however large the graph is; what peers are to hear of it is gathered, and
 told a bounded number of sources at a time.
 """
@@ -37,6 +40,7 @@ from rmpa.bridge.messages import (
     is_crossing_name,
     is_crossing_type,
 )
+from rmpa.bridge.naming import Names, PeerNames
 from rmpa.core import limits
 from rmpa.core.contract import Contract, Contracts, Durability, Reliability, combine
 
@@ -60,12 +64,14 @@ class _Route:
 
     Args:
         contract: What holds for it.
+        asked: What the peer asked for.
         live: Whether data goes there yet.
         epoch: Of a reliable route, else 0.
         after: Where a suspended one goes on.
     """
 
     contract: Contract
+    asked: Contract
     live: bool = False
     epoch: int = 0
     after: int | None = None
@@ -94,10 +100,12 @@ class _Topic:
     Args:
         seen: Its publishers as they were told, by node.
         crossing: Those that policy lets cross, whether they are offered or there are too many.
+        rules: Which rules they were judged by.
     """
 
     seen: Mapping[str, LocalSource]
     crossing: dict[Source, LocalSource] = field(default_factory=dict)
+    rules: int = 0
 
 
 @dataclass(slots=True)
@@ -105,17 +113,30 @@ class _Peer:
     """One link.
 
     Args:
-        news: Sources that it is to hear of, and the type by which it knows each, empty if it does not.
+        name: The peer's.
+        names: How our names read over there.
+        ruled: Whether it may know less than others, or by other names.
+        news: Sources that it is perhaps to hear of (a dict, for its order).
+        told: Those that it knows, as it was told.
+        by_wire: The same by the names that it knows them by.
+        behind: Sources whose wire name another one has, by that name.
         routes: What it has open.
         beginning: Whether it has not heard everything once yet.
     """
 
-    news: dict[Source, str]
+    name: str
+    names: PeerNames
+    ruled: bool
+    news: dict[Source, None]
+    told: dict[Source, Offer] = field(default_factory=dict)
+    by_wire: dict[Source, Source] = field(default_factory=dict)
+    behind: dict[Source, list[Source]] = field(default_factory=dict)
     routes: dict[int, Source] = field(default_factory=dict)
     beginning: bool = True
 
 
 _NOTHING: Final = _Topic({})
+_NO_NAMES: Final = Names()
 
 
 class Exports:
@@ -124,11 +145,14 @@ class Exports:
     Args:
         policy: What may cross.
         contracts: What our side promises.
+        names: How our names read at the peers.
     """
 
-    def __init__(self, policy: Policy, contracts: Contracts | None = None) -> None:
+    def __init__(self, policy: Policy, contracts: Contracts | None = None, names: Names = _NO_NAMES) -> None:
         self._policy = policy
         self._contracts = contracts if contracts is not None else Contracts()
+        self._names = names
+        self._rules = 0
         self._epochs = 0
         self._topics: dict[str, _Topic] = {}
         self._local: dict[Source, LocalSource] = {}
@@ -140,6 +164,20 @@ class Exports:
     def offered(self) -> Mapping[Source, LocalSource]:
         """What peers are told of."""
         return self._local
+
+    def offer(self, peer: int, source: Source) -> Offer | None:
+        """What a peer was told of a source, by the name that it has over there."""
+        return known.told.get(source) if (known := self._peers.get(peer)) is not None else None
+
+    def local(self, peer: int, wire: Source) -> Source | None:
+        """The source that a peer knows by a name, or ``None`` if it may know none by it."""
+        known = self._peers.get(peer)
+        if known is None:
+            return None
+        source = known.by_wire.get(wire)
+        if source is None and not known.ruled and wire in self._local:
+            return wire  # it is about to be told
+        return source if source in self._local else None
 
     def source(self, peer: int, route: int) -> Source | None:
         """What a peer has open on a route."""
@@ -170,10 +208,30 @@ class Exports:
         """Whether there is something to ``tell``."""
         return any(peer.news for peer in self._peers.values())
 
+    def rules(self, policy: Policy, contracts: Contracts, names: Names) -> list[Action]:
+        """Other rules hold from now on; what they leave as it is goes on untouched.
+
+        The topics are judged by them when ``graph`` tells of each next, and the peers hear of it by ``tell``.
+        """
+        self._policy, self._contracts, self._names = policy, contracts, names
+        self._rules += 1
+        for peer in self._peers.values():
+            before = peer.ruled
+            peer.names, peer.ruled = self._rules_of(peer.name)
+            if before or peer.ruled:
+                peer.news.update(dict.fromkeys(self._local))
+        actions: list[Action] = []
+        for source, flow in list(self._flows.items()):
+            offered = contracts.of(source.topic, self._local[source].type)
+            for (peer_number, _), route in list(flow.routes.items()):
+                if combine(offered, route.asked) != route.contract:
+                    actions += self._end_for(source, peer_number, "its contract has changed here")
+        return actions
+
     def graph(self, topic: str, publishers: Mapping[str, LocalSource]) -> list[Action]:
         """Say who publishes a topic in the local graph now, by node, proxies left out; peers hear it by ``tell``."""
         before = self._topics.get(topic, _NOTHING)
-        if before.seen == publishers:
+        if before.seen == publishers and (before.rules == self._rules or not publishers):
             return []
         crossing = {
             source: local
@@ -181,7 +239,7 @@ class Exports:
             if self._crosses(source := Source(topic, node), local.type)
         }
         if publishers:
-            self._topics[topic] = _Topic(publishers, crossing)
+            self._topics[topic] = _Topic(publishers, crossing, self._rules)
         else:
             del self._topics[topic]
         actions: list[Action] = []
@@ -210,7 +268,7 @@ class Exports:
         self._too_many.pop(source, None)
         self._local[source] = local
         if before is None or before.type != local.type:
-            self._note(source, before)
+            self._note(source)
         # A new address is nobody's business but ours.
         flow = self._flows.get(source)
         return self._end(source, "the node has restarted") if flow is not None and flow.uri != local.uri else []
@@ -220,42 +278,83 @@ class Exports:
         if before is None:
             del self._too_many[source]
             return []
-        self._note(source, before)
+        self._note(source)
         actions = self._end(source, "the node has gone")
         if self._too_many:
             source = next(iter(self._too_many))
             actions += self._came(source, self._too_many.pop(source))
         return actions
 
-    def _note(self, source: Source, before: LocalSource | None) -> None:
+    def _note(self, source: Source) -> None:
         for peer in self._peers.values():
-            peer.news.setdefault(source, before.type if before is not None else "")
+            peer.news.setdefault(source)
 
     def tell(self) -> list[Action]:
         """One message for each peer that has not heard everything; call again while ``untold``."""
         actions: list[Action] = []
         for number, peer in self._peers.items():
             begins = peer.beginning
-            if peer.news and ((message := self._next(peer)).added or message.removed or begins is not message.more):
+            if not peer.news:
+                continue
+            message, ends = self._next(number, peer)
+            actions += ends
+            if message.added or message.removed or begins is not message.more:
                 actions.append(Send(number, message))
         return actions
 
-    def _next(self, peer: _Peer, *, full: bool = False) -> Advertise:
+    def _next(self, number: int, peer: _Peer, *, full: bool = False) -> tuple[Advertise, list[Action]]:
+        """The next portion of news, and what becomes of routes whose sources the peer may not have any more."""
         added: list[Offer] = []
         removed: list[Source] = []
+        actions: list[Action] = []
         for source in tuple(islice(peer.news, limits.ADVERTISED_AT_ONCE)):
-            known, local = peer.news.pop(source), self._local.get(source)
-            if local is None and known:
-                removed.append(source)
-            elif local is not None and local.type != known:
-                added.append(Offer(source.topic, source.node, local.type))
+            del peer.news[source]
+            before, now = peer.told.get(source), self._offer(peer, source)
+            if before is not None and (now is None or now.source != before.source):
+                del peer.told[source], peer.by_wire[before.source]
+                removed.append(before.source)
+                peer.news.update(dict.fromkeys(peer.behind.pop(before.source, ())))
+                actions += self._end_for(source, number, "it is not offered here any more, or by another name")
+            if now is not None and now != before:
+                holder = peer.by_wire.setdefault(now.source, source)
+                if holder != source:
+                    peer.behind.setdefault(now.source, []).append(source)
+                    text = f"{source} would be {now.topic} at {peer.name}, as {holder.topic} is already: rename one"
+                    actions.append(Warn("names.taken", f"{number} {source}", text))
+                    continue
+                peer.told[source] = now
+                added.append(now)
         peer.beginning = peer.beginning and bool(peer.news)
-        return Advertise(added=tuple(added), removed=tuple(removed), full=full, more=peer.beginning)
+        return Advertise(added=tuple(added), removed=tuple(removed), full=full, more=peer.beginning), actions
 
-    def link_up(self, peer: int) -> list[Action]:
-        """A link is up: begin to tell all we have; ``tell`` goes on with it."""
-        self._peers[peer] = new = _Peer(dict.fromkeys(self._local, ""))
-        return [Send(peer, self._next(new, full=True))]
+    def _offer(self, peer: _Peer, source: Source) -> Offer | None:
+        """What a peer is to know of a source now."""
+        local = self._local.get(source)
+        if local is None:
+            return None
+        if not peer.ruled:
+            return Offer(source.topic, source.node, local.type)
+        wire = peer.names.wire_name(source.topic, local.type)
+        if not is_crossing_name(wire):
+            return None
+        if not self._policy.judge_for(peer.name, source.topic, local.type, wire).allowed:
+            return None
+        return Offer(wire, source.node, local.type)
+
+    def link_up(self, peer: int, name: str = "") -> list[Action]:
+        """A link is up: begin to tell all we have; ``tell`` goes on with it.
+
+        Args:
+            peer: Whose.
+            name: The peer's name, which its rules go by.
+        """
+        self._peers[peer] = new = _Peer(name, *self._rules_of(name), dict.fromkeys(self._local))
+        message, actions = self._next(peer, new, full=True)
+        return [*actions, Send(peer, message)]
+
+    def _rules_of(self, name: str) -> tuple[PeerNames, bool]:
+        names = self._names.of(name)
+        return names, not names.plain or self._policy.has_rules_for(name)
 
     def link_down(self, peer: int) -> list[Action]:
         """A peer is gone for good, and all its routes, suspended ones too."""
@@ -312,16 +411,17 @@ class Exports:
             ]
         if len(routes) >= limits.ROUTES_PER_LINK_MAX:
             return [Send(peer, Closed(message.route, f"more than {limits.ROUTES_PER_LINK_MAX} routes on one link"))]
-        source = message.source
-        local = self._local.get(source)
-        if local is None:
-            return [Send(peer, Closed(message.route, f"{source}: not published here, or policy keeps it home"))]
+        source = self.local(peer, message.source)
+        if source is None:
+            text = f"{message.source}: not published here, or policy keeps it home"
+            return [Send(peer, Closed(message.route, text))]
+        local = self._local[source]
         flow = self._flows.get(source)
         if flow is not None and any(other == peer for other, _ in flow.routes):
             # One copy a peer: more would let it multiply what we send at will.
             return [Send(peer, Closed(message.route, f"{source} is open on another route of this link"))]
         routes[message.route] = source
-        route = self._route(message, local, flow.away.pop(peer, None) if flow is not None else None)
+        route = self._route(message, source.topic, local, flow.away.pop(peer, None) if flow is not None else None)
         if flow is None:
             flow = self._flows[source] = _Flow(local.uri)
             flow.routes[peer, message.route] = route
@@ -331,15 +431,16 @@ class Exports:
             return []
         return self._start(source, flow, flow.description)
 
-    def _route(self, message: Open, local: LocalSource, away: _Route | None) -> _Route:
+    def _route(self, message: Open, topic: str, local: LocalSource, away: _Route | None) -> _Route:
         """The wish of a peer; it goes on where a suspended one was if it names that one's epoch."""
-        contract = combine(self._contracts.of(message.topic, local.type), message.contract)
+        asked = message.contract
+        contract = combine(self._contracts.of(topic, local.type), asked)
         if contract.reliability is not Reliability.RELIABLE:
-            return _Route(contract)
-        if away is not None and away.epoch == message.epoch:
-            return _Route(contract, epoch=away.epoch, after=message.after)
+            return _Route(contract, asked)
+        if away is not None and away.epoch == message.epoch and away.contract == contract:
+            return _Route(contract, asked, epoch=away.epoch, after=message.after)
         self._epochs += 1
-        return _Route(contract, epoch=self._epochs)
+        return _Route(contract, asked, epoch=self._epochs)
 
     def closed(self, peer: int, message: Close) -> list[Action]:
         """A peer wants no more of a route; one that is not open is none of our worry (it crossed ours)."""
@@ -387,6 +488,19 @@ class Exports:
             return []
         del self._flows[source]
         return [Disconnect(source)]
+
+    def _end_for(self, source: Source, peer: int, reason: str) -> list[Action]:
+        """A source goes to one peer no longer, though others may have it."""
+        flow = self._flows.get(source)
+        if flow is None:
+            return []
+        actions: list[Action] = []
+        for number in [number for owner, number in flow.routes if owner == peer]:
+            self._peers[peer].routes.pop(number, None)
+            actions += [*self._remove(source, peer, number), Send(peer, Closed(number, reason))]
+        if flow.away.pop(peer, None) is not None:
+            actions += [RemoveRoute(source, peer, 0), *self._disconnect(source, flow)]
+        return actions
 
     def _end(self, source: Source, reason: str, *, connected: bool = True) -> list[Action]:
         flow = self._flows.pop(source, None)
