@@ -155,6 +155,31 @@ def parse_reply_head(data: Buffer) -> tuple[bool, int] | None:
     return ok != 0, size
 
 
+class Body:
+    """A request or response of a known size whose bytes come in parts; what is only claimed takes no memory.
+
+    Args:
+        size: How many bytes it has.
+    """
+
+    __slots__ = ("data", "size")
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self.data = bytearray()
+
+    def take(self, part: memoryview) -> int:
+        """Append what belongs to it; return how many bytes that are."""
+        mine = part[: self.size - len(self.data)]
+        self.data += mine
+        return len(mine)
+
+    @property
+    def whole(self) -> bool:
+        """Whether all of it is there."""
+        return len(self.data) == self.size
+
+
 def parse_service_uri(uri: str) -> tuple[str, int]:
     """Host and port of ``rosrpc://host:port``.
 

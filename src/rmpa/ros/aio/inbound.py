@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core import limits
 from rmpa.core.aio.stream import Stream
 from rmpa.core.outbox import URGENT, Outbox
-from rmpa.ros.tcpros import LENGTH, encode_header, error_header, parse_header
+from rmpa.ros.tcpros import encode_header, error_header, parse_header
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from rmpa.core.aio.stream import OnBytes
     from rmpa.core.outbox import Parcel
     from rmpa.ros.tcpros import Buffer, Header
 
@@ -38,6 +39,10 @@ class Inbound:
         on_header: Called once, with the fields.
         on_end: Called once when the other side is gone or broke the protocol (then with the error); not after
             ``close()`` or ``refuse()``. Its owner may replace it.
+
+    Attributes:
+        on_bytes: Takes what comes behind the header, as ``core.aio.stream`` has it; without one, as for subscribers,
+            it is thrown away.
     """
 
     def __init__(
@@ -55,6 +60,7 @@ class Inbound:
         self.messages = 0
         """Messages given to the connection, later dropped ones included."""
         self.on_end = on_end
+        self.on_bytes: OnBytes | None = None
         self._on_header = on_header
         self._sock = sock
         self._local_port: int = sock.getsockname()[1]
@@ -78,15 +84,18 @@ class Inbound:
         """The addresses, in the form that rosnode shows."""
         return f"TCPROS connection on port {self._local_port} to [{self.peer[0]}:{self.peer[1]}]"
 
-    def accept(self, header: Mapping[str, str], queue_messages: int, queue_bytes: int) -> None:
+    def accept(
+        self, header: Mapping[str, str], queue_messages: int, queue_bytes: int, *, nodelay: bool = False
+    ) -> None:
         """Answer with our header; messages may follow.
 
         Args:
             header: Our reply.
             queue_messages: How many messages may wait for this connection.
             queue_bytes: The same in bytes.
+            nodelay: Whether each message leaves at once, even if the other side did not ask for it.
         """
-        if self.fields.get("tcp_nodelay") == "1":
+        if nodelay or self.fields.get("tcp_nodelay") == "1":
             self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._outbox.set_bounds(queue_messages, queue_bytes)
         self.stream.send([encode_header(header)], URGENT)
@@ -124,6 +133,8 @@ class Inbound:
 
     def _take(self, data: memoryview) -> tuple[int, int]:
         if self._heard:
+            if self.on_bytes is not None:
+                return self.on_bytes(data)
             # Nothing may come from a subscriber. Reading it away keeps its end of stream visible.
             return len(data), 0
         fields, consumed, wanted = parse_header(data)
@@ -132,7 +143,10 @@ class Inbound:
         self._heard = True
         self.fields = fields
         self._on_header(self, fields)
-        return max(consumed, LENGTH.size), 0
+        if self.on_bytes is not None and consumed < len(data):
+            taken, wanted = self.on_bytes(data[consumed:])
+            return consumed + taken, wanted
+        return consumed, 0
 
     def _ended(self, error: Exception | None) -> None:
         self.on_end(self, error)

@@ -107,13 +107,16 @@ class SlaveNode:
         """Close the topics, then the servers; unregister before."""
         for topic in tuple(self._publications):
             self.remove_publication(topic)
-        for service in tuple(self._services):
-            self.remove_service(service)
+        services = tuple(self._services.values())
+        for endpoint in services:
+            self.remove_service(endpoint.service)
         subscriptions, self._subscriptions = self._subscriptions, {}
         for subscription in subscriptions.values():
             subscription.close()
         self._tcpros.close()
         await self._http.close()
+        for endpoint in services:
+            await endpoint.closed()
         for subscription in subscriptions.values():
             await subscription.closed()
         # We and our servers know each other, and wait for the collector; what our owner knows must not.
@@ -167,7 +170,10 @@ class SlaveNode:
         self._services[endpoint.service] = endpoint
 
     def remove_service(self, service: str, text: str = "") -> None:
-        """Serve a service no longer; calls under way get an error with ``text``. Nothing happens if it is not served."""
+        """Serve a service no longer; calls under way get an error with ``text``.
+
+        Nothing happens if it is not served.
+        """
         endpoint = self._services.pop(service, None)
         if endpoint is not None:
             endpoint.withdraw(text)
