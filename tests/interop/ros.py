@@ -51,6 +51,15 @@ def why_not() -> str:
     return ""
 
 
+@functools.cache
+def lacks(package: str) -> str:
+    """Why tests that need a further Python package of ROS cannot run here, or an empty string."""
+    found = subprocess.run(
+        [PYTHON, "-c", f"import {package}"], capture_output=True, check=False, env=_clean_environment()
+    )
+    return f"no {package} for ROS here (scripts/install-ros installs Debian's)" if found.returncode else ""
+
+
 def free_port(address: str = "127.0.0.1", kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
     """A port that nobody uses at this moment (on the real machine; a namespace's ports are all free)."""
     with socket.socket(socket.AF_INET, kind) as probe:
@@ -166,8 +175,9 @@ def compiled(program: str, nodes: Path = NODES) -> Path:
     """The binary of ``PROGRAM.cpp`` in the folder ``nodes``; compiled once for each version of the sources."""
     source = nodes / f"{program}.cpp"
     flags = ["-std=c++17", "-O2", "-Wall", "-Wextra", f"-I{NODES}"]
+    packages = ["actionlib", "roscpp"] if "<actionlib/" in source.read_text() else ["roscpp"]
     libraries = subprocess.run(
-        ["pkg-config", "--cflags", "--libs", "roscpp"], capture_output=True, text=True, check=True
+        ["pkg-config", "--cflags", "--libs", *packages], capture_output=True, text=True, check=True
     ).stdout.split()
     digest = hashlib.sha256(" ".join([*flags, *libraries]).encode())
     for part in sorted([source, *NODES.glob("*.hpp")]):
