@@ -400,6 +400,24 @@ SERVICE_ROUTES: Final = 1 << 31
 """Routes from here on are those of services: topics' are counted from 1."""
 SERVICES_PER_PEER_MAX: Final = 8192
 """Services that one peer may advertise; a large robot's nodes have some 500, loggers left out."""
+SERVICE_SESSIONS_MAX: Final = 8192
+"""Services that one peer may have open with us at once."""
+SERVICE_TIMEOUT_MAX: Final = 3600.0
+"""Longest time that a call may be given: a caller of a server that hangs is told so within the hour."""
+SERVICE_GRACE: Final = 1.0
+"""The serving agent waits this much longer than the calling one, whose text says more."""
+SERVICE_IDLE: Final = 30.0
+"""A service, and a connection to its server, that nobody uses for this long is closed."""
+SERVICE_POOL: Final = 32
+"""Calls of one service that its server gets at once, each by a connection (and in rospy a thread) of its own."""
+SERVICE_QUEUE: Final = 1024
+"""Calls of one service that wait for one of those; further ones are refused at once."""
+SERVICE_BYTES: Final = 256 * MIB
+"""Requests and responses of one peer that are under way or being put together, each direction: four of the largest."""
+SERVER_LOOK: Final = 0.5
+"""Between two looks whether the servers of what is offered still listen: a killed one is gone everywhere within 1 s."""
+SERVICE_LATENCIES: Final = 512
+"""Calls of a service that its latency is made of."""
 AUDIENCE_MAX: Final = 64
 """Nodes that listen to one topic and are named to its publisher's agent."""
 AUDIENCES_MAX: Final = 1024
@@ -410,6 +428,36 @@ ASKS_AT_ONCE: Final = 64
 """Questions of one peer that are being answered; further ones are refused at once."""
 ASK_TIMEOUT: Final = 5.0
 """For another agent's answer."""
+WHY_WINDOW: Final = 1.0
+"""Between the two looks of ``rmpa why`` at what flows: a topic of some messages a second has moved by then."""
+WHY_TIMEOUT: Final = 12.0
+"""For a peer's own walk: its window, and two questions to us of ASK_TIMEOUT each at the worst."""
+WHY_SILENT: Final = 2.0
+"""A topic that was silent for less than this is not called so, whatever its rate."""
+WHY_SILENT_PERIODS: Final = 10.0
+"""In its own longest usual periods, likewise."""
+WHY_SOURCES_MAX: Final = 64
+"""Publishers of one topic in one module that ``rmpa why`` tells of."""
+PARAM_PORTION: Final = 16 * KIB
+"""Characters of a parameter that cross at once: a millisecond of a 100 Mbit/s link, and the next portion is asked for
+when this one is there, so commands do not wait behind megabytes."""
+PARAM_TEXT_MAX: Final = HTTP_BODY_MAX
+"""Characters of a parameter as XML-RPC text: what a core itself takes in one call."""
+PARAM_TRANSFERS: Final = 4
+"""Parameters that one peer reads or writes at a time; the one that was begun first gives way."""
+PARAM_TRANSFER_IDLE: Final = 30.0
+"""A parameter that is read or written in portions is forgotten when nobody went on for this long."""
+PARAM_CALL_TIMEOUT: Final = 10.0
+"""For one call of the local core about a parameter, megabytes of XML included."""
+PARAM_GATHER: Final = 0.05
+"""Changes of a followed parameter are gathered this long: a node that loads twenty keys of a namespace sets each."""
+PARAM_SMALL: Final = 64 * KIB
+"""Followed parameters up to this size are compared each RECONCILE_INTERVAL; larger ones are trusted to the core's own
+notifications, and compared when the core was restarted."""
+FOLLOWERS_KEYS_MAX: Final = FOLLOWED_MAX
+"""Parameters that one peer may follow here."""
+FOLLOWED_BYTES_MAX: Final = 64 * MIB
+"""All followed parameters as they are remembered here, to be put back."""
 CROSSING_NAME_MAX: Final = 1024
 """Characters of a topic's, node's or type's name that crosses the mesh; the longest seen have some 200."""
 CONTROL_TEXT_MAX: Final = 16 * KIB

@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from rmpa.core.contract import Contracts
     from rmpa.mesh.aio.link import MeshLink
     from rmpa.ros.aio.core_api import Core
+    from rmpa.ros.xmlrpc import XmlRpcValue
 
 _log = logging.getLogger(__name__)
 _ADVERTISE: Final = b'{"op":"advertise"'
@@ -94,6 +95,7 @@ class Bridge:
             core.uri,
             advertised_host=core.node_address,
             counters=self.counters,
+            on_param_update=self._param_update,
             taps=lambda: self._outbound.connections,
         )
         self._outbound = Outbound(
@@ -423,6 +425,9 @@ class Bridge:
             self._schedule()
         for part in self._parts:
             part.graph_changed(change)
+
+    def _param_update(self, key: str, _value: XmlRpcValue) -> bool:
+        return any([part.param_update(key) for part in self._parts])  # each of them, not up to the first
 
     def _schedule(self) -> None:
         if self._rescan is None and not self._closed:

@@ -45,6 +45,17 @@ class Part:
     def graph_changed(self, change: GraphChange) -> None:
         """A registration in the local graph came, changed or went."""
 
+    def param_update(self, key: str) -> bool:  # noqa: ARG002 - for those that override it
+        """A parameter that the agent's own node has subscribed to has changed.
+
+        Args:
+            key: Which, without a slash at its end; one below it may be what was subscribed to, or one above.
+
+        Returns:
+            Whether this part has subscribed to it.
+        """
+        return False
+
     def reconcile(self) -> None:
         """Each ``limits.RECONCILE_INTERVAL``: compare what is with what should be, and mend it."""
 
