@@ -124,6 +124,38 @@ class TimeSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class ServiceRule:
+    """One ``[[service]]``: what holds for services of some names.
+
+    Args:
+        names: Globs over their names here.
+        timeout: Seconds that a call may take.
+    """
+
+    names: tuple[str, ...]
+    timeout: float
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceSettings:
+    """What crosses of the services.
+
+    Args:
+        allow: Globs over services that may cross, by their names here; empty lets none cross.
+        deny: Globs over those that stay home.
+        loggers: Whether each node's ``get_loggers`` and ``set_logger_level`` cross too.
+        timeout: Seconds that a call may take.
+        rules: Exceptions from that; the first that fits holds.
+    """
+
+    allow: tuple[str, ...] = ("/**",)
+    deny: tuple[str, ...] = ()
+    loggers: bool = False
+    timeout: float = limits.SERVICE_TIMEOUT
+    rules: tuple[ServiceRule, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class LaneSettings:
     """How the packets of each lane are marked.
 
@@ -175,6 +207,7 @@ class Settings:
         policy: What may cross.
         peers: What holds for single peers, in the order of the file.
         contracts: What the topics need, in the order of the file (``core.contract.Contracts``).
+        services: What crosses of the services, and how long a call may take.
         params: What crosses of the parameters.
         time: Whose simulated time holds.
         lanes: How the lanes are marked.
@@ -198,6 +231,7 @@ class Settings:
     policy: PolicySettings = field(default_factory=PolicySettings)
     peers: tuple[PeerRule, ...] = ()
     contracts: tuple[Rule, ...] = ()
+    services: ServiceSettings = field(default_factory=ServiceSettings)
     params: ParamSettings = field(default_factory=ParamSettings)
     time: TimeSettings = field(default_factory=TimeSettings)
     lanes: LaneSettings = field(default_factory=LaneSettings)

@@ -84,6 +84,22 @@ class ContractTable(_Table, kw_only=True):
     max_rate: object | UnsetType = UNSET
 
 
+class ServicesTable(_Table, kw_only=True):
+    """``[services]``: which services cross, and how long a call may take."""
+
+    allow: list[str] | UnsetType = UNSET
+    deny: list[str] | UnsetType = UNSET
+    loggers: bool | UnsetType = UNSET
+    timeout: object | UnsetType = UNSET
+
+
+class ServiceTable(_Table, kw_only=True):
+    """``[[service]]``: what holds for services of some names; ``core.config_service`` reads the values."""
+
+    names: list[str] | UnsetType = UNSET
+    timeout: object | UnsetType = UNSET
+
+
 class ParamsTable(_Table, kw_only=True):
     """``[params]``: what peers may do with this module's parameters."""
 
@@ -141,6 +157,8 @@ class ConfigFile(_Table, kw_only=True):
     discovery: DiscoveryTable = msgspec.field(default_factory=DiscoveryTable)
     bridge: BridgeTable = msgspec.field(default_factory=BridgeTable)
     contract: list[ContractTable] | UnsetType = UNSET
+    services: ServicesTable = msgspec.field(default_factory=ServicesTable)
+    service: list[ServiceTable] | UnsetType = UNSET
     params: ParamsTable = msgspec.field(default_factory=ParamsTable)
     param: list[ParamTable] | UnsetType = UNSET
     time: TimeTable = msgspec.field(default_factory=TimeTable)
@@ -169,7 +187,10 @@ def known_keys() -> list[Key]:
     return found
 
 
-LISTS: Final = {name: tuple(_keys(table)) for name, table in (("contract", ContractTable), ("param", ParamTable))}
+LISTS: Final = {
+    name: tuple(_keys(table))
+    for name, table in (("contract", ContractTable), ("param", ParamTable), ("service", ServiceTable))
+}
 """The tables that there may be many of (``[[contract]]``), and the keys that each may have."""
 
 

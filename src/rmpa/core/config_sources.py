@@ -17,10 +17,19 @@ from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
 from rmpa.core import config_values as values
-from rmpa.core.config import LaneSettings, ParamSettings, PolicySettings, RealtimeSettings, Settings, TimeSettings
+from rmpa.core.config import (
+    LaneSettings,
+    ParamSettings,
+    PolicySettings,
+    RealtimeSettings,
+    ServiceSettings,
+    Settings,
+    TimeSettings,
+)
 from rmpa.core.config_contract import ContractRules, read_contracts
 from rmpa.core.config_file import Key, Place, dotted, line_of, parse_config
 from rmpa.core.config_param import problems, read_follow_rules, read_key_glob
+from rmpa.core.config_service import read_service_glob, read_service_rules, read_timeout
 from rmpa.core.config_values import BadValue, Multicast
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import peer_name_from
@@ -90,6 +99,11 @@ _OPTIONS: Final[Mapping[str, _Option]] = {
     "allow_types": _Option(_list_of(values.read_type_glob), ("bridge", "allow_types"), "RMPA_ALLOW_TYPES"),
     "deny_types": _Option(_list_of(values.read_type_glob), ("bridge", "deny_types"), "RMPA_DENY_TYPES"),
     "contracts": _Option(read_contracts, ("contract",)),
+    "service_allow": _Option(_list_of(read_service_glob), ("services", "allow"), "RMPA_SERVICE_ALLOW"),
+    "service_deny": _Option(_list_of(read_service_glob), ("services", "deny"), "RMPA_SERVICE_DENY"),
+    "service_loggers": _Option(values.read_bool, ("services", "loggers"), "RMPA_SERVICE_LOGGERS"),
+    "service_timeout": _Option(read_timeout, ("services", "timeout"), "RMPA_SERVICE_TIMEOUT"),
+    "service_rules": _Option(read_service_rules, ("service",)),
     "remote_get": _Option(_list_of(read_key_glob), ("params", "remote_get"), "RMPA_REMOTE_GET"),
     "remote_set": _Option(_list_of(read_key_glob), ("params", "remote_set"), "RMPA_REMOTE_SET"),
     "follow": _Option(read_follow_rules, ("param",)),
@@ -234,6 +248,10 @@ def _named_file(named: str, source: str) -> Path:
 
 _GROUPS: Final[Mapping[str, tuple[Callable[..., object], Mapping[str, str]]]] = {
     "policy": (PolicySettings, {key: key for key in ("allow", "deny", "allow_types", "deny_types")}),
+    "services": (
+        ServiceSettings,
+        {f"service_{key}": key for key in ("allow", "deny", "loggers", "timeout", "rules")},
+    ),
     "params": (ParamSettings, {key: key for key in ("remote_get", "remote_set", "follow")}),
     "time": (TimeSettings, {"time_follow": "follow", "time_share": "share"}),
     "lanes": (

@@ -67,6 +67,8 @@ MULTICAST_GROUP: Final = "239.255.82.77"
 """Administratively scoped (RFC 2365), so routers keep it on site; 82.77 is "RM"."""
 MULTICAST_PORT: Final = 11411
 """Of domain 0; domain n uses this plus n."""
+MULTICAST_TEST_PORT: Final = 11410
+"""Of ``rmpa multicast``: beside those of all domains, so that no agent hears its packets."""
 MULTICAST_TTL: Final = 1
 """Hops: the own sub-network only."""
 BEACON_MAX_BYTES: Final = 1200
@@ -413,9 +415,9 @@ SERVICE_POOL: Final = 32
 SERVICE_QUEUE: Final = 1024
 """Calls of one service that wait for one of those; further ones are refused at once."""
 SERVICE_BYTES: Final = 256 * MIB
-"""Requests and responses of one peer that are under way or being put together, each direction: four of the largest."""
+"""Requests and responses of one peer that are under way or being put together, each way: four of the largest."""
 SERVER_LOOK: Final = 0.5
-"""Between two looks whether the servers of what is offered still listen: a killed one is gone everywhere within 1 s."""
+"""Between two looks whether the servers of what is offered still listen: a killed one is gone within 1 s."""
 SERVICE_LATENCIES: Final = 512
 """Calls of a service that its latency is made of."""
 AUDIENCE_MAX: Final = 64
@@ -511,6 +513,24 @@ DIAGNOSTICS_STALE: Final = 60.0
 """For this long a peer that is gone, and what came from it, is shown as stale on /diagnostics."""
 DIAGNOSTICS_QUEUE: Final = 10
 """Messages waiting for a slow reader of /diagnostics: each holds everything that the one before it did."""
+
+# --- doctor ---------------------------------------------------------------------------------------------------
+DOCTOR_HEAR: Final = 1.0
+"""For a packet that an interface sends to ourselves; it takes less than a millisecond where it comes at all."""
+DOCTOR_PROGRAM: Final = 5.0
+"""For one of the system's programs (nft, iptables) to answer."""
+DOCTOR_NAME: Final = 5.0
+"""For the resolver to say what a host name is: a dead name server takes 5 s for each question."""
+DOCTOR_OUTPUT_MAX: Final = 4 * MIB
+"""Of such a program; the rules of a Kubernetes node have some 100 KB."""
+DOCTOR_FILES_LOW: Final = 4096
+"""Open files below which an agent of a large graph runs out: a proxy takes two, and each subscriber one."""
+DOCTOR_CLOCK_LOOK: Final = 0.3
+"""Between two looks at both clocks, to see one being set."""
+DOCTOR_CLOCK_STEP: Final = 0.005
+"""Seconds that the wall clock may go apart from the monotonic one meanwhile; slewing makes 0.15 ms."""
+DOCTOR_CLOCK_APART: Final = 0.02
+"""Seconds between the clocks of two modules from which on tf complains: two periods of a 100 Hz transform."""
 
 # --- logging --------------------------------------------------------------------------------------------------
 LOG_WAITING: Final = 10_000
