@@ -23,7 +23,7 @@ def of(ours: Identity, *, alive: bool = True) -> Peering:
 
 
 def dials(outputs: list[Output]) -> list[tuple[str, int]]:
-    return [o.endpoint for o in outputs if isinstance(o, Dial)]
+    return [o.endpoints[0] for o in outputs if isinstance(o, Dial)]
 
 
 def until_dial(peering: Peering, now: float) -> tuple[float, tuple[str, int]]:
@@ -44,20 +44,34 @@ def test_the_lower_dials_at_once_and_the_higher_after_a_while() -> None:
     assert until_dial(high, 0.0) == (limits.DIAL_FALLBACK, LOW.guid.endpoint)
 
 
-def test_the_beacons_source_then_each_address_then_a_growing_pause() -> None:
+def test_all_addresses_at_once_the_beacons_source_first_then_a_growing_pause() -> None:
     low = of(LOW)
     low.peer_found(DUAL, 0.0, source="172.16.0.2")
     now, seen = 0.0, []
-    for _ in range(9):
-        now, endpoint = until_dial(low, now)
-        seen.append((round(now, 3), endpoint[0]))
-        low.dial_failed(DUAL.guid, "refused", now)
-    a, b, c = "172.16.0.2", "10.0.0.2", "192.168.0.2"
-    assert seen == [(0.0, a), (0.0, b), (0.0, c), (0.1, a), (0.1, b), (0.1, c), (0.3, a), (0.3, b), (0.3, c)]
+    for _ in range(3):
+        while not (made := [o for o in low.take() if isinstance(o, Dial)]):
+            due = low.next_timer()
+            assert due is not None
+            now = max(now, due)
+            low.handle_timer(now)
+        seen.append((round(now, 3), [host for host, _ in made[0].endpoints]))
+        low.dial_failed(DUAL.guid, "no answer anywhere", now)
+    everywhere = ["172.16.0.2", "10.0.0.2", "192.168.0.2"]
+    assert seen == [(0.0, everywhere), (0.1, everywhere), (0.3, everywhere)]
     (status,) = low.peers()
-    assert status.state == "waiting"
-    assert status.last_error == "refused"
-    assert status.attempts == 9
+    assert (status.state, status.last_error, status.attempts) == ("waiting", "no answer anywhere", 3)
+
+
+def test_somebody_else_at_one_address_leaves_the_others_to_try_at_once() -> None:
+    low = of(LOW)
+    low.peer_found(DUAL, 0.0)
+    stranger, *rest = DUAL.endpoints
+    low.take()
+    low.dial_refused(DUAL.guid, Refuse(Refusal.WRONG_PEER, "I am another"), 1.0, stranger)
+    low.handle_timer(1.0)
+    assert low.take() == [Dial(DUAL.guid, tuple(rest))]
+    low.dial_failed(DUAL.guid, "hung up", 2.0, rest[0])
+    assert until_dial(low, 2.0)[0] > 2.0
 
 
 def test_retries_for_ever_with_a_cap() -> None:
@@ -172,7 +186,7 @@ def test_a_new_instance_replaces_its_ghost() -> None:
     assert low.take() == [
         CloseLink(1, "the peer restarted"),
         LinkDown(1, HIGH, "the peer restarted"),
-        Dial(AGAIN.guid, AGAIN.guid.endpoint),
+        Dial(AGAIN.guid, AGAIN.endpoints),
     ]
     low.link_up(2, AGAIN, 1.1, dialled=True, endpoint=AGAIN.guid.endpoint)
     assert low.take() == [LinkUp(2, AGAIN)]

@@ -34,10 +34,15 @@ _ELSEWHERE: Final = frozenset({Refusal.MYSELF, Refusal.WRONG_PEER})
 
 @dataclass(frozen=True, slots=True)
 class Dial:
-    """Connect to this endpoint, which should be this peer."""
+    """Connect to this peer, at whichever of its endpoints answers first.
+
+    Args:
+        guid: Who should be there.
+        endpoints: Where to try, best first; a peer with several addresses may be reached at some of them only.
+    """
 
     guid: Guid
-    endpoint: Endpoint
+    endpoints: tuple[Endpoint, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +127,7 @@ class _Peer:
     good: Endpoint | None = None
     link: _LinkInfo | None = None
     fell: float | None = None
-    dialling: Endpoint | None = None
+    dialling: tuple[Endpoint, ...] = ()
     tried: set[Endpoint] = field(default_factory=set)
     next_attempt: float | None = None
     forget_at: float | None = None
@@ -182,7 +187,7 @@ class Peering:
         if restarted:
             peer.lower = self._ours.guid < identity.guid
             self._restart(peer, now)
-        if fresh and peer.link is None and peer.dialling is None:
+        if fresh and peer.link is None and not peer.dialling:
             peer.next_attempt = now if peer.lower else now + limits.DIAL_FALLBACK
         self._dial_due(peer, now)
 
@@ -219,8 +224,8 @@ class Peering:
         """
         peer = self._peers.get(identity.guid.place) or self._add(identity)
         if dialled:
-            peer.dialling = None
-            peer.good = endpoint
+            peer.dialling = ()
+            peer.good = peer.last_endpoint = endpoint
         new = _LinkInfo(link_id, identity, dialled, now)
         old = peer.link
         if old is not None and self._keeps(old, new):
@@ -267,20 +272,27 @@ class Peering:
             return
         if not peer.announced:
             peer.forget_at = now + limits.FORGET_UNANNOUNCED
-        if peer.dialling is None:
+        if not peer.dialling:
             peer.next_attempt = now + peer.backoff.delay() + (0.0 if peer.lower else limits.DIAL_FALLBACK)
 
-    def dial_failed(self, guid: Guid, error: str, now: float) -> None:
-        """Nobody answered a ``Dial``, or the connection ended before the handshake did."""
-        peer = self._answered(guid)
+    def dial_failed(self, guid: Guid, error: str, now: float, endpoint: Endpoint | None = None) -> None:
+        """Nobody answered a ``Dial``, or the connection ended before the handshake did.
+
+        Args:
+            guid: Whose.
+            error: What happened.
+            now: Monotonic seconds.
+            endpoint: Where the connection was that ended; ``None`` if no endpoint answered.
+        """
+        peer = self._answered(guid, endpoint)
         if peer is not None:
             peer.last_error = error
             peer.refused = None
             self._again(peer, now)
 
-    def dial_refused(self, guid: Guid, refuse: Refuse, now: float) -> None:
-        """A ``Dial`` was answered with a no, by them or by us."""
-        peer = self._answered(guid)
+    def dial_refused(self, guid: Guid, refuse: Refuse, now: float, endpoint: Endpoint | None = None) -> None:
+        """A ``Dial`` was answered with a no, by them or by us, at this endpoint."""
+        peer = self._answered(guid, endpoint)
         if peer is None:
             return
         peer.last_error = str(refuse)
@@ -318,6 +330,11 @@ class Peering:
         outputs, self._outputs = self._outputs, []
         return outputs
 
+    def endpoints(self, guid: Guid) -> list[Endpoint]:
+        """Where a peer may be reached, best first; empty for one that is not known."""
+        peer = self._peers.get(guid.place)
+        return peer.endpoints() if peer is not None else []
+
     def peers(self) -> list[PeerStatus]:
         """All known peers, by GUID."""
         return [_status(p) for p in sorted(self._peers.values(), key=lambda p: p.identity.guid)]
@@ -333,7 +350,7 @@ class Peering:
     def _forget_if_idle(self, peer: _Peer) -> None:
         """Forget a peer that is gone; one that we are dialling only when the dial was answered."""
         peer.next_attempt = peer.forget_at = None
-        if peer.link is None and peer.dialling is None:
+        if peer.link is None and not peer.dialling:
             self._peers.pop(peer.identity.guid.place, None)
 
     def _restart(self, peer: _Peer, now: float) -> None:
@@ -346,7 +363,7 @@ class Peering:
         ghost = link is not None and link.identity.instance != peer.identity.instance
         if link is not None and ghost and (link.identity.guid < peer.identity.guid or not self._alive(link.id)):
             self._drop(peer, link, "the peer restarted", close=True)
-        if peer.link is None and peer.dialling is None:
+        if peer.link is None and not peer.dialling:
             peer.next_attempt = now if peer.lower else now + limits.DIAL_FALLBACK
 
     def _keeps(self, old: _LinkInfo, new: _LinkInfo) -> bool:
@@ -362,19 +379,24 @@ class Peering:
             self._outputs.append(CloseLink(link.id, reason))
         self._outputs.append(LinkDown(link.id, link.identity, reason))
 
-    def _answered(self, guid: Guid) -> _Peer | None:
+    def _answered(self, guid: Guid, endpoint: Endpoint | None) -> _Peer | None:
+        """The peer that was dialled. Who answered at one endpoint says nothing of the others."""
         peer = self._peers.get(guid.place)
-        if peer is None or peer.dialling is None:
+        if peer is None or not peer.dialling:
             return None
-        peer.tried.add(peer.dialling)
-        peer.dialling = None
+        if endpoint is None:
+            peer.tried.update(peer.dialling)
+        else:
+            peer.tried.add(endpoint)
+            peer.last_endpoint = endpoint
+        peer.dialling = ()
         if peer.gone:
             self._forget_if_idle(peer)
             return None
         return peer
 
     def _again(self, peer: _Peer, now: float) -> None:
-        """Try the next endpoint at once, or wait when all were tried."""
+        """Try the other endpoints at once, or wait when all were tried."""
         if peer.link is not None:
             return
         if peer.tried.issuperset(peer.endpoints()):
@@ -386,23 +408,24 @@ class Peering:
 
     def _dial_due(self, peer: _Peer, now: float) -> None:
         due = peer.next_attempt
-        if due is None or now < due or peer.link is not None or peer.dialling is not None:
+        if due is None or now < due or peer.link is not None or peer.dialling:
             return
         left = [e for e in peer.endpoints() if e not in peer.tried]
         if not left:
             peer.tried.clear()
             left = peer.endpoints()
-        peer.dialling = peer.last_endpoint = left[0]
+        peer.dialling = tuple(left)
+        peer.last_endpoint = left[0]
         peer.next_attempt = None
         peer.attempts += 1
-        self._outputs.append(Dial(peer.identity.guid, left[0]))
+        self._outputs.append(Dial(peer.identity.guid, peer.dialling))
 
 
 def _status(peer: _Peer) -> PeerStatus:
     state: Literal["linked", "dialling", "waiting", "refused"]
     if peer.link is not None:
         state = "linked"
-    elif peer.dialling is not None:
+    elif peer.dialling:
         state = "dialling"
     else:
         state = "waiting" if peer.refused is None else "refused"

@@ -37,10 +37,17 @@ async def until(condition: Callable[[], bool], what: str) -> None:
 class Peer:
     """A mesh and what it was told."""
 
-    def __init__(self, number: int, instance: int = 0, port: int = 0, lanes: LaneSettings | None = None) -> None:
+    def __init__(
+        self,
+        number: int,
+        instance: int = 0,
+        port: int = 0,
+        lanes: LaneSettings | None = None,
+        host: str = "127.0.0.1",
+    ) -> None:
         sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        sock.bind(("127.0.0.1", port))
+        sock.bind((host, port))
         sock.listen(32)
         self.number = number
         self.port = sock.getsockname()[1]

@@ -9,6 +9,8 @@ import fcntl
 import hashlib
 import socket
 import sys
+from dataclasses import replace
+from ipaddress import IPv4Address
 
 import pytest
 
@@ -19,7 +21,7 @@ from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.mesh.aio.sockets import tune_express
 from rmpa.mesh.frames import Frame, Kind
-from rmpa.mesh.handshake import Refusal, Refuse
+from rmpa.mesh.handshake import Lane, Refusal, Refuse
 from tests.mesh.aio.meshes import DEADLINE, Peer, peers, raw, until
 
 _SIOCOUTQNSD = 0x894B  # linux/sockios.h: bytes that were not sent yet
@@ -52,6 +54,35 @@ async def test_one_side_alone_knows_the_other() -> None:
         one.mesh.peer_found(other.identity)
         await until(lambda: one.linked(other) and other.linked(one), "a link")
         assert other.ups[0].identity == one.identity
+
+
+async def test_of_several_addresses_whichever_answers_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody answers at the GUID's own address; at the next one nobody listens, and at the third a stranger does."""
+    one, other = sorted((Peer(1, host="127.0.0.4"), Peer(2, host="127.0.0.4")), key=lambda p: p.identity.guid)
+    connect = one.mesh._connect  # noqa: SLF001 - where packets are swallowed
+
+    async def through(endpoint: tuple[str, int], lane: Lane, within: float = limits.DIAL_TIMEOUT) -> socket.socket:
+        if endpoint[0] == "127.0.0.1":
+            await asyncio.sleep(within)
+            raise TimeoutError
+        return await connect(endpoint, lane, within)
+
+    monkeypatch.setattr(one.mesh, "_connect", through)
+    stranger = await asyncio.start_server(lambda _, writer: writer.close(), "127.0.0.3", other.port)
+    try:
+        await one.mesh.start()
+        await other.mesh.start()
+        began = asyncio.get_running_loop().time()
+        addresses = tuple(map(IPv4Address, ("127.0.0.2", "127.0.0.3", "127.0.0.4")))
+        one.mesh.peer_found(replace(other.identity, addresses=addresses))
+        await until(lambda: one.linked(other) and other.linked(one), "a link")
+        assert one.link(other).remote_endpoint[0] == "127.0.0.4"
+        assert asyncio.get_running_loop().time() - began < sum(limits.DIAL_ATTEMPTS)
+    finally:
+        stranger.close()
+        await stranger.wait_closed()
+        await one.mesh.close()
+        await other.mesh.close()
 
 
 async def test_small_and_large_messages_in_order_and_byte_exact() -> None:

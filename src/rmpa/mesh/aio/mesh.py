@@ -26,10 +26,13 @@ from rmpa.mesh.link import Role
 from rmpa.mesh.peering import REPLACED, CloseLink, Dial, LinkDown, LinkRefused, LinkUp, Output, Peering, PeerStatus
 
 if TYPE_CHECKING:
+    from collections.abc import Coroutine, Iterable
+
     from rmpa.core.clock import Clock
     from rmpa.core.guid import Guid
     from rmpa.core.identity import Identity
     from rmpa.mesh.handshake import Hello, Refuse, Verdict
+    from rmpa.mesh.peering import Endpoint
 
 _log = logging.getLogger(__name__)
 
@@ -131,6 +134,7 @@ class Mesh:
         self._pending: set[int] = set()
         self._dialled: dict[int, Guid] = {}
         self._dials: set[asyncio.Task[None]] = set()
+        self._attempts: set[asyncio.Task[socket.socket]] = set()
         self._bulk_dials: dict[int, asyncio.Task[None]] = {}
         self._bulk_backoffs: dict[int, Backoff] = {}
         self._redials: dict[int, asyncio.Task[None]] = {}
@@ -159,7 +163,7 @@ class Mesh:
         for timer in (self._timer, self._accept_timer):
             if timer is not None:
                 timer.cancel()
-        dials = [*self._dials, *self._bulk_dials.values(), *self._redials.values()]
+        dials = [*self._dials, *self._attempts, *self._bulk_dials.values(), *self._redials.values()]
         for task in dials:
             task.cancel()
         await asyncio.gather(*dials, return_exceptions=True)
@@ -237,7 +241,7 @@ class Mesh:
             return  # its end, which follows, is what makes us try again
         guid = self._dialled.pop(link.id, None)
         if guid is not None:
-            self._peering.dial_refused(guid, refuse, now)
+            self._peering.dial_refused(guid, refuse, now, link.remote_endpoint)
             self._act()
 
     def link_control(self, link: MeshLink, payload: bytes) -> None:
@@ -268,7 +272,7 @@ class Mesh:
         self._bulk_backoffs.pop(link.id, None)
         guid = self._dialled.pop(link.id, None)
         if guid is not None:
-            self._peering.dial_failed(guid, reason, now)
+            self._peering.dial_failed(guid, reason, now, link.remote_endpoint)
         if was_up:
             self._peering.link_down(link.id, reason, now, silent=link.silent)
         self._act(link)
@@ -385,10 +389,11 @@ class Mesh:
     # --- connections ----------------------------------------------------------------------------------------
 
     async def _redial(self, link: MeshLink) -> None:
-        """Replace a link whose bytes nobody acknowledges, as soon as the peer can be reached again."""
+        """Replace a link whose bytes nobody acknowledges, as soon as the peer can be reached again, on any way."""
         while link.used and not self._alive(link.id):
+            ways = dict.fromkeys([link.remote_endpoint, *self._peering.endpoints(link.guid)])
             try:
-                sock = await self._connect(link.remote_endpoint, Lane.EXPRESS, limits.REDIAL_TIMEOUT)
+                sock, endpoint = await self._race(ways, self._knock)
             except OSError as error:
                 _log.debug("! %s: silent, and not to be reached: %s", link.name, str(error) or "no answer")
                 await asyncio.sleep(limits.REDIAL_PAUSE)
@@ -397,17 +402,56 @@ class Mesh:
                 _log.debug("= %s: silent, but not for want of a way to it", link.name)
                 sock.close()
                 return
-            _log.debug("= %s: silent, but it can be reached: a new link", link.name)
-            self._open(sock, Role.DIALLER, link.remote_endpoint, link.guid)
+            _log.debug("= %s: silent, but it can be reached at %s:%d: a new link", link.name, *endpoint)
+            self._open(sock, Role.DIALLER, endpoint, link.guid)
             return
 
-    async def _reach(self, endpoint: tuple[str, int]) -> socket.socket:
+    async def _knock(self, endpoint: Endpoint) -> socket.socket:
+        return await self._connect(endpoint, Lane.EXPRESS, limits.REDIAL_TIMEOUT)
+
+    async def _reach(self, endpoint: Endpoint) -> socket.socket:
         """Connect; a lost SYN is repeated by new attempts, for TCP would take a second."""
         *hasty, patient = limits.DIAL_ATTEMPTS
         for within in hasty:
             with contextlib.suppress(TimeoutError):
                 return await self._connect(endpoint, Lane.EXPRESS, within)
         return await self._connect(endpoint, Lane.EXPRESS, patient)
+
+    async def _race(
+        self, endpoints: Iterable[Endpoint], attempt: Callable[[Endpoint], Coroutine[object, object, socket.socket]]
+    ) -> tuple[socket.socket, Endpoint]:
+        """Connect where somebody answers first (RFC 8305): the next endpoint has its turn when the one before it
+        failed, or has not answered for ``limits.DIAL_STAGGER``.
+
+        Raises:
+            OSError: Nobody answers anywhere; the error is the first endpoint's.
+        """
+        left = list(endpoints)
+        if len(left) == 1:
+            return await attempt(left[0]), left[0]
+        running: dict[asyncio.Task[socket.socket], Endpoint] = {}
+        first: OSError | None = None
+        try:
+            while left or running:
+                if left:
+                    endpoint = left.pop(0)
+                    task = asyncio.get_running_loop().create_task(attempt(endpoint))
+                    running[task] = endpoint
+                    self._attempts.add(task)
+                    task.add_done_callback(self._attempts.discard)
+                pause = limits.DIAL_STAGGER if left else None
+                done, _ = await asyncio.wait(running, timeout=pause, return_when=asyncio.FIRST_COMPLETED)
+                for task in [task for task in running if task in done]:
+                    endpoint = running.pop(task)
+                    try:
+                        return task.result(), endpoint
+                    except OSError as error:  # TimeoutError is one, no file descriptor for the socket another
+                        first = first if first is not None else error
+        finally:
+            for task in running:  # not awaited: who is linked has better to do
+                task.add_done_callback(_close_late)
+                task.cancel()
+        raise first if first is not None else OSError(errno.EHOSTUNREACH, os.strerror(errno.EHOSTUNREACH))
 
     async def _connect(
         self, endpoint: tuple[str, int], lane: Lane, within: float = limits.DIAL_TIMEOUT
@@ -423,17 +467,17 @@ class Mesh:
         return sock
 
     async def _dial(self, dial: Dial) -> None:
-        host, port = dial.endpoint
-        _log.debug("> dialling %s at %s:%d", dial.guid, host, port)
+        places = ", ".join(f"{host}:{port}" for host, port in dial.endpoints)
+        _log.debug("> dialling %s at %s", dial.guid, places)
         try:
-            sock = await self._reach(dial.endpoint)
-        except OSError as error:  # TimeoutError is one, no file descriptor for the socket another
+            sock, endpoint = await self._race(dial.endpoints, self._reach)
+        except OSError as error:
             self.counters.add("link.dial_failed")
             problem = os.strerror(error.errno) if error.errno else f"no answer within {limits.DIAL_TIMEOUT:g} s"
-            self._peering.dial_failed(dial.guid, f"{host}:{port}: {problem}", self._clock.now())
+            self._peering.dial_failed(dial.guid, f"{places}: {problem}", self._clock.now())
             self._act()
         else:
-            self._open(sock, Role.DIALLER, dial.endpoint, dial.guid)
+            self._open(sock, Role.DIALLER, endpoint, dial.guid)
 
     def _open(
         self,
@@ -495,6 +539,12 @@ class Mesh:
         text = f"closed a connection from {address}: too many have not said who they are ({there} from there)"
         self._refusals.refuse(self._clock.now(), "link.pending_full", address, text)
         return False
+
+
+def _close_late(task: asyncio.Task[socket.socket]) -> None:
+    """Somebody else was faster: close what came of an attempt all the same."""
+    if not task.cancelled() and task.exception() is None:
+        task.result().close()
 
 
 def _status(link: MeshLink) -> LinkStatus:
