@@ -213,7 +213,7 @@ def test_a_profile_that_serves_worse_within_the_known_range_changes_nothing(
         },
         cost=1,
     )
-    assume(all(worse.offers[name] <= model.offers[name] for name in ("x", "y")))
+    assume(all(float(worse.offers[name]) <= float(model.offers[name]) for name in ("x", "y")))
     assert plane([*profiles, worse]).decide(asked) == before
 
 

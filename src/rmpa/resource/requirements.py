@@ -73,9 +73,11 @@ def bound(
     if exactly is not None:
         at_least = at_most = exactly
     if attribute.direction is Direction.MAX:
-        at_most = _one_sided(at_least, at_most, exactly, where, "more is better", "at_least")
+        _check_side(at_least, at_most, exactly, where, "more is better", "at_least")
+        at_most = None
     elif attribute.direction is Direction.MIN:
-        at_least = _one_sided(at_most, at_least, exactly, where, "less is better", "at_most")
+        _check_side(at_most, at_least, exactly, where, "less is better", "at_most")
+        at_least = None
     low = -math.inf if at_least is None else _place(attribute, at_least, where)
     high = math.inf if at_most is None else _place(attribute, at_most, where)
     if low > high:
@@ -83,7 +85,7 @@ def bound(
     return Bound(low, high, weight=weight, hard=hard)
 
 
-def _one_sided(asked: object, other: object, exactly: object, where: str, better: str, key: str) -> None:
+def _check_side(asked: object, other: object, exactly: object, where: str, better: str, key: str) -> None:
     """Check the side that asks for nothing: an exact value is a bound on the side that counts."""
     if asked is None or (other is not None and exactly is None):
         raise ConfigError(where, f"{better}, so a bound on the other side asks for nothing", f"give {key} alone")
