@@ -85,11 +85,19 @@ class SuspendRoute:
 
 @dataclass(frozen=True, slots=True)
 class Publish:
-    """Let a peer's source appear in the local graph."""
+    """Let a peer's source appear in the local graph.
+
+    Args:
+        peer: Whose.
+        source: Which, by the name that its peer has for it.
+        type: Its message type.
+        topic: What it is called here; empty: the same.
+    """
 
     peer: int
     source: Source
     type: str
+    topic: str = ""
 
 
 @dataclass(frozen=True, slots=True)

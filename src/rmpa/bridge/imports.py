@@ -11,6 +11,9 @@ of each peer is in one state of this table::
 
 What each method costs depends on what it is told, not on how many peers and sources there are; only who takes a long
 advertisement in one piece waits long (``portions``).
+
+A source is known by its wire name, as its peer has it; under which topic it stands here is ``Import.topic``
+(``bridge.naming``), and what the local graph says of topics is about those.
 """
 
 from __future__ import annotations
@@ -22,7 +25,8 @@ from heapq import heappop, heappush
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.actions import Action, Describe, Detach, Publish, Retract, Send, Warn
-from rmpa.bridge.messages import Advertise, Close, Closed, Mismatch, Offer, Open, Opened, Source
+from rmpa.bridge.messages import Advertise, Close, Closed, Mismatch, Offer, Open, Opened, Source, is_crossing_name
+from rmpa.bridge.naming import Names, PeerNames
 from rmpa.core import limits
 from rmpa.core.backoff import Backoff
 from rmpa.core.contract import Contract, Contracts, Reliability
@@ -66,6 +70,7 @@ class Import:
 
     Args:
         type: Its message type.
+        topic: The topic that it is here.
         backoff: Delays between attempts.
         shown: Whether it is in the local graph.
         hidden: Why it is not, or empty.
@@ -77,10 +82,12 @@ class Import:
         problem: Why the last attempt failed, or empty.
         wanted: Whether somebody local listens.
         contract: What holds for its route, once it was open.
+        asked: What was last asked for.
         serial: Of the timer.
     """
 
     type: str
+    topic: str
     backoff: Backoff
     shown: bool = False
     hidden: str = ""
@@ -92,6 +99,7 @@ class Import:
     problem: str = ""
     wanted: bool = False
     contract: Contract | None = None
+    asked: Contract | None = None
     serial: int = 0
 
 
@@ -99,6 +107,7 @@ def _nothing(_peer: int, _source: Source) -> None:
     """Nothing outlives its link."""
 
 
+_NO_NAMES: Final = Names()
 _LISTENED: Final = frozenset({RouteState.OPENING, RouteState.OPEN, RouteState.WAITING})
 
 
@@ -107,8 +116,11 @@ class _Peer:
     """What came over one link, or over the links of one instance.
 
     Args:
+        name: The peer's.
+        names: How its names read here.
         sources: What it offers.
-        topics: The same by topic (dicts, for their order).
+        topics: The same by the topic here (dicts, for their order).
+        places: What is in the local graph, by its topic and node there.
         routes: Those that were asked for or are open.
         next_route: The next one's id.
         nodes: How many sources each of its nodes has.
@@ -116,8 +128,11 @@ class _Peer:
         doubtful: What it offered over its last link and has not offered again since.
     """
 
+    name: str
+    names: PeerNames
     sources: dict[Source, Import] = field(default_factory=dict)
     topics: dict[str, dict[Source, None]] = field(default_factory=dict)
+    places: dict[tuple[str, str], Source] = field(default_factory=dict)
     routes: dict[int, Source] = field(default_factory=dict)
     next_route: int = 1
     nodes: Counter[str] = field(default_factory=Counter)
@@ -133,6 +148,7 @@ class Imports:
         rng: Uniform numbers in [0, 1) for the back-off's jitter.
         contracts: What our side asks for.
         position: ``(peer, source)``: epoch and last message of a reliable route that outlived its link, or ``None``.
+        names: How the peers' names read here.
     """
 
     def __init__(
@@ -141,8 +157,10 @@ class Imports:
         rng: Callable[[], float],
         contracts: Contracts | None = None,
         position: Callable[[int, Source], tuple[int, int] | None] = _nothing,
+        names: Names = _NO_NAMES,
     ) -> None:
         self._policy = policy
+        self._names = names
         self._rng = rng
         self._contracts = contracts if contracts is not None else Contracts()
         self._position = position
@@ -167,7 +185,7 @@ class Imports:
         return any(source in known.sources for known in self._peers.values())
 
     def offered_by(self, peer: int) -> Collection[str]:
-        """The topics that a peer offers."""
+        """The topics that a peer offers, as they are here."""
         return known.topics.keys() if (known := self._peers.get(peer)) is not None else ()
 
     def local_type(self, topic: str, type_name: str | None) -> list[Action]:
@@ -191,9 +209,43 @@ class Imports:
                     actions += self._report_conflict(peer, source, entry)
         return actions
 
-    def link_up(self, peer: int) -> list[Action]:
-        """A link is up, perhaps of a peer that was away; its first message begins a full advertisement."""
-        known = self._peers.setdefault(peer, _Peer())
+    def rules(self, policy: Policy, contracts: Contracts, names: Names, now: float) -> Iterator[list[Action]]:
+        """Other rules hold from now on; what they leave as it is goes on untouched.
+
+        Returns:
+            What to do, source by source, as it is taken.
+        """
+        self._policy, self._contracts, self._names = policy, contracts, names
+        for known in self._peers.values():
+            known.names = names.of(known.name)
+        return (self._rejudge(peer, source, now) for peer, source, _ in self)
+
+    def _rejudge(self, peer: int, source: Source, now: float) -> list[Action]:
+        entry = self.get(peer, source)
+        if entry is None:
+            return []
+        known = self._peers[peer]
+        actions: list[Action] = []
+        topic = known.names.local_name(source.topic, entry.type)
+        if topic != entry.topic:
+            actions += self._hide(peer, source, entry) if entry.shown else []
+            self._unlist(known, source, entry)
+            entry.topic = topic
+            known.topics.setdefault(topic, {})[source] = None
+        actions += self._show_or_hide(peer, source, entry)
+        if entry.route and entry.asked != self._contracts.of(entry.topic, entry.type):
+            actions += self._close(peer, source, entry)
+            actions += self._open(peer, source, entry, now) if entry.wanted else []
+        return actions
+
+    def link_up(self, peer: int, name: str = "") -> list[Action]:
+        """A link is up, perhaps of a peer that was away; its first message begins a full advertisement.
+
+        Args:
+            peer: Whose.
+            name: The peer's name, which its rules go by.
+        """
+        known = self._peers.setdefault(peer, _Peer(name, self._names.of(name)))
         known.away = False
         known.routes = {}
         known.next_route = 1
@@ -394,21 +446,41 @@ class Imports:
             ]
         nodes[source.node] += 1
         backoff = Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng)
-        entry = known[source] = Import(offer.type, backoff)
-        self._peers[peer].topics.setdefault(source.topic, {})[source] = None
+        topic = self._peers[peer].names.local_name(source.topic, offer.type)
+        entry = known[source] = Import(offer.type, topic, backoff)
+        self._peers[peer].topics.setdefault(topic, {})[source] = None
         actions += self._show_or_hide(peer, source, entry)
         return actions + self._report_conflict(peer, source, entry)
 
     def _show_or_hide(self, peer: int, source: Source, entry: Import) -> list[Action]:
-        entry.hidden, entry.conflict = self._why_hidden(source, entry.type)
+        entry.hidden, entry.conflict = self._why_hidden(peer, source, entry)
         if entry.shown is not bool(entry.hidden):
             return []
-        if not entry.hidden:
-            entry.shown = True
-            return [Publish(peer, source, entry.type)]
+        if entry.hidden:
+            return self._hide(peer, source, entry)
+        entry.shown = True
+        self._peers[peer].places[entry.topic, source.node] = source
+        return [Publish(peer, source, entry.type, entry.topic if entry.topic != source.topic else "")]
+
+    def _hide(self, peer: int, source: Source, entry: Import) -> list[Action]:
         entry.shown = False
         entry.wanted = False
-        return [*self._close(peer, source, entry), Retract(peer, source)]
+        return [*self._close(peer, source, entry), Retract(peer, source), *self._yield_place(peer, source, entry)]
+
+    def _yield_place(self, peer: int, source: Source, entry: Import) -> list[Action]:
+        """A source has left the local graph: another one may have stood behind it."""
+        known = self._peers[peer]
+        del known.places[entry.topic, source.node]
+        if known.names.plain:
+            return []
+        behind = [s for s in known.topics.get(entry.topic, ()) if s.node == source.node and s != source]
+        return [action for s in behind for action in self._show_or_hide(peer, s, known.sources[s])]
+
+    @staticmethod
+    def _unlist(known: _Peer, source: Source, entry: Import) -> None:
+        del known.topics[entry.topic][source]
+        if not known.topics[entry.topic]:
+            del known.topics[entry.topic]
 
     def _report_conflict(self, peer: int, source: Source, entry: Import) -> list[Action]:
         """Say loudly, on both sides, that a local topic of another type is in the way."""
@@ -419,14 +491,21 @@ class Imports:
             Send(peer, Mismatch(source.topic, source.node, "", entry.hidden)),
         ]
 
-    def _why_hidden(self, source: Source, type_name: str) -> tuple[str, bool]:
-        decision = self._policy.judge(source.topic, type_name, source.node)
+    def _why_hidden(self, peer: int, source: Source, entry: Import) -> tuple[str, bool]:
+        known, topic, type_name = self._peers[peer], entry.topic, entry.type
+        decision = self._policy.judge(topic, type_name, source.node)
+        if decision.allowed:
+            decision = self._policy.judge_for(known.name, topic, type_name, source.topic)
         if not decision.allowed:
             return decision.rule, False
-        local = self._local_types.get(source.topic, type_name)
+        if not is_crossing_name(topic):
+            return f"its name here would be {topic}, which is too long", False
+        if (holder := known.places.get((topic, source.node), source)) != source:
+            return f"it would be {topic} here, as {holder.topic} of this node is already; rename one", False
+        local = self._local_types.get(topic, type_name)
         if local == type_name:
             return "", False
-        why = f"its type is {type_name}, but a local node publishes {source.topic} as {local}; "
+        why = f"its type is {type_name}, but a local node publishes {topic} as {local}; "
         return why + "rename one of the topics or use one type", True
 
     def _forget(self, peer: int, source: Source) -> list[Action]:
@@ -436,13 +515,13 @@ class Imports:
         return self._close(peer, source, entry) + self._drop(peer, source, entry)
 
     def _drop(self, peer: int, source: Source, entry: Import) -> list[Action]:
-        actions: list[Action] = [Retract(peer, source)] if entry.shown else []
         known = self._peers[peer]
+        actions: list[Action] = []
+        if entry.shown:
+            actions += [Retract(peer, source), *self._yield_place(peer, source, entry)]
         del known.sources[source]
         known.doubtful.discard(source)
-        del known.topics[source.topic][source]
-        if not known.topics[source.topic]:
-            del known.topics[source.topic]
+        self._unlist(known, source, entry)
         known.nodes[source.node] -= 1
         if not known.nodes[source.node]:
             del known.nodes[source.node]
@@ -470,7 +549,7 @@ class Imports:
         known.routes[route] = source
         entry.route = route
         self._move(peer, source, entry, RouteState.OPENING, now + limits.ROUTE_OPEN_TIMEOUT)
-        contract = self._contracts.of(source.topic, entry.type)
+        contract = entry.asked = self._contracts.of(entry.topic, entry.type)
         epoch, after = self._position(peer, source) or (0, 0)
         return [Send(peer, Open(route, source.topic, source.node, contract, epoch, after))]
 
