@@ -59,7 +59,7 @@ async def test_one_side_alone_knows_the_other() -> None:
 async def test_of_several_addresses_whichever_answers_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody answers at the GUID's own address; at the next one nobody listens, and at the third a stranger does."""
     one, other = sorted((Peer(1, host="127.0.0.4"), Peer(2, host="127.0.0.4")), key=lambda p: p.identity.guid)
-    connect = one.mesh._connect  # noqa: SLF001 - where packets are swallowed
+    connect = one.mesh._connect  # where packets are swallowed
 
     async def through(endpoint: tuple[str, int], lane: Lane, within: float = limits.DIAL_TIMEOUT) -> socket.socket:
         if endpoint[0] == "127.0.0.1":

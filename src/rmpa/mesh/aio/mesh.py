@@ -420,8 +420,9 @@ class Mesh:
     async def _race(
         self, endpoints: Iterable[Endpoint], attempt: Callable[[Endpoint], Coroutine[object, object, socket.socket]]
     ) -> tuple[socket.socket, Endpoint]:
-        """Connect where somebody answers first (RFC 8305): the next endpoint has its turn when the one before it
-        failed, or has not answered for ``limits.DIAL_STAGGER``.
+        """Connect where somebody answers first (RFC 8305).
+
+        The next endpoint has its turn when the one before it failed, or has been silent for ``limits.DIAL_STAGGER``.
 
         Raises:
             OSError: Nobody answers anywhere; the error is the first endpoint's.
