@@ -37,11 +37,32 @@ def _not_here(name: str, reason: str) -> None:
 
 @dataclass(slots=True)
 class Proxy:
-    """A node of a peer, standing in the local graph."""
+    """A node of a peer, standing in the local graph.
+
+    Args:
+        node: What stands there.
+        types: By topic as the peer has it: its message type.
+        publications: Likewise: its local end, whose ``topic`` is what it is called here.
+    """
 
     node: SlaveNode
     types: dict[str, str] = field(default_factory=dict)
     publications: dict[str, Publication] = field(default_factory=dict)
+    held: dict[str, Callable[[SlaveNode], None]] = field(default_factory=dict)
+    """What else it is kept for, and who was told that it is there."""
+
+    @property
+    def idle(self) -> bool:
+        """Whether it stands for nothing any more."""
+        return not self.publications and not self.held
+
+
+@dataclass(frozen=True, slots=True)
+class _Hold:
+    """Somebody keeps the proxy of a node for something else than a topic, or no longer does."""
+
+    node: str
+    key: str
 
 
 class Inbound:
@@ -79,8 +100,9 @@ class Inbound:
         self._on_demand = on_demand
         self._on_mismatch = on_mismatch
         self._proxies: dict[str, Proxy] = {}
-        self._wanted: dict[Source, str] = {}
-        self._jobs: asyncio.Queue[Publish | Retract | None] = asyncio.Queue()
+        self._wanted: dict[Source, Publish] = {}
+        self._holds: dict[tuple[str, str], Callable[[SlaveNode], None]] = {}
+        self._jobs: asyncio.Queue[Publish | Retract | _Hold | None] = asyncio.Queue()
         self._task = asyncio.create_task(self._work(), name=f"proxies {prefix}")
         self.flows: dict[int, ImportFlow] = {}
         """Open routes; the data path looks here."""
@@ -104,7 +126,7 @@ class Inbound:
 
     def publish(self, action: Publish) -> None:
         """Let a source appear; takes a moment."""
-        self._wanted[action.source] = action.type
+        self._wanted[action.source] = action
         self._jobs.put_nowait(action)
 
     def retract(self, action: Retract) -> None:
@@ -112,6 +134,22 @@ class Inbound:
         self._wanted.pop(action.source, None)
         self._over(action.source)
         self._jobs.put_nowait(action)
+
+    def hold(self, node: str, key: str, ready: Callable[[SlaveNode], None]) -> None:
+        """Keep the proxy of a node for something else than a topic, until ``release``.
+
+        Args:
+            node: In the peer's graph.
+            key: What for; names it at ``release``.
+            ready: Gets the proxy in a moment; what it registers there it takes away itself.
+        """
+        self._holds[node, key] = ready
+        self._jobs.put_nowait(_Hold(node, key))
+
+    def release(self, node: str, key: str) -> None:
+        """The proxy is not needed for that any more."""
+        self._holds.pop((node, key), None)
+        self._jobs.put_nowait(_Hold(node, key))
 
     def describe(self, action: Describe, on_ack: Callable[[int], None]) -> None:
         """Data of a source will come on a route; its subscribers learn what it is.
@@ -238,15 +276,19 @@ class Inbound:
         missing = [
             (proxy, topic)
             for proxy in breathing(list(self._proxies.values()), every=1)
-            for topic in tuple(proxy.publications)
-            if publishers.get(topic, {}).get(proxy.node.name) != proxy.node.uri
+            for topic, publication in tuple(proxy.publications.items())
+            if publishers.get(publication.topic, {}).get(proxy.node.name) != proxy.node.uri
         ]
         for proxy, topic in missing:
             self._register(proxy, topic)
         if self._jobs.empty():
-            for source, type_name in breathing(list(self._wanted.items())):
+            for source, action in breathing(list(self._wanted.items())):
                 if self.publication(source) is None:
-                    self._jobs.put_nowait(Publish(0, source, type_name))
+                    self._jobs.put_nowait(action)
+            for (node, key), ready in breathing(list(self._holds.items())):
+                proxy = self._proxies.get(node)
+                if proxy is None or proxy.held.get(key) is not ready:
+                    self._jobs.put_nowait(_Hold(node, key))
         return len(missing)
 
     async def close(self) -> None:
@@ -265,23 +307,73 @@ class Inbound:
         while (job := await self._jobs.get()) is not None:
             try:
                 if isinstance(job, Publish):
-                    await self._publish(job.source, job.type)
+                    await self._publish(job)
+                elif isinstance(job, _Hold):
+                    await self._hold(job)
                 else:
                     await self._retract(job.source)
             except (RmpaError, OSError) as error:
                 # Most likely no file descriptor is left; what is wanted is tried again by ``reconcile``.
-                _log.error("! %s: %s is not in the local graph: %s", self.prefix, job.source, error)
+                what = job.key if isinstance(job, _Hold) else job.source
+                _log.error("! %s: %s is not in the local graph: %s", self.prefix, what, error)
             except Exception:  # noqa: BLE001 - the task's top: one source that fails must not stop the others
                 _log.exception("! %s: %s failed; the others go on", self.prefix, job)
         for node in list(self._proxies):
             await self._close_proxy(node)
 
-    async def _publish(self, source: Source, type_name: str) -> None:
+    async def _publish(self, action: Publish) -> None:
+        source = action.source
         if self.publication(source) is not None:
             return  # asked for again while the first attempt was still at work
+        proxy = await self._proxy(source.node)
+        if self._wanted.get(source) != action:
+            # Retracted while the proxy's sockets were being made: to register it would change the topic's type.
+            if proxy.idle:
+                await self._close_proxy(source.node)
+            return
+        publication = Publication(
+            action.topic or source.topic,
+            proxy.node.name,
+            on_first_subscriber=lambda: self._on_demand(source, True),
+            on_last_subscriber=lambda: self._on_demand(source, False),
+            on_mismatch=lambda fields, text: self._on_mismatch(source, printable(fields.get("callerid", "")), text),
+            on_listeners=lambda: self._on_listeners(source),
+        )
+        proxy.node.add_publication(publication)
+        proxy.publications[source.topic] = publication
+        proxy.types[source.topic] = action.type
+        self._register(proxy, source.topic)
+
+    async def _retract(self, source: Source) -> None:
         proxy = self._proxies.get(source.node)
+        publication = proxy.publications.pop(source.topic, None) if proxy else None
+        if proxy is None or publication is None:
+            return
+        del proxy.types[source.topic]
+        self._core.call("unregisterPublisher", proxy.node.name, publication.topic, proxy.node.uri)
+        # rospy never leaves a publisher because the master says so: it must be hung up on.
+        proxy.node.remove_publication(publication.topic)
+        if proxy.idle:
+            await self._close_proxy(source.node)
+
+    async def _hold(self, job: _Hold) -> None:
+        if (job.node, job.key) in self._holds:
+            proxy = await self._proxy(job.node)
+            ready = self._holds.get((job.node, job.key))
+            if ready is not None and proxy.held.get(job.key) is not ready:
+                proxy.held[job.key] = ready
+                ready(proxy.node)
+        maybe = self._proxies.get(job.node)
+        if maybe is not None and (job.node, job.key) not in self._holds:
+            maybe.held.pop(job.key, None)
+            if maybe.idle:
+                await self._close_proxy(job.node)
+
+    async def _proxy(self, remote: str) -> Proxy:
+        """The proxy of a node, made if it is not there."""
+        proxy = self._proxies.get(remote)
         if proxy is None:
-            name = proxy_name(self.prefix, source.node)
+            name = proxy_name(self.prefix, remote)
             node = SlaveNode(
                 name,
                 self._core.node_host,
@@ -291,46 +383,22 @@ class Inbound:
                 on_shutdown=lambda reason: _not_here(name, reason),
             )
             await node.start()
-            proxy = self._proxies[source.node] = Proxy(node)
-        if self._wanted.get(source) != type_name:
-            # Retracted while the proxy's sockets were being made: to register it would change the topic's type.
-            if not proxy.publications:
-                await self._close_proxy(source.node)
-            return
-        publication = Publication(
-            source.topic,
-            proxy.node.name,
-            on_first_subscriber=lambda: self._on_demand(source, True),
-            on_last_subscriber=lambda: self._on_demand(source, False),
-            on_mismatch=lambda fields, text: self._on_mismatch(source, printable(fields.get("callerid", "")), text),
-            on_listeners=lambda: self._on_listeners(source),
-        )
-        proxy.node.add_publication(publication)
-        proxy.publications[source.topic] = publication
-        proxy.types[source.topic] = type_name
-        self._register(proxy, source.topic)
-
-    async def _retract(self, source: Source) -> None:
-        proxy = self._proxies.get(source.node)
-        publication = proxy.publications.pop(source.topic, None) if proxy else None
-        if proxy is None or publication is None:
-            return
-        del proxy.types[source.topic]
-        self._core.call("unregisterPublisher", proxy.node.name, source.topic, proxy.node.uri)
-        # rospy never leaves a publisher because the master says so: it must be hung up on.
-        proxy.node.remove_publication(source.topic)
-        if not proxy.publications:
-            await self._close_proxy(source.node)
+            proxy = self._proxies[remote] = Proxy(node)
+        return proxy
 
     async def _close_proxy(self, node: str) -> None:
         proxy = self._proxies.pop(node)
-        for topic in proxy.publications:
-            self._core.call("unregisterPublisher", proxy.node.name, topic, proxy.node.uri)
+        for publication in proxy.publications.values():
+            self._core.call("unregisterPublisher", proxy.node.name, publication.topic, proxy.node.uri)
         await proxy.node.close()
 
     def _register(self, proxy: Proxy, topic: str) -> None:
         code, status, _ = self._core.call(
-            "registerPublisher", proxy.node.name, topic, proxy.types[topic], proxy.node.uri
+            "registerPublisher",
+            proxy.node.name,
+            proxy.publications[topic].topic,
+            proxy.types[topic],
+            proxy.node.uri,
         )
         if code != 1:
             _log.error("! the local core does not take %s of %s: %s", topic, proxy.node.name, status)
