@@ -1,0 +1,478 @@
+"""The loop of a Smart Resource: what is asked, what is measured, and which profile to apply (paper, section 3.1).
+
+MAPE-K, sans-I/O: *monitor* takes each window of measured quality, *analyse* compares it with what the clients ask,
+*plan* is ``decision.Decider``, *execute* is the driver's work, which reports back. The profile's state::
+
+    none ──decided──► applying ──applied──► active ──another is better──► applying
+                       │  ▲                    │
+                       │  └─ next best ◄───────┘ violated
+                       └─ failed, hung: left out for a cool-down, and the next best is applied
+
+A quality that is violated in ``k`` of the last ``n`` windows is a disturbance. If another profile can serve, that is
+an *adaptation event* (WARN): the violating one is left out for its cool-down and the other one applied. If none can,
+it is a *non-adaptable event* (ERROR): the best-effort profile runs. Without a disturbance a profile is changed only
+where that brings more than ``improvement``, and not before ``dwell`` is over, so that two nearly alike do not alternate.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core.errors import LocalProtocolError, PeerRefused
+from rmpa.resource.requirements import Merged, Requirement, merge
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rmpa.resource.attributes import Attribute, Value
+    from rmpa.resource.decision import Decider, Decision, Score
+    from rmpa.resource.requirements import Bound
+
+COOL_DOWN_GROWTH: Final = 2.0
+"""Each time that a profile disappoints again its cool-down is so many times as long, up to ``cool_down_max``."""
+
+
+@dataclass(frozen=True, slots=True)
+class AdaptationSettings:
+    """How patient a resource is.
+
+    Args:
+        violations: ``k``: so many violated windows …
+        windows: ``n``: … of the last so many are a disturbance.
+        improvement: ``h``: a change without a disturbance must lessen the distance by more than this.
+        dwell: Seconds that a profile runs at least before such a change.
+        cool_down: Seconds that a profile is left out after it failed or disappointed.
+        cool_down_max: The same at most, when it does so again and again.
+        apply_timeout: Seconds after which a profile that is being applied counts as hung.
+    """
+
+    violations: int = 2
+    windows: int = 3
+    improvement: float = 0.05
+    dwell: float = 2.0
+    cool_down: float = 10.0
+    cool_down_max: float = 160.0
+    apply_timeout: float = 5.0
+
+
+class AlarmKind(Enum):
+    """What an alarm says; the level of REP 107 that it is shown with."""
+
+    ADAPTATION = "adaptation"
+    """A quality is not satisfied, and another profile takes over: WARN."""
+    NON_ADAPTABLE = "non_adaptable"
+    """No profile meets what is asked; the most similar one runs: ERROR."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shortfall:
+    """One attribute that is not as asked.
+
+    Args:
+        attribute: Its name.
+        wanted: The bound.
+        given: What was measured, or what the profile offers; ``None``: nothing.
+    """
+
+    attribute: str
+    wanted: Bound
+    given: Value | None
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """What every client is told.
+
+    Args:
+        kind: Adaptation or non-adaptable.
+        shortfalls: What was asked and is not given.
+        before: The profile that ran, or empty.
+        after: The one that takes over, or the same.
+        at: When, monotonic seconds.
+    """
+
+    kind: AlarmKind
+    shortfalls: tuple[Shortfall, ...]
+    before: str
+    after: str
+    at: float
+
+
+# --- what the driver is asked for -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Apply:
+    """Apply this profile, and report ``applied`` or ``failed``; ``why`` is for people."""
+
+    profile: str
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Raise:
+    """Tell every client, and the diagnostics."""
+
+    alarm: Alarm
+
+
+@dataclass(frozen=True, slots=True)
+class Clear:
+    """What an alarm said is over."""
+
+    alarm: Alarm
+
+
+@dataclass(frozen=True, slots=True)
+class Reacted:
+    """A reconfiguration is complete.
+
+    Args:
+        profile: The one that runs now.
+        reaction: Seconds since the first window, or request, that called for it.
+    """
+
+    profile: str
+    reaction: float
+
+
+Action = Apply | Raise | Clear | Reacted
+
+
+class ProfileState(Enum):
+    """Where the loop stands."""
+
+    NONE = auto()
+    """Nothing was decided yet, or no profile can be taken."""
+    APPLYING = auto()
+    ACTIVE = auto()
+
+
+@dataclass(slots=True)
+class _Trouble:
+    """A profile that failed or disappointed."""
+
+    until: float
+    cool_down: float
+    why: str
+
+
+@dataclass(slots=True)
+class _Knowledge:
+    """What the loop knows."""
+
+    requirements: dict[str, Requirement] = field(default_factory=dict)
+    merged: Merged = field(default_factory=Merged)
+    barred: dict[str, str] = field(default_factory=dict)
+    """Profiles whose preconditions do not hold, and why."""
+    troubles: dict[str, _Trouble] = field(default_factory=dict)
+    windows: deque[tuple[float, tuple[Shortfall, ...]]] = field(default_factory=deque)
+    """When each of the last windows ended, and what fell short in it; since the profile became active."""
+
+
+class Adaptation:
+    """The loop of one resource.
+
+    Args:
+        attributes: Declared ones, by name.
+        decider: Of its profiles.
+        settings: How patient it is.
+    """
+
+    def __init__(
+        self, attributes: Mapping[str, Attribute], decider: Decider, settings: AdaptationSettings | None = None
+    ) -> None:
+        self._attributes = attributes
+        self._decider = decider
+        self._settings = settings if settings is not None else AdaptationSettings()
+        self._knows = _Knowledge()
+        self._state = ProfileState.NONE
+        self._profile = ""
+        self._target = ""
+        self._pinned = ""
+        self._since = -math.inf
+        self._deadline = math.inf
+        self._caused = math.inf
+        self._alarm: Alarm | None = None
+        self._asked_meanwhile = False
+
+    @property
+    def state(self) -> ProfileState:
+        """Where the loop stands."""
+        return self._state
+
+    @property
+    def profile(self) -> str:
+        """The profile that runs, or ran until the one that is being applied; empty before the first."""
+        return self._profile
+
+    @property
+    def applying(self) -> str:
+        """The profile that is being applied, or empty."""
+        return self._target
+
+    @property
+    def alarm(self) -> Alarm | None:
+        """What is wrong at present."""
+        return self._alarm
+
+    @property
+    def asked(self) -> Merged:
+        """What all clients ask together."""
+        return self._knows.merged
+
+    @property
+    def requirements(self) -> Mapping[str, Requirement]:
+        """By client."""
+        return self._knows.requirements
+
+    def explain(self, now: float) -> tuple[Score, ...]:
+        """How each profile does at this moment, and which are left out."""
+        return self._decider.explain(self._knows.merged.bounds, self._left_out(now))
+
+    # --- what is asked ------------------------------------------------------------------------------------------
+
+    def start(self, now: float) -> list[Action]:
+        """Take the first profile."""
+        return self._plan(now, "the resource starts")
+
+    def require(self, requirement: Requirement, now: float) -> list[Action]:
+        """A client asks for a quality, in place of what it asked for before."""
+        self._knows.requirements[requirement.client] = requirement
+        return self._asked_anew(now, f"{requirement.client} asks for a quality")
+
+    def release(self, client: str, now: float) -> list[Action]:
+        """A client asks for nothing any more, or is gone.
+
+        Raises:
+            PeerRefused: It had asked for nothing.
+        """
+        if self._knows.requirements.pop(client, None) is None:
+            raise PeerRefused("the resource", f"{client} has asked for nothing here")
+        return self._asked_anew(now, f"{client} asks for nothing any more")
+
+    def bar(self, barred: Mapping[str, str], now: float) -> list[Action]:
+        """Say which profiles cannot be taken now (their preconditions, the context), and why; all others can."""
+        if barred == self._knows.barred:
+            return []
+        self._knows.barred = dict(barred)
+        return self._plan(now, "the preconditions of profiles have changed")
+
+    def pin(self, profile: str, now: float) -> list[Action]:
+        """Run this profile whatever is asked; an empty name lets the loop decide again.
+
+        Raises:
+            ConfigError: There is no such profile.
+        """
+        if profile:
+            self._decider.profile(profile)
+        self._pinned = profile
+        return self._plan(now, f"{profile} was chosen by hand" if profile else "the choice by hand is over")
+
+    # --- what is measured ---------------------------------------------------------------------------------------
+
+    def window(self, measured: Mapping[str, Value], now: float) -> list[Action]:
+        """A window of quality has ended under the active profile; what was not measured is not judged."""
+        if self._state is not ProfileState.ACTIVE:
+            return []
+        short = self._shortfalls(measured)
+        windows = self._knows.windows
+        windows.append((now, short))
+        while len(windows) > self._settings.windows:
+            windows.popleft()
+        violated = [(at, short) for at, short in windows if short]
+        if len(violated) >= self._settings.violations and not self._pinned:
+            return self._disturbed(violated[0][0], violated[-1][1], now)
+        if not short and not violated:
+            return [*self._plan(now, "a better profile can be taken"), *self._recovered()]
+        return []
+
+    def _shortfalls(self, measured: Mapping[str, Value]) -> tuple[Shortfall, ...]:
+        short = []
+        for name, bound in self._knows.merged.bounds.items():
+            value = measured.get(name)
+            if value is not None and not _meets(self._attributes[name], value, bound):
+                short.append(Shortfall(name, bound, value))
+        return tuple(short)
+
+    def _disturbed(self, since: float, short: tuple[Shortfall, ...], now: float) -> list[Action]:
+        """The active profile does not give what it was taken for."""
+        others = self._left_out(now) | {self._profile: "it does not give what is asked"}
+        decision = self._decider.decide(self._knows.merged.bounds, others)
+        if decision.feasible:
+            self._disappoint(self._profile, f"{_named(short)} fell short", now)
+            alarm = Alarm(AlarmKind.ADAPTATION, short, self._profile, decision.profile, now)
+            return [*self._raise(alarm), *self._apply(decision, f"{_named(short)} fell short", now, since)]
+        # Where nothing better can be had the profile stays, unless a best effort was declared for just this.
+        best = self._decider.decide(self._knows.merged.bounds, self._left_out(now))
+        after = decision if decision.best_effort else best
+        known = self._alarm is not None and self._alarm.kind is AlarmKind.NON_ADAPTABLE
+        actions: list[Action] = []
+        if not known:
+            actions += self._raise(Alarm(AlarmKind.NON_ADAPTABLE, short, self._profile, after.profile, now))
+        if decision.best_effort and decision.profile != self._profile:
+            self._disappoint(self._profile, f"{_named(short)} fell short", now)
+            actions += self._apply(decision, "none can serve: best effort", now, since)
+        return actions
+
+    # --- what the driver reports --------------------------------------------------------------------------------
+
+    def applied(self, profile: str, now: float) -> list[Action]:
+        """The profile that was asked for runs; a report about another one is late, and ignored."""
+        if self._state is not ProfileState.APPLYING or profile != self._target:
+            return []
+        self._state = ProfileState.ACTIVE
+        self._profile, self._target = profile, ""
+        self._since, self._deadline = now, math.inf
+        self._knows.windows.clear()
+        reaction = max(0.0, now - self._caused)
+        self._caused = math.inf
+        # What was asked, or failed, meanwhile may want another one at once.
+        at_once, self._asked_meanwhile = self._asked_meanwhile, False
+        return [Reacted(profile, reaction), *self._plan(now, "what is asked has changed meanwhile", at_once=at_once)]
+
+    def failed(self, profile: str, why: str, now: float) -> list[Action]:
+        """The profile that was asked for could not be applied: the next best is."""
+        if self._state is not ProfileState.APPLYING or profile != self._target:
+            return []
+        self._disappoint(profile, why, now)
+        self._state = ProfileState.ACTIVE if self._profile else ProfileState.NONE
+        self._target, self._deadline = "", math.inf
+        # Half of the profile that failed may be in force: the one that ran before is to be applied again too.
+        return self._plan(now, f"{profile} failed: {why}", again=True)
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is due, monotonic seconds."""
+        due = [self._deadline, *(trouble.until for trouble in self._knows.troubles.values())]
+        due += [r.expires for r in self._knows.requirements.values() if r.expires is not None]
+        first = min(due)
+        return None if first == math.inf else first
+
+    def handle_timer(self, now: float) -> list[Action]:
+        """A requirement expires, a cool-down is over, or a profile hangs."""
+        if self._deadline <= now:
+            return self.failed(self._target, f"not applied within {self._settings.apply_timeout:g} s", now)
+        over = [c for c, r in self._knows.requirements.items() if r.expires is not None and r.expires <= now]
+        for client in over:
+            del self._knows.requirements[client]
+        for trouble in self._knows.troubles.values():
+            if trouble.until <= now:
+                trouble.until = math.inf  # it may be taken again; how long it was out is remembered
+        if over:
+            return self._asked_anew(now, f"what {', '.join(over)} asked for has expired")
+        return self._plan(now, "a profile's cool-down is over")
+
+    # --- planning -----------------------------------------------------------------------------------------------
+
+    def _asked_anew(self, now: float, why: str) -> list[Action]:
+        self._knows.merged = merge(self._knows.requirements.values())
+        for name in self._knows.merged.bounds:
+            if name not in self._attributes:
+                raise LocalProtocolError(f"a bound of {name}, which is no attribute; check it before it comes here")
+        self._knows.windows.clear()
+        return self._plan(now, why, at_once=True)
+
+    def _plan(self, now: float, why: str, *, at_once: bool = False, again: bool = False) -> list[Action]:
+        """Take another profile if that is worth it.
+
+        Args:
+            now: The time.
+            why: What may have changed.
+            at_once: A change need not wait for the dwell time, for it is another question that is asked.
+            again: Apply what is decided even if it is the profile that runs.
+        """
+        if self._state is ProfileState.APPLYING:
+            self._asked_meanwhile |= at_once
+            return []  # ``applied`` or ``failed`` looks again
+        decision = self._pinned_or_best(now)
+        if not decision.profile:
+            self._state, self._profile = ProfileState.NONE, ""
+            return []
+        actions = self._judge(decision, now)
+        if decision.profile == self._profile and not again:
+            return actions
+        if not again and not at_once and not self._worth_it(decision, now):
+            return actions
+        return [*actions, *self._apply(decision, why, now, now)]
+
+    def _pinned_or_best(self, now: float) -> Decision:
+        bounds = self._knows.merged.bounds
+        if not self._pinned:
+            return self._decider.decide(bounds, self._left_out(now))
+        others = {name: "another one was chosen by hand" for name in self._decider.profiles if name != self._pinned}
+        return self._decider.decide(bounds, others)
+
+    def _worth_it(self, decision: Decision, now: float) -> bool:
+        """Whether a change without a new question pays."""
+        if not self._profile or self._profile in self._left_out(now) or self._pinned:
+            return True
+        current = self._score(self._profile, now)
+        if decision.feasible and not current.feasible:
+            return True
+        if now - self._since < self._settings.dwell:
+            return False
+        return current.distance - decision.distance > self._settings.improvement
+
+    def _judge(self, decision: Decision, now: float) -> list[Action]:
+        """Raise the alarm if not even the best profile is declared to meet what is asked; clear it if one does."""
+        known = self._alarm is not None and self._alarm.kind is AlarmKind.NON_ADAPTABLE
+        if decision.feasible:
+            disturbed = any(short for _, short in self._knows.windows)
+            return self._recovered() if known and not disturbed else []
+        if known or self._pinned:
+            return []
+        offers = self._decider.profile(decision.profile).offers
+        score = self._score(decision.profile, now)
+        short = tuple(
+            Shortfall(term.attribute, self._knows.merged.bounds[term.attribute], offers.get(term.attribute))
+            for term in score.terms
+            if term.hard and not term.met
+        )
+        return self._raise(Alarm(AlarmKind.NON_ADAPTABLE, short, self._profile, decision.profile, now))
+
+    def _apply(self, decision: Decision, why: str, now: float, since: float) -> list[Action]:
+        self._state = ProfileState.APPLYING
+        self._target = decision.profile
+        self._deadline = now + self._settings.apply_timeout
+        self._caused = min(self._caused, since)
+        return [Apply(decision.profile, why)]
+
+    def _score(self, profile: str, now: float) -> Score:
+        return next(score for score in self.explain(now) if score.profile == profile)
+
+    def _left_out(self, now: float) -> dict[str, str]:
+        cooling = {name: t.why for name, t in self._knows.troubles.items() if now < t.until < math.inf}
+        return cooling | self._knows.barred
+
+    def _disappoint(self, profile: str, why: str, now: float) -> None:
+        before = self._knows.troubles.get(profile)
+        cool_down = self._settings.cool_down
+        if before is not None:
+            cool_down = min(before.cool_down * COOL_DOWN_GROWTH, self._settings.cool_down_max)
+        self._knows.troubles[profile] = _Trouble(now + cool_down, cool_down, why)
+
+    def _raise(self, alarm: Alarm) -> list[Action]:
+        before, self._alarm = self._alarm, alarm
+        return [Raise(alarm)] if before is None else [Clear(before), Raise(alarm)]
+
+    def _recovered(self) -> list[Action]:
+        if self._alarm is None:
+            return []
+        alarm, self._alarm = self._alarm, None
+        # Under it the quality is as asked again: the next disturbance starts with a short cool-down.
+        self._knows.troubles.pop(self._profile, None)
+        return [Clear(alarm)]
+
+
+def _meets(attribute: Attribute, value: Value, bound: Bound) -> bool:
+    if bound.words:
+        return value in bound.words
+    return bound.low <= attribute.place(value) <= bound.high
+
+
+def _named(short: tuple[Shortfall, ...]) -> str:
+    return ", ".join(s.attribute for s in short)

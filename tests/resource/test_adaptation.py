@@ -1,0 +1,321 @@
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from rmpa.core.errors import ConfigError, PeerRefused
+from rmpa.resource.adaptation import (
+    Action,
+    Adaptation,
+    AdaptationSettings,
+    AlarmKind,
+    Apply,
+    Clear,
+    ProfileState,
+    Raise,
+    Reacted,
+)
+from rmpa.resource.attributes import LATENCY, RATE
+from rmpa.resource.decision import Decider
+from rmpa.resource.profiles import Profile
+from rmpa.resource.requirements import Bound, Requirement, bound
+
+ATTRIBUTES = {"rate": RATE, "latency": LATENCY}
+FAST = Profile("fast", {"rate": 40.0, "latency": 0.01}, cost=9)
+MIDDLE = Profile("middle", {"rate": 20.0, "latency": 0.02}, cost=5)
+SLOW = Profile("slow", {"rate": 5.0, "latency": 0.1}, cost=1)
+LIMP = Profile("limp", {"rate": 1.0, "latency": 0.5}, best_effort=True, cost=2)
+SETTINGS = AdaptationSettings(violations=2, windows=3, improvement=0.05, dwell=2.0, cool_down=10.0, apply_timeout=5.0)
+
+
+def loop(*profiles: Profile) -> Adaptation:
+    chosen = profiles or (FAST, MIDDLE, SLOW)
+    return Adaptation(ATTRIBUTES, Decider("camera", ATTRIBUTES, chosen), SETTINGS)
+
+
+def at_least(rate: float, client: str = "/client", *, hard: bool = False, **more: float | None) -> Requirement:
+    return Requirement(client, {"rate": bound(RATE, at_least=rate, hard=hard)}, **more)  # type: ignore[arg-type]
+
+
+def running(rate: float, *profiles: Profile, hard: bool = True) -> Adaptation:
+    """A loop whose client has what it asked for at 1 s."""
+    one = loop(*profiles)
+    one.start(0.0)
+    finish(one, 0.0)
+    one.require(at_least(rate, hard=hard), 1.0)
+    finish(one, 1.0)
+    return one
+
+
+def finish(one: Adaptation, now: float) -> list[Action]:
+    done: list[Action] = []
+    while one.applying:
+        done += one.applied(one.applying, now)
+    return done
+
+
+def applies(actions: list[Action]) -> list[str]:
+    return [action.profile for action in actions if isinstance(action, Apply)]
+
+
+def alarms(actions: list[Action]) -> list[tuple[AlarmKind, str, str]]:
+    return [(a.alarm.kind, a.alarm.before, a.alarm.after) for a in actions if isinstance(a, Raise)]
+
+
+def test_a_request_is_translated_into_the_most_similar_profile() -> None:
+    one = loop()
+    assert applies(one.start(0.0)) == ["slow"]
+    assert one.applied("slow", 0.5) == [Reacted("slow", 0.5)]
+    assert applies(one.require(at_least(15), 1.0)) == ["middle"]
+    assert (one.profile, one.applying, one.state) == ("slow", "middle", ProfileState.APPLYING)
+    assert one.applied("middle", 1.25) == [Reacted("middle", 0.25)]
+    assert (one.profile, one.applying, one.state) == ("middle", "", ProfileState.ACTIVE)
+
+
+def test_a_client_that_leaves_is_forgotten() -> None:
+    one = running(30)
+    assert one.profile == "fast"
+    assert applies(one.release("/client", 2.0)) == ["slow"]
+    with pytest.raises(PeerRefused, match="/client has asked for nothing here"):
+        one.release("/client", 3.0)
+
+
+def test_a_request_expires() -> None:
+    one = running(1)
+    one.require(at_least(30, "/guest", expires=60.0), 5.0)
+    finish(one, 5.0)
+    assert one.profile == "fast"
+    assert one.next_timer() == 60.0
+    assert applies(one.handle_timer(60.0)) == ["slow"]
+
+
+def test_a_disturbance_takes_k_of_n_windows() -> None:
+    one = running(15)
+    assert one.profile == "middle"
+    assert one.window({"rate": 8.0}, 2.0) == []
+    assert one.window({"rate": 20.0}, 3.0) == []
+    actions = one.window({"rate": 8.0}, 4.0)
+    assert alarms(actions) == [(AlarmKind.ADAPTATION, "middle", "fast")]
+    assert applies(actions) == ["fast"]
+    raised = next(a.alarm for a in actions if isinstance(a, Raise))
+    assert [(s.attribute, s.given) for s in raised.shortfalls] == [("rate", 8.0)]
+    # From the first window that was violated to the profile that runs.
+    assert one.applied("fast", 4.5)[0] == Reacted("fast", 2.5)
+
+
+def test_windows_that_were_long_ago_do_not_count() -> None:
+    one = running(15)
+    for now, rate in enumerate([8, 20, 20, 8, 20, 20, 8], 2):
+        assert one.window({"rate": float(rate)}, float(now)) == []
+
+
+def test_what_was_not_measured_or_not_asked_is_not_judged() -> None:
+    one = running(15)
+    for now in range(2, 9):
+        assert one.window({"latency": 9.0}, float(now)) == []
+
+
+def test_an_alarm_is_over_when_the_windows_are_good_again() -> None:
+    one = running(15)
+    one.window({"rate": 8.0}, 2.0)
+    one.window({"rate": 8.0}, 3.0)
+    finish(one, 3.5)
+    assert one.alarm is not None
+    actions = one.window({"rate": 39.0}, 4.0)
+    assert [type(action) for action in actions] == [Clear]
+    assert one.alarm is None
+
+
+def test_without_another_that_can_serve_the_alarm_is_non_adaptable_and_best_effort_runs() -> None:
+    one = running(30, FAST, SLOW, LIMP)
+    one.window({"rate": 20.0}, 2.0)
+    actions = one.window({"rate": 20.0}, 3.0)
+    assert alarms(actions) == [(AlarmKind.NON_ADAPTABLE, "fast", "limp")]
+    assert applies(actions) == ["limp"]
+    finish(one, 3.0)
+    # While it lasts it is said once.
+    assert alarms(one.window({"rate": 1.0}, 4.0)) == alarms(one.window({"rate": 1.0}, 5.0)) == []
+
+
+def test_without_a_declared_best_effort_the_profile_stays() -> None:
+    one = running(30)
+    one.window({"rate": 20.0}, 2.0)
+    actions = one.window({"rate": 20.0}, 3.0)
+    assert alarms(actions) == [(AlarmKind.NON_ADAPTABLE, "fast", "fast")]
+    assert applies(actions) == []
+    for now in (4.0, 5.0):
+        assert one.window({"rate": 39.0}, now) == []
+    assert [type(a) for a in one.window({"rate": 39.0}, 6.0)] == [Clear]
+
+
+def test_what_no_profile_is_declared_to_meet_is_a_non_adaptable_event_at_once() -> None:
+    one = loop()
+    one.start(0.0)
+    finish(one, 0.0)
+    actions = one.require(at_least(100, hard=True), 1.0)
+    assert alarms(actions) == [(AlarmKind.NON_ADAPTABLE, "slow", "fast")]
+    raised = next(a.alarm for a in actions if isinstance(a, Raise))
+    assert [(s.attribute, s.given) for s in raised.shortfalls] == [("rate", 40.0)]
+    finish(one, 1.0)
+    assert [type(a) for a in one.require(at_least(10, hard=True), 2.0)] == [Clear, Apply]
+
+
+def test_a_profile_that_fails_is_left_out_for_its_cool_down_and_the_next_best_taken() -> None:
+    one = loop()
+    one.start(0.0)
+    finish(one, 0.0)
+    assert applies(one.require(at_least(15, hard=True), 1.0)) == ["middle"]
+    assert applies(one.failed("middle", "ValueError: no such mode", 1.1)) == ["fast"]
+    finish(one, 1.2)
+    assert one.explain(2.0)[1].excluded == "ValueError: no such mode"
+    assert one.next_timer() == pytest.approx(11.1)
+    assert applies(one.handle_timer(11.1)) == []  # back, but by the cost alone it is not worth a change
+    assert one.explain(12.0)[1].excluded == ""
+
+
+def test_a_profile_that_hangs_is_failed() -> None:
+    one = loop()
+    one.start(0.0)
+    assert one.next_timer() == 5.0
+    assert applies(one.handle_timer(5.0)) == ["middle"]
+    assert one.applied("slow", 5.5) == []  # at last; too late
+    assert one.applying == "middle"
+
+
+def test_a_failure_applies_the_profile_that_ran_before_again() -> None:
+    one = running(1)
+    assert applies(one.pin("fast", 2.0)) == ["fast"]
+    one.pin("", 2.5)
+    assert applies(one.failed("fast", "broken", 3.0)) == ["slow"]
+
+
+def test_when_every_profile_fails_the_first_cool_down_that_ends_tries_again() -> None:
+    one = loop(FAST, SLOW)
+    one.start(0.0)
+    assert applies(one.failed("slow", "broken", 1.0)) == ["fast"]
+    assert one.failed("fast", "broken", 2.0) == []
+    assert (one.state, one.profile) == (ProfileState.NONE, "")
+    assert applies(one.handle_timer(one.next_timer() or 0.0)) == ["slow"]
+
+
+def test_a_profile_that_disappoints_again_and_again_is_left_out_for_longer() -> None:
+    one = loop(FAST, SLOW)
+    outs = []
+    one.start(0.0)
+    finish(one, 0.0)
+    now = 0.0
+    one.require(at_least(30, hard=True), now)
+    for _ in range(6):
+        assert one.applying == "fast"
+        one.failed("fast", "broken", now)
+        finish(one, now)
+        due = one.next_timer()
+        assert due is not None
+        outs.append(due - now)
+        now = due
+        one.handle_timer(now)
+    assert outs == [10.0, 20.0, 40.0, 80.0, 160.0, 160.0]
+
+
+def test_two_that_are_nearly_alike_do_not_alternate() -> None:
+    alike = Profile("alike", {"rate": 39.0, "latency": 0.01}, cost=8)
+    one = loop(FAST, alike)
+    one.start(0.0)
+    finish(one, 0.0)
+    assert one.profile == "alike"
+    one.require(Requirement("/c", {"rate": bound(RATE, at_least=39.5)}), 1.0)
+    finish(one, 1.0)
+    before = one.profile
+    for now in range(2, 30):
+        assert one.window({"rate": 39.6}, float(now)) == []
+    assert one.profile == before
+
+
+def test_what_a_better_profile_waits_for_is_the_dwell_time() -> None:
+    one = running(30, FAST, SLOW, hard=False)
+    one.bar({"fast": "battery low"}, 2.0)
+    finish(one, 2.0)
+    assert one.profile == "slow"
+    assert one.bar({}, 3.0) == []
+    assert applies(one.window({"latency": 0.1}, 3.5)) == []
+    assert applies(one.window({"latency": 0.1}, 4.5)) == ["fast"]
+
+
+def test_a_barred_profile_is_left_at_once() -> None:
+    one = running(30)
+    assert applies(one.bar({"fast": "battery low"}, 1.5)) == ["middle"]
+
+
+def test_a_choice_by_hand_holds_whatever_is_asked() -> None:
+    one = running(30)
+    assert applies(one.pin("slow", 2.0)) == ["slow"]
+    finish(one, 2.0)
+    for now in (3.0, 4.0, 5.0):
+        assert one.window({"rate": 5.0}, now) == []
+    assert applies(one.require(at_least(40), 6.0)) == []
+    assert applies(one.pin("", 7.0)) == ["fast"]
+    with pytest.raises(ConfigError, match="did you mean slow"):
+        one.pin("slwo", 8.0)
+
+
+def test_what_is_asked_while_a_profile_is_applied_counts_when_it_runs() -> None:
+    one = loop()
+    one.start(0.0)
+    assert one.require(at_least(30), 0.1) == []
+    assert applies(one.applied("slow", 0.2)) == ["fast"]
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_whatever_happens_one_profile_is_applied_at_a_time_and_none_that_is_left_out(seed: int) -> None:
+    chance = random.Random(seed)
+    one = loop(FAST, MIDDLE, SLOW, LIMP)
+    now, outstanding = 0.0, ""
+    raised = 0
+
+    def take(actions: list[Action]) -> None:
+        nonlocal outstanding, raised
+        for action in actions:
+            if isinstance(action, Apply):
+                assert not outstanding, "a second profile before the first one was reported"
+                excluded = {score.profile: score.excluded for score in one.explain(now)}
+                assert not excluded[action.profile]
+                outstanding = action.profile
+            elif isinstance(action, Raise):
+                raised += 1
+                assert raised == 1, "two alarms at a time"
+            elif isinstance(action, Clear):
+                raised -= 1
+        assert one.applying == outstanding
+
+    take(one.start(now))
+    for _ in range(300):
+        now += chance.choice((0.0, 0.1, 1.0, 4.0))
+        while (due := one.next_timer()) is not None and due <= now:
+            was, outstanding = outstanding, "" if outstanding and due == one._deadline else outstanding
+            take(one.handle_timer(due))
+        match chance.randrange(6):
+            case 0:
+                take(one.require(_any_requirement(chance, now), now))
+            case 1 if one.requirements:
+                take(one.release(chance.choice(list(one.requirements)), now))
+            case 2:
+                take(one.window({"rate": chance.choice((0.5, 4.0, 18.0, 45.0))}, now))
+            case 3 if outstanding:
+                was, outstanding = outstanding, ""
+                take(one.applied(was, now))
+            case 4 if outstanding:
+                was, outstanding = outstanding, ""
+                take(one.failed(was, "by chance", now))
+            case 5:
+                barred = {name: "by chance" for name in ("fast", "middle") if chance.random() < 0.3}
+                take(one.bar(barred, now))
+
+
+def _any_requirement(chance: random.Random, now: float) -> Requirement:
+    bounds: dict[str, Bound] = {
+        "rate": bound(RATE, at_least=chance.choice((1, 10, 30, 99)), hard=chance.random() < 0.5)
+    }
+    return Requirement(
+        chance.choice(("/a", "/b", "/c")), bounds, chance.randrange(3), now + chance.choice((1.0, 50.0))
+    )
