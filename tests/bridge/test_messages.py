@@ -10,16 +10,25 @@ from hypothesis import strategies as st
 from rmpa.bridge import messages
 from rmpa.bridge.messages import (
     Advertise,
+    AdvertiseServices,
+    Answer,
+    Ask,
     Audience,
     Close,
     Closed,
+    CloseService,
     Description,
     Message,
     Mismatch,
     Offer,
     Open,
     Opened,
+    OpenService,
+    ServiceClosed,
+    ServiceOffer,
+    ServiceOpened,
     Source,
+    Tell,
     decode,
     encode,
 )
@@ -44,6 +53,7 @@ STRICT = Contract(
     priority=Priority.HIGH,
     max_rate=30.0,
 )
+ADD_MD5 = "6a2e34150c00229791cc89ff309fff21"
 GOLDEN: list[tuple[Message, bytes]] = [
     (
         Advertise(added=(Offer("/cmd", "/joy", "sensor_msgs/Joy"),), full=True),
@@ -83,6 +93,36 @@ GOLDEN: list[tuple[Message, bytes]] = [
         b'{"op":"mismatch","topic":"/cmd","node":"/joy","subscriber":"/base","text":"md5"}',
     ),
     (Audience(7, ("/arm", "/move_base")), b'{"op":"audience","route":7,"nodes":["/arm","/move_base"]}'),
+    (
+        AdvertiseServices(added=(ServiceOffer("/add", "/adder"),), full=True),
+        b'{"op":"services","added":[{"service":"/add","node":"/adder"}],"removed":[],"full":true,"more":false}',
+    ),
+    (
+        AdvertiseServices(removed=("/add",), more=True),
+        b'{"op":"services","added":[],"removed":["/add"],"full":false,"more":true}',
+    ),
+    (
+        OpenService(1 << 31 | 1, "/add", 2.5),
+        b'{"op":"service_open","route":2147483649,"service":"/add","timeout":2.5}',
+    ),
+    (
+        ServiceOpened(1 << 31 | 1, 1 << 31 | 2, "a/Add", ADD_MD5, "a/AddRequest", "a/AddResponse"),
+        (
+            b'{"op":"service_opened","route":2147483649,"requests":2147483650,"type":"a/Add",'
+            b'"md5":"6a2e34150c00229791cc89ff309fff21","request_type":"a/AddRequest","response_type":"a/AddResponse"}'
+        ),
+    ),
+    (CloseService(1 << 31 | 1), b'{"op":"service_close","route":2147483649}'),
+    (
+        ServiceClosed(1 << 31 | 1, "its server has gone"),
+        b'{"op":"service_closed","route":2147483649,"reason":"its server has gone"}',
+    ),
+    (Ask(3, "param.get", {"key": "/a"}), b'{"op":"ask","number":3,"what":"param.get","args":{"key":"/a"}}'),
+    (
+        Answer(3, ok=False, error="no /a", remedy="set it"),
+        b'{"op":"answer","number":3,"ok":false,"value":null,"error":"no /a","remedy":"set it"}',
+    ),
+    (Tell("param.changed", {"key": "/a"}), b'{"op":"tell","what":"param.changed","args":{"key":"/a"}}'),
 ]
 
 
@@ -270,6 +310,8 @@ _contracts = st.builds(
     st.sampled_from(Priority),
     st.none() | st.floats(limits.CONTRACT_RATE_MIN, limits.CONTRACT_RATE_MAX),
 )
+_service_routes = st.integers(1 << 31, (1 << 32) - 1)
+_services = st.builds(ServiceOffer, _names, _names)
 _messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(
         Advertise,
@@ -291,6 +333,11 @@ _messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(Closed, _routes, st.text()),
     st.builds(Mismatch, _names, _names, st.text(), st.text()),
     st.builds(Audience, _routes, st.lists(_names, max_size=5).map(tuple)),
+    st.builds(AdvertiseServices, st.lists(_services).map(tuple), st.lists(_names).map(tuple), st.booleans()),
+    st.builds(OpenService, _service_routes, _names, st.floats(0.001, 3600)),
+    st.builds(ServiceOpened, _service_routes, _service_routes, st.just("a/Add"), st.just(ADD_MD5)),
+    st.builds(CloseService, _service_routes),
+    st.builds(ServiceClosed, _service_routes, st.text()),
 )
 
 
@@ -303,6 +350,29 @@ def test_every_message_survives_the_wire(message: Message) -> None:
 def test_no_bytes_do_worse_than_a_protocol_error(wire: bytes) -> None:
     with contextlib.suppress(RemoteProtocolError):
         decode(wire)
+
+
+@pytest.mark.parametrize(
+    ("wire", "words"),
+    [
+        (b'{"op":"service_open","route":7,"service":"/add"}', "route 7 of a service"),
+        (b'{"op":"service_open","route":4294967296,"service":"/add"}', "is not from 2147483648 to"),
+        (b'{"op":"service_open","route":2147483649,"service":"add"}', "'add' is not a global ROS name"),
+        (b'{"op":"service_open","route":2147483649,"service":"/add","timeout":0}', "that may take 0"),
+        (b'{"op":"service_open","route":2147483649,"service":"/add","timeout":1e9}', "that may take 1"),
+        (b'{"op":"service_opened","route":2147483649,"requests":5,"type":"a/B","md5":"*"}', "route 5 of a service"),
+        (
+            b'{"op":"service_opened","route":2147483649,"requests":2147483650,"type":"a/B","md5":"*"}',
+            "md5 sum '*'",
+        ),
+        (b'{"op":"services","added":[{"service":"/add","node":"x y"}]}', "'x y' is not a global ROS name"),
+        (b'{"op":"services","removed":["add"]}', "'add' is not a global ROS name"),
+    ],
+)
+def test_what_a_peer_may_not_say_of_services(wire: bytes, words: str) -> None:
+    with pytest.raises(RemoteProtocolError) as caught:
+        decode(wire)
+    assert words in str(caught.value)
 
 
 def test_every_message_has_golden_bytes() -> None:

@@ -21,6 +21,17 @@ SEEDS: list[bytes] = [
     b'{"op":"closed","route":7,"reason":"the node has gone"}',
     b'{"op":"mismatch","topic":"/cmd","node":"/joy","subscriber":"/base","text":"md5"}',
     b'{"op":"audience","route":7,"nodes":["/arm","/move_base"]}',
+    b'{"op":"services","added":[{"service":"/add","node":"/adder"}],"removed":["/sub"],"full":true,"more":true}',
+    b'{"op":"service_open","route":2147483649,"service":"/add","timeout":2.5}',
+    (
+        b'{"op":"service_opened","route":2147483649,"requests":2147483650,"type":"a/Add",'
+        b'"md5":"6a2e34150c00229791cc89ff309fff21","request_type":"a/AddRequest","response_type":"a/AddResponse"}'
+    ),
+    b'{"op":"service_close","route":2147483649}',
+    b'{"op":"service_closed","route":2147483649,"reason":"its server has gone"}',
+    b'{"op":"ask","number":3,"what":"param.get","args":{"key":"/a"}}',
+    b'{"op":"answer","number":3,"ok":false,"value":null,"error":"no /a","remedy":"set it"}',
+    b'{"op":"tell","what":"param.changed","args":{"key":"/a"}}',
 ]
 
 

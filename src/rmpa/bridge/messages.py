@@ -201,10 +201,12 @@ class OpenService(msgspec.Struct, frozen=True, tag_field="op", tag="service_open
         route: The id, from ``limits.SERVICE_ROUTES`` on. Each reply is one message on it, whose sequence is the
             call's; its body is TCPROS's reply: the byte ``ok``, then the response or the text of the error.
         service: Its name, as it was offered.
+        timeout: Seconds that I wait for the reply to a call.
     """
 
     route: int
     service: str
+    timeout: float = limits.SERVICE_TIMEOUT
 
 
 class ServiceOpened(msgspec.Struct, frozen=True, tag_field="op", tag="service_opened"):
@@ -380,6 +382,8 @@ def _validate_service(message: ServiceMessage) -> None:
     _check_service_route(message.route)
     if isinstance(message, OpenService):
         _check_names(message.service)
+        if not limits.CONTRACT_TIME_MIN <= message.timeout <= limits.SERVICE_TIMEOUT_MAX:
+            raise RemoteProtocolError(f"calls of {message.service} that may take {message.timeout} s")
     elif isinstance(message, ServiceClosed):
         _check_text(message.reason)
     elif isinstance(message, ServiceOpened):
