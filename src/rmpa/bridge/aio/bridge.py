@@ -30,11 +30,12 @@ from rmpa.bridge.messages import (
     decode,
     encode,
 )
-from rmpa.bridge.policy import OWN_NODE, is_own
+from rmpa.bridge.naming import Names
+from rmpa.bridge.policy import OWN_NODE, Policy, is_own
 from rmpa.bridge.proxy_names import proxy_prefix
 from rmpa.core import limits
 from rmpa.core.aio.loop import breathe
-from rmpa.core.contract import Priority
+from rmpa.core.contract import Contracts, Priority
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.names import is_type_name
@@ -46,9 +47,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from rmpa.bridge.aio.part import DataTaker, Part
-    from rmpa.bridge.policy import Policy
     from rmpa.bridge.watch import Occurred
-    from rmpa.core.contract import Contracts
+    from rmpa.core.config import Settings
     from rmpa.mesh.aio.link import MeshLink
     from rmpa.ros.aio.core_api import Core
     from rmpa.ros.xmlrpc import XmlRpcValue
@@ -79,15 +79,24 @@ class Bridge:
         core: The local core, started.
         policy: What may cross.
         contracts: What its topics need.
+        names: How names read at the peers, and theirs here.
         rng: Uniform numbers in [0, 1) for back-off jitter.
     """
 
     def __init__(
-        self, core: Core, policy: Policy, *, rng: Callable[[], float], contracts: Contracts | None = None
+        self,
+        core: Core,
+        policy: Policy,
+        *,
+        rng: Callable[[], float],
+        contracts: Contracts | None = None,
+        names: Names | None = None,
     ) -> None:
         self._core = core
-        self._exports = Exports(policy, contracts)
-        self._imports = Imports(policy, rng, contracts, self._position)
+        self.names = names if names is not None else Names()
+        """How names read at the peers, and theirs here; another one after ``reload``."""
+        self._exports = Exports(policy, contracts, self.names)
+        self._imports = Imports(policy, rng, contracts, self._position, self.names)
         self.counters = Counters()
         self._node = SlaveNode(
             OWN_NODE,
@@ -117,6 +126,7 @@ class Bridge:
         self._learning: deque[tuple[Attached, bytes | Iterator[Advertise]]] = deque()
         self._learning_bytes = 0
         self._forgetting: deque[Iterator[act.Action]] = deque()
+        self._rejudging: Iterator[list[act.Action]] = iter(())
         self._actions: deque[act.Action] = deque()
         self._acting = False
         self._mismatches: dict[Source, dict[str, str]] = {}
@@ -128,6 +138,19 @@ class Bridge:
     def add(self, part: Part) -> None:
         """Let a part hear of everything; before ``start()``."""
         self._parts.append(part)
+
+    def reload(self, settings: Settings) -> None:
+        """Other rules hold from now on: policy, contracts, names, and what the parts have.
+
+        What they leave as it is goes on untouched; the rest follows in a moment.
+        """
+        policy, contracts = Policy(settings.policy, settings.peers), Contracts(settings.contracts)
+        self.names = Names(settings.peers)
+        self._act(self._exports.rules(policy, contracts, self.names))
+        self._rejudging = self._imports.rules(policy, contracts, self.names, self._loop.time())
+        self._scan_all()
+        for part in self._parts:
+            part.reload(settings)
 
     @property
     def node(self) -> SlaveNode:
@@ -197,8 +220,8 @@ class Bridge:
             back.back = self._loop.call_later(limits.RESUME_CLAIM, self._unclaimed, back)
             back.inbound.time.resumed_at = lambda: link.resumed_at
             self._by_link[link] = back
-            self._act(self._imports.link_up(back.peer))
-            self._act(self._exports.link_up(back.peer))
+            self._act(self._imports.link_up(back.peer, link.identity.name))
+            self._act(self._exports.link_up(back.peer, link.identity.name))
             self._parts_link_up(back)
             self._schedule()
             return
@@ -216,8 +239,8 @@ class Bridge:
         inbound.time.resumed_at = lambda: link.resumed_at
         attached = Attached(peer, link, inbound)
         self._by_number[peer] = self._by_link[link] = attached
-        self._act(self._imports.link_up(peer))
-        self._act(self._exports.link_up(peer))
+        self._act(self._imports.link_up(peer, link.identity.name))
+        self._act(self._exports.link_up(peer, link.identity.name))
         self._parts_link_up(attached)
         self._schedule()
 
@@ -357,14 +380,18 @@ class Bridge:
                 if actions := self._imports.closed(peer, message, now):
                     _log.info("< %s closes route %d: %s", attached.link.name, message.route, message.reason)
                     self._act(actions)
-            case Mismatch() if message.source not in self._exports.offered:
-                pass  # it went meanwhile
             case Mismatch():
-                who = f"{attached.link.name}: {message.source}"
-                self._remember(message.source, f"{attached.link.name}{message.subscriber}", message.text)
-                self._warn("mismatch.remote", who, f"{who}: {message.text}")
+                self._mismatched_there(attached, message)
             case _ if not any(part.message(attached, message) for part in self._parts):
                 raise RemoteProtocolError(f"a message of kind {type(message).__name__} that nobody here takes")
+
+    def _mismatched_there(self, attached: Attached, message: Mismatch) -> None:
+        source = self._exports.local(attached.peer, message.source)
+        if source is None:
+            return  # it went meanwhile
+        who = f"{attached.link.name}: {source}"
+        self._remember(source, f"{attached.link.name}{message.subscriber}", message.text)
+        self._warn("mismatch.remote", who, f"{who}: {message.text}")
 
     def _claim(self, link: MeshLink) -> Attached | None:
         """The peer that was away, if it is this one; another instance in its place shows that it will not come."""
@@ -450,7 +477,10 @@ class Bridge:
             self._learn(*self._learning.popleft())
         if self._forgetting and not tuple(islice(self._forgetting[0], limits.LEARNT_AT_ONCE)):
             self._forgetting.popleft()
-        if self._changed or self._learning or self._forgetting or self._exports.untold:
+        rejudged = tuple(islice(self._rejudging, limits.LEARNT_AT_ONCE))
+        for actions in rejudged:
+            self._act(actions)
+        if self._changed or self._learning or self._forgetting or rejudged or self._exports.untold:
             self._schedule()
         elif self._mismatches:
             for source in [s for s in self._mismatches if s not in self._exports.offered]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from rmpa.bridge.aio.bridge import Attached
     from rmpa.bridge.messages import Message
+    from rmpa.core.config import Settings
     from rmpa.ros.master.effects import GraphChange
 
 
@@ -55,6 +56,9 @@ class Part:
             Whether this part has subscribed to it.
         """
         return False
+
+    def reload(self, settings: Settings) -> None:
+        """The settings were read again; of those that a running agent can take, others may hold from now on."""
 
     def reconcile(self) -> None:
         """Each ``limits.RECONCILE_INTERVAL``: compare what is with what should be, and mend it."""
