@@ -267,7 +267,7 @@ def test_what_is_asked_while_a_profile_is_applied_counts_when_it_runs() -> None:
 
 
 @pytest.mark.parametrize("seed", range(200))
-def test_whatever_happens_one_profile_is_applied_at_a_time_and_none_that_is_left_out(seed: int) -> None:
+def test_whatever_happens_one_profile_is_applied_at_a_time_and_none_that_is_left_out(seed: int) -> None:  # noqa: C901
     chance = random.Random(seed)
     one = loop(FAST, MIDDLE, SLOW, LIMP)
     now, outstanding = 0.0, ""

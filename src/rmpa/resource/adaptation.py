@@ -11,7 +11,7 @@ MAPE-K, sans-I/O: *monitor* takes each window of measured quality, *analyse* com
 A quality that is violated in ``k`` of the last ``n`` windows is a disturbance. If another profile can serve, that is
 an *adaptation event* (WARN): the violating one is left out for its cool-down and the other one applied. If none can,
 it is a *non-adaptable event* (ERROR): the best-effort profile runs. Without a disturbance a profile is changed only
-where that brings more than ``improvement``, and not before ``dwell`` is over, so that two nearly alike do not alternate.
+where that brings more than ``improvement``, and not before ``dwell`` is over: two nearly alike do not alternate.
 """
 
 from __future__ import annotations
