@@ -40,6 +40,7 @@ class Connection:
         bytes: Sent or received, headers included.
         messages: Sent or received.
         dropped: Messages dropped because the other side is slow; 0 inbound.
+        waiting: Bytes that wait for the other side to read; 0 inbound.
     """
 
     number: int
@@ -51,6 +52,7 @@ class Connection:
     bytes: int
     messages: int
     dropped: int = 0
+    waiting: int = 0
 
 
 class NodeView(Protocol):

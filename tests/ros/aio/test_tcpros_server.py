@@ -17,8 +17,6 @@ from tests.ros.aio.peers import STRING, RawSubscriber, until
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from rmpa.ros.aio.inbound import Inbound
-
 
 class Served:
     def __init__(self) -> None:
@@ -150,18 +148,6 @@ async def test_all_connections_are_bounded_and_closed_ones_do_not_count(
             link.close()
         await until(lambda: served.publication.subscribers == 0)
     assert served.counters["tcpros.refused.full"] == 2
-
-
-async def test_a_service_can_be_taken_over() -> None:
-    taken: list[Inbound] = []
-    server = TcprosServer("/p", {}, on_service=taken.append)
-    server.start()
-    link = await RawSubscriber.connect(server.address, topic="", service="/add")
-    await until(lambda: taken)
-    assert taken[0].fields["service"] == "/add"
-    taken[0].close()
-    link.close()
-    server.close()
 
 
 async def test_an_address_in_use_is_a_clear_error(served: Served) -> None:

@@ -23,7 +23,7 @@ from rmpa.core.aio.loop import breathe, breathing
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, UnreachableError
 from rmpa.ros.xmlrpc import Reply, ResponseReader, RosFault, XmlRpcValue, brief, call_pieces
 
-__all__ = ["RosFault", "call", "call_api", "connect", "is_own_name", "split_uri"]
+__all__ = ["RosFault", "call", "call_api", "connect", "exchange", "is_own_name", "read_response", "split_uri"]
 
 _log = logging.getLogger(__name__)
 
@@ -177,16 +177,32 @@ async def call(
         RemoteProtocolError: The answer is not XML-RPC, or too large.
         LocalProtocolError: A parameter cannot be said in XML-RPC.
     """
-    host, port, path = split_uri(uri)
-    http, request = _request(host, port, path, b"".join(breathing(call_pieces(method, params), every=1)))
     if _log.isEnabledFor(logging.DEBUG):
         _log.debug("> %s %s%s", uri, method, brief(params))
+    document = b"".join(breathing(call_pieces(method, params), every=1))
+    return await read_response(await exchange(uri, method, document, timeout=timeout))
+
+
+async def exchange(
+    uri: str,
+    method: str,
+    document: bytes,
+    *,
+    timeout: float,  # noqa: ASYNC109 - the message names it
+) -> bytes:
+    """Send a ``methodCall`` document and return the response's, which nobody has looked at.
+
+    For who asks the same again and again, and need not read the same answer twice. Arguments and errors as of
+    ``call``; ``read_response`` reads it.
+    """
+    host, port, path = split_uri(uri)
+    http, request = _request(host, port, path, document)
     try:
         async with asyncio.timeout(timeout):
             sock = await connect(host, port)
             try:
                 await asyncio.get_running_loop().sock_sendall(sock, request)
-                body = await _response_body(sock, http)
+                return await _response_body(sock, http)
             finally:
                 sock.close()
     except TimeoutError as error:
@@ -198,10 +214,14 @@ async def call(
         raise UnreachableError("XML-RPC server", uri, f"{problem}; is that program running?") from error
     except h11.RemoteProtocolError as error:
         raise RemoteProtocolError(f"{uri} does not speak HTTP: {error}") from error
-    return await _read(body)
 
 
-async def _read(body: bytes) -> XmlRpcValue:
+async def read_response(body: bytes) -> XmlRpcValue:
+    """Read a response, a little at a time.
+
+    Raises:
+        RosFault, RemoteProtocolError: As for ``call``.
+    """
     reader = ResponseReader()
     try:
         for begin in range(0, len(body), limits.XMLRPC_SLICE):

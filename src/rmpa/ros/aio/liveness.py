@@ -106,10 +106,10 @@ class Liveness:
                 await asyncio.sleep(pause)
 
     async def _check(self, node: str, api: str) -> None:
-        if not await _refuses(api):
+        if not await refuses(api):
             return
         await asyncio.sleep(limits.NODE_RECHECK_DELAY)
-        if await _refuses(api) and self._nodes().get(node) == api:
+        if await refuses(api) and self._nodes().get(node) == api:
             _log.warning("= node %s at %s is dead: nobody listens there", node, api)
             self._on_dead(node, api)
 
@@ -122,7 +122,8 @@ def _listens(api: str, ports: set[int] | None) -> bool:
     return ports is not None and (is_own_name(host) or host.startswith("127.")) and port in ports
 
 
-async def _refuses(api: str) -> bool:
+async def refuses(api: str) -> bool:
+    """Whether nobody listens at a slave API's address; ``False`` where that cannot be found out."""
     try:
         host, port, _ = split_uri(api)
         async with asyncio.timeout(limits.TCPROS_CONNECT_TIMEOUT):

@@ -123,6 +123,7 @@ class Publication:
                 link.stream.bytes_out,
                 link.messages,
                 link.dropped,
+                link.stream.pending_bytes,
             )
             for link in (*self._open, *self._held)
         ]
