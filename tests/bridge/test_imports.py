@@ -432,6 +432,23 @@ def test_a_silence_that_lasts_leaves_only_what_waits(flowing: Imports) -> None:
     assert state(flowing) is RouteState.WAITING
 
 
+def test_what_is_latched_waits_for_a_silent_peer_while_somebody_listens(imports: Imports) -> None:
+    latched = Description("sensor_msgs/Joy", ABOUT.md5, "Header header\n", True)
+    plain = Description("a/B", ABOUT.md5, "", False)
+    imports.advertised(1, Advertise(added=(OFFER, ODOM)))
+    for route, (source, about) in enumerate(((CMD, latched), (ODOM.source, plain)), start=1):
+        imports.demand(1, source, 0.0, wanted=True)
+        imports.opened(1, Opened(route, about), 0.0)
+    imports.link_away(1, briefly=True)
+    assert imports.waits_for(1)
+    assert imports.link_away(1) == ([Retract(1, ODOM.source)], True)
+    imports.link_up(1)
+    assert opens(imports.advertised(1, Advertise(added=(OFFER,)), 10.0)) == [Open(1, "/cmd", "/joy")]
+    imports.opened(1, Opened(1, latched), 10.0)
+    # A link that somebody closed is not expected back.
+    assert imports.link_away(1) == ([Detach(1, CMD, 1), Retract(1, CMD)], False)
+
+
 def test_a_local_topic_of_another_type_ends_what_waits(flowing: Imports) -> None:
     flowing.link_away(1)
     actions = flowing.local_type("/cmd", "std_msgs/String")

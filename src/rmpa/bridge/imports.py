@@ -125,6 +125,7 @@ class _Peer:
         next_route: The next one's id.
         nodes: How many sources each of its nodes has.
         away: Whether it has no link, and may come back.
+        silent: Whether its link fell silent before, for nobody closed it.
         doubtful: What it offered over its last link and has not offered again since.
     """
 
@@ -137,6 +138,7 @@ class _Peer:
     next_route: int = 1
     nodes: Counter[str] = field(default_factory=Counter)
     away: bool = False
+    silent: bool = False
     doubtful: set[Source] = field(default_factory=set)
 
 
@@ -246,7 +248,7 @@ class Imports:
             name: The peer's name, which its rules go by.
         """
         known = self._peers.setdefault(peer, _Peer(name, self._names.of(name)))
-        known.away = False
+        known.away = known.silent = False
         known.routes = {}
         known.next_route = 1
         return []
@@ -265,9 +267,10 @@ class Imports:
         actions: list[Action] = []
         known = self._peers[peer]
         known.away = True
+        known.silent = known.silent or briefly
         known.routes = {}
         for source, entry in list(known.sources.items()):
-            keep = briefly or _outlives(entry)
+            keep = briefly or _outlives(entry, silent=known.silent)
             if entry.route:
                 # Where nobody listens any more, nothing is to go on.
                 goes_on = keep and entry.state is not RouteState.LINGERING
@@ -280,8 +283,9 @@ class Imports:
         return actions, bool(known.sources)
 
     def waits_for(self, peer: int) -> bool:
-        """Whether somebody local listens to a reliable route of a peer."""
-        return any(map(_outlives, self._peers[peer].sources.values()))
+        """Whether something of a peer stays for a while: what somebody local listens to, reliable or latched."""
+        known = self._peers[peer]
+        return any(_outlives(entry, silent=known.silent) for entry in known.sources.values())
 
     def detached(self, peer: int) -> list[Action]:
         """A link is gone, and nothing waits for its peer: ``link_down`` follows. Costs what was open."""
@@ -580,10 +584,17 @@ class Imports:
         return actions
 
 
-def _outlives(entry: Import) -> bool:
-    """Whether an entry stays when its peer's link is gone."""
-    reliable = entry.contract is not None and entry.contract.reliability is Reliability.RELIABLE
-    return reliable and entry.wanted and entry.state in _LISTENED
+def _outlives(entry: Import, *, silent: bool) -> bool:
+    """Whether an entry stays when its peer's link is gone.
+
+    A reliable one does, so that nothing is lost. A latched one does if the link fell silent: its subscribers stay
+    connected, and are not told again what they know when the peer is back; late ones are told meanwhile.
+    """
+    if not entry.wanted or entry.state not in _LISTENED:
+        return False
+    if silent and entry.description is not None and entry.description.latching:
+        return True
+    return entry.contract is not None and entry.contract.reliability is Reliability.RELIABLE
 
 
 def _gone(peer: int, sources: dict[Source, Import]) -> Iterator[Action]:
