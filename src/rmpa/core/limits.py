@@ -47,6 +47,8 @@ CONTRACTS_REMEMBERED: Final = 4096
 """(topic, type) pairs whose contract is remembered; the oldest is forgotten first, and found again by the rules."""
 NAMES_REMEMBERED: Final = 256
 """Peers whose names' rules are remembered: as many as peers have names in a large network; found again by the rules."""
+REMAPS_MAX: Final = 256
+"""Rules for names in one direction of a ``[[peer]]``; each is held against each other one."""
 CONTRACT_DEPTH_MAX: Final = 100_000
 """Messages that a contract may let wait: 100 s of a 1 kHz topic. ``LINK_QUEUE_BYTES`` bounds their bytes."""
 CONTRACT_TIME_MIN: Final = 0.001
@@ -360,6 +362,29 @@ PARAM_DEPTH_MAX: Final = 64
 """Namespaces inside each other in one parameter's name; more is an attack on the recursion."""
 SLAVE_CALL_TIMEOUT: Final = 3.0
 """For one XML-RPC call to a node; a stopped node must not hold the others up."""
+MASTER_LOOK_FIRST: Final = 0.1
+"""Between two looks at a roscore whose graph has just changed: nodes register one thing after the other. An idle look
+at a graph of 50 nodes costs it some milliseconds."""
+MASTER_LOOK_IDLE: Final = 0.5
+"""Between two looks where nothing changes: a look more would cost more than it finds earlier."""
+MASTER_LOOK_MAX: Final = 0.8
+"""Between two looks at the most, so that whatever changes is seen within a second."""
+MASTER_LOOK_SHARE: Final = 20
+"""Times what a look took, before the next one: a twentieth of the master's time is ours."""
+MASTER_LOOK_SOON: Final = 0.02
+"""Before a look that somebody has cause for: what he saw is seldom the only thing."""
+MASTER_RETRY: Final = 0.5
+"""Between two looks for a roscore that does not answer: one that was started again has us back within a second."""
+MASTER_TIMEOUT: Final = 3.0
+"""For one look or one write; a roscore on a busy board has answered in 0.3 s."""
+MASTER_ASK_TIMEOUT: Final = 10.0
+"""For an answer that may be megabytes of parameters."""
+MASTER_WRITES_AT_ONCE: Final = 64
+"""Registrations in one call to a roscore, some 10 ms of its work."""
+MASTER_WRITES_MAX: Final = 20_000
+"""Registrations that wait to be told to a roscore: more than a peer may advertise; beyond it a look finds them."""
+MASTER_FAREWELL: Final = 2.0
+"""For what an agent that ends has to tell a roscore."""
 NODE_CHECK_INTERVAL: Final = 5.0
 """How often the core looks whether a registered node still listens."""
 NODE_RECHECK_DELAY: Final = 0.2
@@ -398,6 +423,8 @@ NODES_PER_PEER_MAX: Final = 256
 """Nodes of one peer that get a proxy here: each takes two listening sockets; large robots have some 100 nodes."""
 MISMATCHES_MAX: Final = 16
 """Refused subscribers of one source that are remembered for the user."""
+RELAY_HOPS_MAX: Final = 4
+"""Relays between two modules: five networks in a row; each adds a hop's delay, and longer rows are a mistake."""
 SERVICE_ROUTES: Final = 1 << 31
 """Routes from here on are those of services: topics' are counted from 1."""
 SERVICES_PER_PEER_MAX: Final = 8192

@@ -1,0 +1,336 @@
+"""The graph of a master that is another program, as far as it is known here, and what of it is ours.
+
+Two sources make it: what the agent itself registers counts at once, what others do counts when a survey shows it. A
+survey also shows what the master lacks of ours (it was started anew), or has too much (an agent was killed).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+from rmpa.ros.master.effects import GraphChange, GraphState, Kind
+from rmpa.ros.master.registrations import ANY_TYPE, Registrations
+from rmpa.ros.xmlrpc import Reply, XmlRpcValue, brief
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from rmpa.core.breathing import Breathing
+    from rmpa.ros.master.survey import Survey
+
+Call: TypeAlias = tuple[str, tuple[XmlRpcValue, ...]]
+"""A method of the Master API and its parameters."""
+Entry: TypeAlias = tuple[Kind, str, str]
+"""One registration: its kind, the topic, service or parameter, and the node."""
+
+_REGISTER: Final = {
+    "registerPublisher": Kind.PUBLISHER,
+    "registerSubscriber": Kind.SUBSCRIBER,
+    "registerService": Kind.SERVICE,
+    "subscribeParam": Kind.PARAM,
+}
+_UNREGISTER: Final = {
+    "unregisterPublisher": Kind.PUBLISHER,
+    "unregisterSubscriber": Kind.SUBSCRIBER,
+    "unregisterService": Kind.SERVICE,
+    "unsubscribeParam": Kind.PARAM,
+}
+REGISTRATIONS: Final = frozenset({*_REGISTER, *_UNREGISTER})
+"""The methods that ``Mirror.apply`` takes."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Own:
+    """One registration of ours."""
+
+    call: Call
+    api: str
+    undo: Call
+
+
+class Mirror:
+    """What is known of the graph of one master.
+
+    Args:
+        breathing: For surveys of thousands of topics.
+    """
+
+    def __init__(self, *, breathing: Breathing = iter) -> None:
+        self._breathing = breathing
+        self._known = Registrations()
+        self._own: dict[Entry, _Own] = {}
+        # What we asked for and no survey was begun since: a survey from before says nothing about it.
+        self._touched: dict[Entry, int] = {}
+        self._asked = 0
+        # Nodes whose registrations the master keeps although nobody listens at their address any more.
+        self._dead: dict[str, str] = {}
+        # Nodes that a master which is no more knew: they live, and what they send still comes.
+        self._orphans: dict[str, str] = {}
+        self._run = ""
+
+    # --- questions --------------------------------------------------------------------------------------------
+
+    @property
+    def asked(self) -> int:
+        """How often ``apply`` was called: what a survey that begins now can have seen."""
+        return self._asked
+
+    @property
+    def dead(self) -> Mapping[str, str]:
+        """Nodes that were found dead, and their slave APIs."""
+        return self._dead
+
+    def state(self) -> GraphState:
+        """All registrations; the same object until something changes."""
+        return self._known.state()
+
+    def publishers(self, topic: str) -> Mapping[str, str]:
+        """The nodes that publish a topic, and their slave APIs."""
+        return self._known.at(Kind.PUBLISHER, topic)
+
+    def type_of(self, topic: str) -> str:
+        """The type of a topic; ``*`` for none."""
+        return self._known.types().get(topic, ANY_TYPE)
+
+    def is_ours(self, node: str) -> bool:
+        """Whether we registered something for this node."""
+        return any(entry[2] == node for entry in self._own)
+
+    def others(self) -> dict[str, str]:
+        """The nodes that are not ours, and their slave APIs."""
+        ours = {node for _, _, node in self._own}
+        return {node: api for node, api in self._known.nodes().items() if node not in ours}
+
+    def undo_all(self) -> list[Call]:
+        """What takes all that is ours away again, in the order opposite to that in which it came."""
+        return [own.undo for own in reversed(self._own.values())]
+
+    def take_changes(self) -> list[GraphChange]:
+        """What has changed since the last time."""
+        self._known.effects.clear()  # the master tells the nodes
+        changes, self._known.changes = self._known.changes, []
+        return changes
+
+    # --- our own registrations --------------------------------------------------------------------------------
+
+    def apply(self, method: str, params: Sequence[XmlRpcValue]) -> Reply:
+        """Register or unregister something of ours, one of ``REGISTRATIONS``; the master is to be told by the caller.
+
+        Returns:
+            What the master will answer, as far as it is known here.
+        """
+        self._asked += 1
+        words = [param for param in params if isinstance(param, str)]
+        if method in _REGISTER and len(words) == len(params) == _ARITY[method]:
+            return self._register(_REGISTER[method], method, words)
+        if method in _UNREGISTER and len(words) == len(params) == _ARITY[method]:
+            return self._unregister(_UNREGISTER[method], words)
+        return Reply(-1, f"{method} does not take {brief(params)}", 0)
+
+    def _register(self, kind: Kind, method: str, words: list[str]) -> Reply:
+        value: XmlRpcValue = 1
+        match kind, words:
+            case Kind.PUBLISHER, [node, key, type_name, api]:
+                self._known.register_publisher(key, type_name, node, api)
+                undo: Call = "unregisterPublisher", (node, key, api)
+                value = self._known.apis(Kind.SUBSCRIBER, key)
+            case Kind.SUBSCRIBER, [node, key, type_name, api]:
+                self._known.register_subscriber(key, type_name, node, api)
+                undo = "unregisterSubscriber", (node, key, api)
+                value = self._known.apis(Kind.PUBLISHER, key)
+            case Kind.SERVICE, [node, key, uri, api]:
+                self._known.register_service(key, uri, node, api)
+                undo = "unregisterService", (node, key, uri)
+            case _, [node, api, key]:
+                undo = "unsubscribeParam", (node, api, key)
+            case _:
+                raise AssertionError(words)
+        self._touched[kind, key, node] = self._asked
+        self._own[kind, key, node] = _Own((method, tuple(words)), api, undo)
+        return Reply(1, "will be registered", value)
+
+    def _unregister(self, kind: Kind, words: list[str]) -> Reply:
+        node, key = (words[0], words[2]) if kind is Kind.PARAM else (words[0], words[1])
+        self._touched[kind, key, node] = self._asked
+        own = self._own.get((kind, key, node))
+        if own is None or own.undo[1] != tuple(words):
+            return Reply(1, f"{node} is not registered for {key}", 0)
+        self._forget(kind, key, node)
+        return Reply(1, "will be unregistered", 1)
+
+    def forget(self, call: Call) -> None:
+        """The master does not take this registration of ours: it is none."""
+        for entry, own in list(self._own.items()):
+            if own.call == call:
+                self._forget(*entry)
+
+    def _forget(self, kind: Kind, key: str, node: str) -> None:
+        own = self._own.pop((kind, key, node))
+        if kind is Kind.SERVICE:
+            self._known.unregister_service(key, str(own.undo[1][2]), node)
+        elif kind is not Kind.PARAM:
+            self._known.unregister(kind, key, node, own.api)
+
+    # --- the others -------------------------------------------------------------------------------------------
+
+    def buried(self, node: str, api: str) -> None:
+        """A node was found dead: what the master still has of it counts no more."""
+        self._dead[node] = api
+        self._orphans.pop(node, None)
+        self._known.purge(node, api)
+
+    def risen(self, node: str) -> None:
+        """It lives after all; the next survey brings it back."""
+        self._dead.pop(node, None)
+
+    def strangers(self, survey: Survey, prefix: str, seen: int) -> dict[str, str]:
+        """Nodes with names of an agent's that are not ours: of another agent, or of one that was killed.
+
+        Args:
+            survey: What the master said.
+            prefix: The agent's own node; its proxies' names are below.
+            seen: ``asked`` when the survey was begun.
+        """
+        ours = {node: own.api for (_, _, node), own in self._own.items()}
+        fresh = {node for (_, _, node), asked in self._touched.items() if asked > seen}
+        return {
+            node: survey.uris[node]
+            for node in survey.nodes()
+            if (node == prefix or node.startswith(prefix + "/"))
+            and node not in fresh
+            and node in survey.uris
+            and survey.uris[node] != ours.get(node)
+        }
+
+    def learn(self, survey: Survey, seen: int, ignored: Mapping[str, str]) -> list[Call]:
+        """Take in what the others have registered.
+
+        Args:
+            survey: What the master said; every node and service of it that still is there was looked up.
+            seen: ``asked`` when it was begun.
+            ignored: Nodes that are passed over.
+
+        Returns:
+            What has to be registered again, because the master does not have it of ours.
+        """
+        if self._run and survey.run != self._run:
+            # Its nodes are not in the new master's graph, and never will be before they restart. In a graph without
+            # a bridge they go on all the same, for their connections stand: so do the routes here.
+            self._orphans |= self.others()
+        again = [] if survey.run == self._run else self._own_params()
+        self._run = survey.run
+        listed = survey.nodes()
+        self._orphans = {node: api for node, api in self._orphans.items() if node not in listed}
+        self._dead = {node: api for node, api in self._dead.items() if survey.uris.get(node) == api}
+        passed = {*ignored, *(node for _, _, node in self._own), *self._dead}
+        for kind, table in survey.holders.items():
+            self._drop_gone(kind, table, passed, survey)
+        for kind, table in survey.holders.items():
+            self._add_new(kind, table, passed, survey, seen)
+        self._learn_types(survey, passed)
+        again += self._missing(survey, seen, ignored)
+        self._touched = {entry: asked for entry, asked in self._touched.items() if asked > seen}
+        return again
+
+    def _own_params(self) -> list[Call]:
+        """A survey does not show who follows parameters, so a new master is told of all."""
+        return [own.call for (kind, _, _), own in self._own.items() if kind is Kind.PARAM]
+
+    def _drop_gone(self, kind: Kind, table: Mapping[str, Sequence[str]], passed: set[str], survey: Survey) -> None:
+        for key, nodes in self._breathing(self._known.providers(kind)):
+            there = table.get(key, ())
+            for node, api in nodes.items():
+                if node in passed or self._orphans.get(node) == api:
+                    continue
+                if node not in there or survey.uris.get(node) != api:
+                    if kind is Kind.SERVICE:
+                        uri = self._known.service_uri(key)
+                        self._known.unregister_service(key, uri or "", node)
+                    else:
+                        self._known.unregister(kind, key, node, api)
+
+    def _add_new(
+        self, kind: Kind, table: Mapping[str, Sequence[str]], passed: set[str], survey: Survey, seen: int
+    ) -> None:
+        for key, nodes in self._breathing(table.items()):
+            for node in nodes:
+                api = survey.uris.get(node)
+                if node in passed or api is None:
+                    continue
+                known = self._known.at(kind, key).get(node) == api
+                match kind:
+                    case Kind.PUBLISHER if not known:
+                        self._known.register_publisher(key, survey.types.get(key, ANY_TYPE), node, api)
+                    case Kind.SUBSCRIBER if not known:
+                        self._known.register_subscriber(key, survey.types.get(key, ANY_TYPE), node, api)
+                    case Kind.SERVICE if key in survey.services:
+                        self._take_service(key, survey.services[key], node, api, seen)
+
+    def _take_service(self, service: str, uri: str, node: str, api: str, seen: int) -> None:
+        if self._known.service_uri(service) == uri and node in self._known.at(Kind.SERVICE, service):
+            return
+        for ours in tuple(self._known.at(Kind.SERVICE, service)):
+            entry = Kind.SERVICE, service, ours
+            if entry in self._own:
+                if self._touched.get(entry, 0) > seen:
+                    return
+                # The master has one provider a service, the last: ours was replaced, and is not pushed in again.
+                self._forget(*entry)
+        self._known.register_service(service, uri, node, api)
+
+    def _learn_types(self, survey: Survey, passed: set[str]) -> None:
+        """A topic whose type is known only now, or another: its publishers' word, since the master keeps the last."""
+        types = self._known.types()
+        for topic, type_name in self._breathing(survey.types.items()):
+            if types.get(topic) == type_name or type_name == ANY_TYPE:
+                continue
+            for node, api in self._known.at(Kind.PUBLISHER, topic).items():
+                if node not in passed:
+                    self._known.register_publisher(topic, type_name, node, api)
+            if topic not in types and (nodes := self._known.at(Kind.SUBSCRIBER, topic)):
+                node, api = next(iter(nodes.items()))
+                self._known.register_subscriber(topic, type_name, node, api)
+
+    def _missing(self, survey: Survey, seen: int, ignored: Mapping[str, str]) -> list[Call]:
+        again = []
+        for (kind, key, node), own in self._breathing(list(self._own.items())):
+            if kind is Kind.PARAM or self._touched.get((kind, key, node), 0) > seen or node in ignored:
+                continue
+            there = node in survey.holders[kind].get(key, ()) and survey.uris.get(node) == own.api
+            if not there or (kind is Kind.SERVICE and survey.services.get(key) != own.undo[1][2]):
+                again.append(own.call)
+        return again
+
+
+def leftovers(survey: Survey, nodes: Mapping[str, str]) -> Iterator[Call]:
+    """What takes the registrations of these nodes away, which nobody will do any more.
+
+    Args:
+        survey: What the master said.
+        nodes: The nodes and their slave APIs.
+    """
+    for kind, table in survey.holders.items():
+        for key, holders in table.items():
+            for node in holders:
+                if node not in nodes:
+                    continue
+                match kind:
+                    case Kind.PUBLISHER:
+                        yield "unregisterPublisher", (node, key, nodes[node])
+                    case Kind.SUBSCRIBER:
+                        yield "unregisterSubscriber", (node, key, nodes[node])
+                    case _:
+                        yield "unregisterService", (node, key, survey.services.get(key, ""))
+
+
+_ARITY: Final = {
+    "registerPublisher": 4,
+    "registerSubscriber": 4,
+    "registerService": 4,
+    "subscribeParam": 3,
+    "unregisterPublisher": 3,
+    "unregisterSubscriber": 3,
+    "unregisterService": 3,
+    "unsubscribeParam": 3,
+}

@@ -1,0 +1,138 @@
+"""One look at a master that is another program: what it is asked in one ``system.multicall``, and what it said.
+
+A ROS master tells nobody of changes in its graph, so it has to be looked at. ``getSystemState`` has the names alone;
+where each node and service is must be looked up, all in the same call: a node that restarts has its old name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.ros.master.effects import Kind
+from rmpa.ros.xmlrpc import XmlRpcValue, brief
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from rmpa.core.breathing import Breathing
+
+_KINDS: Final = (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)
+"""In the order of ``getSystemState``."""
+_HEAD: Final = ("getSystemState", "getTopicTypes", "getPid")
+
+Holders = dict[str, tuple[str, ...]]
+"""By topic or service: the nodes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What a master said of its graph.
+
+    Args:
+        holders: By kind, then by topic or service: the nodes, in the master's order.
+        types: By topic.
+        run: Which run of the master it was: its process and its ``/run_id``.
+        uris: Slave APIs, of the nodes that were looked up and are there.
+        services: ``rosrpc://`` URIs, of the services that were looked up and are there.
+    """
+
+    holders: dict[Kind, Holders]
+    types: dict[str, str]
+    run: str
+    uris: dict[str, str] = field(default_factory=dict)
+    services: dict[str, str] = field(default_factory=dict)
+
+    def nodes(self) -> dict[str, None]:
+        """Every node of it."""
+        return dict.fromkeys(node for table in self.holders.values() for nodes in table.values() for node in nodes)
+
+    def holders_of_services(self) -> Holders:
+        """Every service of it, and its node."""
+        return self.holders[Kind.SERVICE]
+
+    def with_more(self, uris: Mapping[str, str], services: Mapping[str, str]) -> Survey:
+        """The same with more that was looked up."""
+        return Survey(self.holders, self.types, self.run, {**self.uris, **uris}, {**self.services, **services})
+
+
+def one_call(method: str, params: Sequence[XmlRpcValue]) -> XmlRpcValue:
+    """One call within a ``system.multicall``."""
+    return {"methodName": method, "params": list(params)}
+
+
+def survey_calls(caller_id: str, nodes: Iterable[str], services: Iterable[str]) -> list[XmlRpcValue]:
+    """What to ask for a survey that looks up these nodes and services; ``read_survey`` reads the answers."""
+    calls = [one_call(method, [caller_id]) for method in _HEAD]
+    # Behind these, so that what is looked up is as new as the state.
+    return [*calls, one_call("getParam", [caller_id, "/run_id"]), *lookup_calls(caller_id, nodes, services)]
+
+
+def lookup_calls(caller_id: str, nodes: Iterable[str], services: Iterable[str]) -> list[XmlRpcValue]:
+    """What to ask for the places of nodes and services; ``read_lookups`` reads the answers."""
+    calls = [one_call("lookupNode", [caller_id, node]) for node in nodes]
+    return calls + [one_call("lookupService", [caller_id, service]) for service in services]
+
+
+def read_survey(
+    answer: XmlRpcValue, nodes: Sequence[str], services: Sequence[str], *, breathing: Breathing = iter
+) -> Survey:
+    """Read the answer to ``survey_calls`` with the same nodes and services.
+
+    Raises:
+        RemoteProtocolError: It is none.
+    """
+    if not isinstance(answer, list) or len(answer) < len(_HEAD) + 1:
+        raise RemoteProtocolError(f"the master's answer to system.multicall is no list of answers: {brief(answer)}")
+    state, types, pid, run_id = (_value(one) for one in answer[: len(_HEAD) + 1])
+    if not isinstance(state, list) or len(state) != len(_KINDS):
+        raise RemoteProtocolError(f"the master's system state is not three lists: {brief(state)}")
+    survey = Survey(
+        {kind: _holders(table, breathing) for kind, table in zip(_KINDS, state, strict=True)},
+        dict(breathing(_pairs(types))),
+        f"{pid} {run_id}",
+    )
+    return survey.with_more(*read_lookups(answer[len(_HEAD) + 1 :], nodes, services, breathing=breathing))
+
+
+def read_lookups(
+    answer: XmlRpcValue, nodes: Sequence[str], services: Sequence[str], *, breathing: Breathing = iter
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Read the answer to ``lookup_calls`` with the same nodes and services: where they are, those that are.
+
+    Raises:
+        RemoteProtocolError: It is none.
+    """
+    if not isinstance(answer, list) or len(answer) != len(nodes) + len(services):
+        raise RemoteProtocolError(f"the master's answer to system.multicall is no list of answers: {brief(answer)}")
+    found = [_value(one) for one in breathing(answer)]
+    places = [value if isinstance(value, str) else "" for value in found]
+    uris = {node: uri for node, uri in zip(nodes, places, strict=False) if uri}
+    return uris, {name: uri for name, uri in zip(services, places[len(nodes) :], strict=True) if uri}
+
+
+def _value(answer: XmlRpcValue) -> XmlRpcValue:
+    """The value of one answer out of many: ``None`` where the method failed."""
+    match answer:
+        case [[1, _, value]]:
+            return value
+    return None
+
+
+def _holders(table: XmlRpcValue, breathing: Breathing) -> Holders:
+    found: Holders = {}
+    for entry in breathing(table) if isinstance(table, list) else ():
+        match entry:
+            case [str(key), list(nodes)]:
+                found[key] = tuple(node for node in nodes if isinstance(node, str))
+            case _:
+                raise RemoteProtocolError(f"the master's system state has {brief(entry)} in it")
+    return found
+
+
+def _pairs(types: XmlRpcValue) -> Iterable[tuple[str, str]]:
+    for entry in types if isinstance(types, list) else ():
+        match entry:
+            case [str(topic), str(type_name)]:
+                yield topic, type_name
