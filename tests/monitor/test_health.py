@@ -97,6 +97,14 @@ def test_a_subscriber_that_was_refused_is_an_error() -> None:
     assert level(with_routes(HEALTHY, mismatches=("another md5",))) == (Level.ERROR, "another md5")
 
 
+def test_our_topic_that_was_refused_elsewhere_is_an_error_here_too() -> None:
+    outgoing = msgspec.structs.replace(HEALTHY, direction="out")
+    for routes in ((), (outgoing,)):
+        snapshot = with_routes(*routes, mismatches=("pc/viewer wants another md5",))
+        assert level(snapshot, "rmpa: /cmd") == (Level.ERROR, "pc/viewer wants another md5")
+    assert "rmpa: /cmd" not in judged(Health(), with_routes(HEALTHY, mismatches=("another md5",)))
+
+
 def test_what_went_missing_is_told_when_it_does_and_only_then() -> None:
     health = Health()
     assert judged(health, with_routes(HEALTHY))[CMD].level is Level.OK  # the three lost ones were before our time

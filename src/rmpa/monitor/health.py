@@ -41,7 +41,7 @@ class Health:
         """The names of the statuses of what came from each of these."""
 
     def judge(self, snapshot: Snapshot, now: float) -> Iterator[Status]:
-        """One status for the agent, one for each peer, and one for each topic that comes from one.
+        """One status for the agent, one for each peer, one for each topic that comes from one or does not fit there.
 
         Args:
             snapshot: All of it.
@@ -63,6 +63,7 @@ class Health:
             counts[name] = _missing(route)
             self._topics.setdefault(route.peer, set()).add(name)
             yield _route(name, here, topic, route, self._new(name, counts[name]))
+        yield from _refused(snapshot, here)
         yield from self._stale(peers, here, now)
         self._counts = counts
 
@@ -109,6 +110,13 @@ def _named(topics: tuple[TopicInfo, ...]) -> Iterator[tuple[str, TopicInfo, Rout
             name = f"rmpa: {route.peer}: {topic.name}" + (f" ({route.node})" if several[route.peer] > 1 else "")
             taken[name] += 1
             yield name if taken[name] == 1 else f"{name} #{taken[name]}", topic, route
+
+
+def _refused(snapshot: Snapshot, here: str) -> Iterator[Status]:
+    """Our own topics that somebody elsewhere could not take; one that comes from a peer has a status already."""
+    for topic in snapshot.topics:
+        if topic.mismatches and not any(route.direction == "in" for route in topic.routes):
+            yield Status(Level.ERROR, f"rmpa: {topic.name}", "; ".join(topic.mismatches), here, {})
 
 
 def _missing(route: RouteInfo) -> Counter[str]:
