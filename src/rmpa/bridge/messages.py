@@ -15,6 +15,8 @@ import msgspec
 from rmpa.core import limits
 from rmpa.core.contract import Contract
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.core.guid import Guid
+from rmpa.core.identity import peer_name_problem
 from rmpa.core.names import is_global_name, is_type_name
 
 
@@ -34,12 +36,38 @@ class Source(msgspec.Struct, frozen=True, order=True):
         return f"{self.topic} from {self.node}"
 
 
-class Offer(msgspec.Struct, frozen=True):
-    """A source that the sender's graph has, and its message type."""
+class Origin(msgspec.Struct, frozen=True):
+    """Whose a source is that a relay passes on.
+
+    Args:
+        name: The name of the module that publishes it.
+        guid: Its GUID as text.
+        instance: The random id of its run, 32 hexadecimal digits.
+        node: The publishing node, in that module's graph.
+        path: The instances of the relays on the way, the first one's first; the last one is the sender.
+    """
+
+    name: str
+    guid: str
+    instance: str
+    node: str
+    path: tuple[str, ...] = ()
+
+
+class Offer(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A source that the sender's graph has, and its message type.
+
+    Args:
+        topic: Its topic.
+        node: Its node; where it is relayed: what stands for it in the sender's graph.
+        type: Its message type.
+        origin: Whose it is, if it is not the sender's own.
+    """
 
     topic: str
     node: str
     type: str
+    origin: Origin | None = None
 
     @property
     def source(self) -> Source:
@@ -290,6 +318,7 @@ Message = TopicMessage | ServiceMessage | AgentMessage
 _ENCODER: Final = msgspec.json.Encoder()
 _DECODER: Final = msgspec.json.Decoder(Message)
 _MD5: Final = re.compile(r"[0-9a-f]{32}")
+_INSTANCE: Final = re.compile(r"[0-9a-f]{32}")
 _ROUTE_MAX: Final = (1 << 32) - 1
 
 
@@ -348,8 +377,25 @@ def _validate_advertise(message: Advertise) -> None:
         _check_names(offer.topic, offer.node)
         if not is_crossing_type(offer.type):
             raise RemoteProtocolError(f"{offer.type[:200]!r}, offered for {offer.topic}, is not a message type")
+        if offer.origin is not None:
+            _check_origin(offer.origin)
     for source in message.removed:
         _check_names(source.topic, source.node)
+
+
+def _check_origin(origin: Origin) -> None:
+    if problem := peer_name_problem(origin.name):
+        raise RemoteProtocolError(f"a relayed source: {problem}")
+    try:
+        Guid.parse(origin.guid)
+    except ValueError as error:
+        raise RemoteProtocolError(f"a relayed source: {error}") from error
+    _check_names(origin.node)
+    if not 0 < len(origin.path) <= limits.RELAY_HOPS_MAX:
+        raise LimitExceeded("way of a relayed source (in relays)", len(origin.path), limits.RELAY_HOPS_MAX)
+    for instance in (origin.instance, *origin.path):
+        if not _INSTANCE.fullmatch(instance):
+            raise RemoteProtocolError(f"{instance[:64]!r} in the way of a relayed source is no instance id")
 
 
 def _validate_route(message: RouteMessage) -> None:

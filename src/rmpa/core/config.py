@@ -198,6 +198,8 @@ class Settings:
         domain: Only agents of one domain join.
         core_host: The address that the ROS core listens at.
         core_port: Its port.
+        core_mode: ``embedded``: the agent runs the core; ``external``: a roscore that runs already is used.
+        core_master: The external core's URI; empty: ROS's own default.
         port: The mesh's port (TCP links, UDP unicast beacons); 0 lets the system choose.
         interfaces: Names of the interfaces to use; empty means all usable ones.
         seeds: Agents to greet by unicast, across sub-networks; port 0 means the domain's discovery port.
@@ -212,6 +214,7 @@ class Settings:
         time: Whose simulated time holds.
         lanes: How the lanes are marked.
         realtime: What is asked of the kernel.
+        relay: Whether what comes from one peer is offered to others that do not reach it themselves.
         log_level: ``debug``, ``info``, ``warning`` or ``error``.
         log_json: One JSON object a line instead of text.
         config_file: Where the file's part came from, if there was a file.
@@ -222,6 +225,8 @@ class Settings:
     domain: int = 0
     core_host: str = "127.0.0.1"
     core_port: int = 11311
+    core_mode: str = "embedded"
+    core_master: str = ""
     port: int = 0
     interfaces: tuple[str, ...] = ()
     seeds: tuple[HostPort, ...] = ()
@@ -236,6 +241,7 @@ class Settings:
     time: TimeSettings = field(default_factory=TimeSettings)
     lanes: LaneSettings = field(default_factory=LaneSettings)
     realtime: RealtimeSettings = field(default_factory=RealtimeSettings)
+    relay: bool = False
     log_level: str = "info"
     log_json: bool = False
     config_file: Path | None = None

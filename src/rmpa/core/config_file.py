@@ -38,8 +38,10 @@ class _Table(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
 
 
 class CoreTable(_Table, kw_only=True):
-    """``[core]``: where the ROS core listens."""
+    """``[core]``: where the ROS core listens, or which roscore is used instead of it."""
 
+    mode: str | UnsetType = UNSET
+    master: str | UnsetType = UNSET
     host: str | UnsetType = UNSET
     port: int | UnsetType = UNSET
 
@@ -82,6 +84,20 @@ class ContractTable(_Table, kw_only=True):
     liveliness_lease_duration: object | UnsetType = UNSET
     priority: str | UnsetType = UNSET
     max_rate: object | UnsetType = UNSET
+
+
+class PeerTable(_Table, kw_only=True):
+    """``[[peer]]``: what holds between us and peers of some names; ``core.config_peer`` reads the values."""
+
+    name: str | UnsetType = UNSET
+    prefix: str | UnsetType = UNSET
+    remap_in: dict[str, str] | UnsetType = UNSET
+    remap_out: dict[str, str] | UnsetType = UNSET
+    remap: list[dict[str, object]] | UnsetType = UNSET
+    allow: list[str] | UnsetType = UNSET
+    deny: list[str] | UnsetType = UNSET
+    allow_types: list[str] | UnsetType = UNSET
+    deny_types: list[str] | UnsetType = UNSET
 
 
 class ServicesTable(_Table, kw_only=True):
@@ -140,6 +156,12 @@ class RealtimeTable(_Table, kw_only=True):
     lock_memory: bool | UnsetType = UNSET
 
 
+class RelayTable(_Table, kw_only=True):
+    """``[relay]``: whether this module joins networks that are not routed to each other."""
+
+    enabled: bool | UnsetType = UNSET
+
+
 class LogTable(_Table, kw_only=True):
     """``[log]``: what is written about it."""
 
@@ -157,6 +179,7 @@ class ConfigFile(_Table, kw_only=True):
     discovery: DiscoveryTable = msgspec.field(default_factory=DiscoveryTable)
     bridge: BridgeTable = msgspec.field(default_factory=BridgeTable)
     contract: list[ContractTable] | UnsetType = UNSET
+    peer: list[PeerTable] | UnsetType = UNSET
     services: ServicesTable = msgspec.field(default_factory=ServicesTable)
     service: list[ServiceTable] | UnsetType = UNSET
     params: ParamsTable = msgspec.field(default_factory=ParamsTable)
@@ -164,6 +187,7 @@ class ConfigFile(_Table, kw_only=True):
     time: TimeTable = msgspec.field(default_factory=TimeTable)
     lanes: LanesTable = msgspec.field(default_factory=LanesTable)
     realtime: RealtimeTable = msgspec.field(default_factory=RealtimeTable)
+    relay: RelayTable = msgspec.field(default_factory=RelayTable)
     log: LogTable = msgspec.field(default_factory=LogTable)
 
 
@@ -189,7 +213,12 @@ def known_keys() -> list[Key]:
 
 LISTS: Final = {
     name: tuple(_keys(table))
-    for name, table in (("contract", ContractTable), ("param", ParamTable), ("service", ServiceTable))
+    for name, table in (
+        ("contract", ContractTable),
+        ("param", ParamTable),
+        ("service", ServiceTable),
+        ("peer", PeerTable),
+    )
 }
 """The tables that there may be many of (``[[contract]]``), and the keys that each may have."""
 

@@ -29,6 +29,7 @@ from rmpa.core.config import (
 from rmpa.core.config_contract import ContractRules, read_contracts
 from rmpa.core.config_file import Key, Place, dotted, line_of, parse_config
 from rmpa.core.config_param import problems, read_follow_rules, read_key_glob
+from rmpa.core.config_peer import PeerRules, read_peers
 from rmpa.core.config_service import read_service_glob, read_service_rules, read_timeout
 from rmpa.core.config_values import BadValue, Multicast
 from rmpa.core.errors import ConfigError
@@ -47,6 +48,8 @@ class Flags:
     name: str | None = None
     core_host: str | None = None
     core_port: str | None = None
+    core_mode: str | None = None
+    core_master: str | None = None
     port: str | None = None
     domain: str | None = None
     interfaces: tuple[str, ...] = ()
@@ -86,6 +89,8 @@ _OPTIONS: Final[Mapping[str, _Option]] = {
     "domain": _Option(values.read_domain, ("domain",), "RMPA_DOMAIN", "--domain", "domain"),
     "core_host": _Option(values.read_host, ("core", "host"), "RMPA_CORE_HOST", "--core-host", "core_host"),
     "core_port": _Option(values.read_port, ("core", "port"), "RMPA_CORE_PORT", "--core-port", "core_port"),
+    "core_mode": _Option(values.read_core_mode, ("core", "mode"), "RMPA_CORE", "--core", "core_mode"),
+    "core_master": _Option(values.read_master_uri, ("core", "master"), "RMPA_MASTER", "--master", "core_master"),
     "port": _Option(values.read_port_or_any, ("mesh", "port"), "RMPA_PORT", "--port", "port"),
     "interfaces": _Option(
         _list_of(values.read_interface), ("discovery", "interfaces"), "RMPA_INTERFACES", "--interface", "interfaces"
@@ -99,6 +104,7 @@ _OPTIONS: Final[Mapping[str, _Option]] = {
     "allow_types": _Option(_list_of(values.read_type_glob), ("bridge", "allow_types"), "RMPA_ALLOW_TYPES"),
     "deny_types": _Option(_list_of(values.read_type_glob), ("bridge", "deny_types"), "RMPA_DENY_TYPES"),
     "contracts": _Option(read_contracts, ("contract",)),
+    "peers": _Option(read_peers, ("peer",)),
     "service_allow": _Option(_list_of(read_service_glob), ("services", "allow"), "RMPA_SERVICE_ALLOW"),
     "service_deny": _Option(_list_of(read_service_glob), ("services", "deny"), "RMPA_SERVICE_DENY"),
     "service_loggers": _Option(values.read_bool, ("services", "loggers"), "RMPA_SERVICE_LOGGERS"),
@@ -117,6 +123,7 @@ _OPTIONS: Final[Mapping[str, _Option]] = {
     "realtime_priority": _Option(values.read_realtime_priority, ("realtime", "priority"), "RMPA_REALTIME_PRIORITY"),
     "realtime_cpus": _Option(_list_of(values.read_cpu), ("realtime", "cpus"), "RMPA_REALTIME_CPUS"),
     "lock_memory": _Option(values.read_bool, ("realtime", "lock_memory"), "RMPA_REALTIME_LOCK_MEMORY"),
+    "relay": _Option(values.read_bool, ("relay", "enabled"), "RMPA_RELAY"),
     "log_level": _Option(values.read_level, ("log", "level"), "RMPA_LOG_LEVEL", "--log-level", "log_level"),
     "log_json": _Option(values.read_bool, ("log", "json"), "RMPA_LOG_JSON", "--log-json", "log_json"),
     "runtime_dir": _Option(values.read_text, variable="RMPA_RUNTIME_DIR"),
@@ -194,6 +201,10 @@ def load_settings(
     rules = chosen.pop("contracts", ContractRules())
     assert isinstance(rules, ContractRules)  # noqa: S101 - what its reader returns
     notes += [str(strongest["contracts"].error(doubt.text, "", doubt.at)) for doubt in rules.doubts]
+    peers = chosen.pop("peers", PeerRules())
+    assert isinstance(peers, PeerRules)  # noqa: S101 - what its reader returns
+    notes += [str(strongest["peers"].error(doubt.text, "", doubt.at)) for doubt in peers.doubts]
+    chosen["peers"] = peers.rules
     settings = _assemble(chosen, rules, path)
     if settings.discovery_port > 65535:
         source = strongest["multicast"].source if "multicast" in strongest else "domain"

@@ -46,7 +46,7 @@ CONFIG_FILE_MAX: Final = 256 * KIB
 CONTRACTS_REMEMBERED: Final = 4096
 """(topic, type) pairs whose contract is remembered; the oldest is forgotten first, and found again by the rules."""
 NAMES_REMEMBERED: Final = 256
-"""Peers whose names' rules are remembered: as many as peers have names in a large network; found again by the rules."""
+"""Peers for whom the rules of names are remembered: as many as a large network has; found again by the rules."""
 REMAPS_MAX: Final = 256
 """Rules for names in one direction of a ``[[peer]]``; each is held against each other one."""
 CONTRACT_DEPTH_MAX: Final = 100_000
@@ -476,8 +476,8 @@ PARAM_TRANSFERS: Final = 4
 """Parameters that one peer reads or writes at a time; the one that was begun first gives way."""
 PARAM_TRANSFER_IDLE: Final = 30.0
 """A parameter that is read or written in portions is forgotten when nobody went on for this long."""
-PARAM_CALL_TIMEOUT: Final = 10.0
-"""For one call of the local core about a parameter, megabytes of XML included."""
+PARAM_LEAVE_TIMEOUT: Final = 1.0
+"""For leaving all parameters that the agent was told of, when it ends."""
 PARAM_GATHER: Final = 0.05
 """Changes of a followed parameter are gathered this long: a node that loads twenty keys of a namespace sets each."""
 PARAM_SMALL: Final = 64 * KIB
