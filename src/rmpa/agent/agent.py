@@ -13,10 +13,14 @@ import time
 from typing import TYPE_CHECKING
 
 from rmpa.agent.clocks import Clocks
+from rmpa.agent.core_choice import make_core
 from rmpa.agent.diagnostics import Diagnostics
+from rmpa.agent.params import ParamOps
 from rmpa.agent.station import Station
 from rmpa.agent.view import View
+from rmpa.agent.why import Why
 from rmpa.bridge.aio.bridge import Bridge
+from rmpa.bridge.aio.params import Params
 from rmpa.bridge.policy import Policy
 from rmpa.core import limits
 from rmpa.core.aio import realtime
@@ -31,11 +35,13 @@ from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableErr
 from rmpa.monitor.aio.control_server import ControlServer
 from rmpa.monitor.aio.runtime_dir import runtime_dir
 from rmpa.monitor.snapshot import PingReply, Snapshot
-from rmpa.ros.aio.core import RosCore
 
 if TYPE_CHECKING:
+    from rmpa.bridge.aio.bridge import Attached
     from rmpa.core.config import Settings
     from rmpa.mesh.aio.link import MeshLink
+    from rmpa.ros.aio.core_api import Core
+    from rmpa.monitor.diagnosis import Diagnosis
 
 _log = logging.getLogger(__name__)
 
@@ -53,9 +59,15 @@ class Agent:
         self._control = ControlServer(
             runtime_dir(os.environ, settings.runtime_dir),
             settings.name,
-            {"snapshot": self._snapshot, "ping": self._ping},
+            {
+                "snapshot": self._snapshot,
+                "ping": self._ping,
+                "why": self._why,
+                "param": lambda args: self._param_ops.ask(args),
+                "followed": lambda args: self._param_ops.followed(args),
+            },
         )
-        self.core = RosCore(settings.core_host, settings.core_port)
+        self.core: Core = make_core(settings)
         self.bridge = Bridge(
             self.core, Policy(settings.policy), rng=random.random, contracts=Contracts(settings.contracts)
         )
@@ -74,6 +86,10 @@ class Agent:
             started=time.time(),
             wishes=wishes,
         )
+        self.params = Params(self.core, self.bridge, settings.name, settings.params, settings.time)
+        self.bridge.add(self.params)
+        self._param_ops = ParamOps(self.params, self.bridge.asks, self._attached)
+        self._whys = Why(settings, self.core, self.bridge, self._view)
 
     async def start(self) -> None:
         """Start every part; the network last, so that who finds us finds us ready.
@@ -157,11 +173,18 @@ class Agent:
         host, port = link.remote_endpoint
         return PingReply(times=tuple(times), remote=f"{host}:{port}")
 
+    async def _why(self, args: dict[str, object]) -> tuple[Diagnosis, ...]:
+        return await self._whys.answer(args)
+
     def _link(self, peer: str) -> MeshLink:
-        links = [attached.link for attached in self.bridge.attached()]
+        return self._attached(peer).link
+
+    def _attached(self, peer: str) -> Attached:
+        linked = {attached.link: attached for attached in self.bridge.attached()}
+        links = list(linked)
         fitting = [link for link in links if peer in {link.name, str(link.guid), str(link.guid).partition("#")[0]}]
         if len(fitting) == 1:
-            return fitting[0]
+            return linked[fitting[0]]
         if fitting:
             raise PeerRefused(self._settings.name, f"{len(fitting)} peers are named {peer}", "name one by its GUID")
         near = did_you_mean(peer, [link.name for link in links])

@@ -24,6 +24,9 @@ COMMANDS = {
     "core": ("rmpa.cli.core", "Run the ROS core alone: a drop-in for roscore."),
     "peer": ("rmpa.cli.peer", "See the peers that the agent knows."),
     "topic": ("rmpa.cli.topic", "See topics, listen to them, publish on them."),
+    "why": ("rmpa.cli.why", "Say why a topic of a peer does not arrive, and what to do."),
+    "doctor": ("rmpa.cli.doctor", "Check this machine: network, clock, rights, ROS environment."),
+    "multicast": ("rmpa.cli.multicast", "Send and receive multicast packets by hand."),
     "completion": ("rmpa.cli.completion", "Print the script that completes rmpa's commands in a shell."),
 }
 EPILOG = """\
@@ -33,6 +36,7 @@ Examples:
   rmpa peer list                 who is there
   rmpa topic list                what they have to say
   rmpa topic echo joystick:/cmd  one peer's messages
+  rmpa why joystick:/cmd         why they do not come
 """
 
 

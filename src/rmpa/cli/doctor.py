@@ -1,0 +1,73 @@
+"""``rmpa doctor``: what on this machine would keep modules apart."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from typing import TYPE_CHECKING, Final
+
+import click
+
+from rmpa.cli.options import json_option
+from rmpa.cli.output import coloured, print_json, print_line, printable
+from rmpa.doctor.finding import Level, exit_code
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rmpa.doctor.finding import Finding
+
+_COLOURS: Final = {Level.OK: "green", Level.WARN: "yellow", Level.FAIL: "red", Level.SKIPPED: "cyan"}
+EPILOG = """\
+\b
+Exit codes: 0 nothing fails (there may be warnings); 1 something does.
+
+\b
+Examples:
+  rmpa doctor
+  sudo rmpa doctor                reads the firewall's rules too
+  rmpa doctor --json | jq '.[] | select(.level == "fail")'
+"""
+
+
+@click.command(epilog=EPILOG)
+@click.option("--config", metavar="FILE", help="Settings. [default: ./rmpa.toml, ~/.config/rmpa, /etc/rmpa]")
+@click.option("-q", "--quiet", is_flag=True, help="Only what fails, or may.")
+@json_option
+def doctor(config: str | None, quiet: bool, as_json: bool) -> int:
+    """Check this machine: settings, agents, network, ROS environment, clock and rights.
+
+    It changes nothing. It sends one packet on each interface to the agents' multicast group, which agents pass over,
+    and looks whether it is heard. A firewall on another machine, or a switch between, shows only there: run it on
+    both sides, and `rmpa multicast` between them.
+    """
+    from rmpa.doctor.aio.look import examine, look_at
+
+    found = []
+    for finding in examine(look_at(os.environ, config)):
+        found.append(finding)
+        if not as_json and (not quiet or finding.level in (Level.WARN, Level.FAIL)):
+            for line in _lines(finding):
+                print_line(line)
+    if as_json:
+        print_json([finding for finding in found if not quiet or finding.level in (Level.WARN, Level.FAIL)])
+    else:
+        print_line(_summary(found))
+    return exit_code(found)
+
+
+def _lines(finding: Finding) -> list[str]:
+    mark = f"{finding.level.value:<7}"
+    if coloured():
+        mark = click.style(mark, fg=_COLOURS[finding.level])
+    what = f"{finding.check} {finding.subject}".strip()
+    lines = [f"{mark}  {printable(what)}: {printable(finding.text)}"]
+    if finding.remedy:
+        lines.append(f"{'':<9}{printable(finding.remedy)}")
+    return lines
+
+
+def _summary(found: Sequence[Finding]) -> str:
+    counts = Counter(finding.level for finding in found)
+    words = [f"{counts[level]} {level.value}" for level in Level if counts[level]]
+    return f"{len(found)} answers: {', '.join(words)}"

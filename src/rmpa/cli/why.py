@@ -1,0 +1,87 @@
+"""``rmpa why``: where on its way a topic gets lost."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Final
+
+import click
+
+from rmpa.cli.master import read_topic
+from rmpa.cli.options import agent_option, json_option
+from rmpa.cli.output import coloured, print_json, printable
+from rmpa.core import limits
+from rmpa.monitor.aio.control_client import ControlClient, choose_agent
+from rmpa.monitor.diagnosis import Diagnosis, Stage, Verdict
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_COLOURS: Final = {Verdict.OK: "green", Verdict.WARN: "yellow", Verdict.FAIL: "red", Verdict.UNKNOWN: "yellow"}
+EPILOG = """\
+\b
+Exit codes: 0 it flows; 1 it does not, and the first stage that fails says why.
+
+\b
+Examples:
+  rmpa why joystick:/cmd          why /cmd of joystick does not come here
+  rmpa why /odom                  every way of /odom, in and out
+  rmpa why joystick:/cmd --json | jq '.[].stages[-1]'
+"""
+
+
+@click.command(epilog=EPILOG)
+@click.argument("name", metavar="[PEER:]TOPIC")
+@json_option
+@agent_option
+def why(name: str, as_json: bool, agent: str | None) -> int:
+    """Say why a topic of a peer does not arrive here, and what to do.
+
+    Both agents are asked, stage by stage from the publisher to the reader; what flows is looked at for a second.
+    PEER is a name or a GUID. Without PEER every module that publishes the topic is looked at, and for one of this
+    module's own topics every peer says how it arrives there.
+    """
+    wanted = read_topic(name)
+    with ControlClient(choose_agent(os.environ, agent).path, timeout=limits.CONTROL_HANDLER_TIMEOUT) as client:
+        found = client.call("why", tuple[Diagnosis, ...], name=wanted.topic, peer=wanted.peer)
+    if as_json:
+        print_json(found)
+    else:
+        for number, diagnosis in enumerate(found):
+            if number:
+                click.echo()
+            for line in _lines(diagnosis):
+                click.echo(line)
+    return exit_code(found)
+
+
+def exit_code(diagnoses: Sequence[Diagnosis]) -> int:
+    """0 if something gets through on every way that was meant, else 1."""
+    return 0 if diagnoses and all(diagnosis.flows for diagnosis in diagnoses) else 1
+
+
+def _lines(diagnosis: Diagnosis) -> list[str]:
+    of = f" of {diagnosis.node}" if diagnosis.node else ""
+    way = f" from {diagnosis.peer}" if diagnosis.peer else ""
+    to = f" to {diagnosis.to}" if diagnosis.to else ""
+    lines = [printable(f"{diagnosis.name}{of}{way}{to}:")]
+    width = max((len(stage.name) for stage in diagnosis.stages), default=0)
+    lines += [_line(stage, width) for stage in diagnosis.stages]
+    failed = diagnosis.failed
+    if failed is None:
+        lines.append(_paint("it flows", Verdict.OK))
+    else:
+        lines.append(_paint(printable(f"it stops at: {failed.name}"), Verdict.FAIL))
+        if failed.remedy:
+            lines.append(printable(f"what to do: {failed.remedy}"))
+    return lines
+
+
+def _line(stage: Stage, width: int) -> str:
+    mark = _paint(f"{stage.verdict.value:<7}", stage.verdict)
+    advice = f" ({stage.remedy})" if stage.remedy and stage.verdict is Verdict.WARN else ""
+    return f"  {mark}  {printable(stage.name):<{width}}  {printable(stage.text + advice)}"
+
+
+def _paint(text: str, verdict: Verdict) -> str:
+    return click.style(text, fg=_COLOURS[verdict]) if coloured() else text

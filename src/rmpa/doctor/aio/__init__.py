@@ -1,0 +1,1 @@
+"""Looks at the machine: sockets, files below /proc, other programs."""

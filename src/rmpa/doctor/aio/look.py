@@ -1,0 +1,145 @@
+"""Everything that ``rmpa doctor`` looks at, one group of checks after the other."""
+
+from __future__ import annotations
+
+import socket
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import rmpa
+from rmpa.core import limits
+from rmpa.core.config import Settings
+from rmpa.core.config_sources import Flags, load_settings
+from rmpa.core.errors import ConfigError, RmpaError
+from rmpa.doctor.agents import judge_agents
+from rmpa.doctor.aio import look_machine, look_network
+from rmpa.doctor.aio.programs import resolve
+from rmpa.doctor.finding import Finding, Level
+from rmpa.doctor.machine import judge_clock, judge_rights
+from rmpa.doctor.network import judge_cards, judge_ports, judge_routes, judge_rp_filter
+from rmpa.doctor.ros_environment import Shell, judge_shell, names_of
+from rmpa.monitor.aio.control_client import ControlClient, find_agents
+from rmpa.monitor.snapshot import Snapshot
+from rmpa.ros.environment import host_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+
+@dataclass(frozen=True, slots=True)
+class Patient:
+    """What the checks are about.
+
+    Args:
+        environ: The shell's variables.
+        settings: What an agent that is started here would have; the defaults where they cannot be read.
+        problems: What is wrong with the settings.
+        agents: What each agent of this machine shows, by its name, or why it does not answer.
+    """
+
+    environ: Mapping[str, str]
+    settings: Settings
+    problems: tuple[Finding, ...]
+    agents: Mapping[str, Snapshot | str]
+
+    @property
+    def snapshots(self) -> dict[str, Snapshot]:
+        """Of the agents that answer."""
+        return {name: shown for name, shown in self.agents.items() if isinstance(shown, Snapshot)}
+
+
+def look_at(environ: Mapping[str, str], config: str | None = None) -> Patient:
+    """Read the settings, and ask the agents.
+
+    Args:
+        environ: The shell's variables.
+        config: The settings' file; the usual places by default.
+    """
+    settings, problems = Settings(), []
+    try:
+        loaded = load_settings(Flags(config=config), environ, host_name=socket.gethostname())
+    except ConfigError as error:
+        problems.append(Finding("settings", error.source, Level.FAIL, str(error), "`rmpa up` will not start"))
+    else:
+        settings = loaded.settings
+        where = f"read from {settings.config_file}" if settings.config_file else "no file; defaults and variables"
+        text = f"{where}: name {settings.name}, domain {settings.domain}"
+        problems.append(Finding("settings", "", Level.OK, text))
+        problems += [Finding("settings", "", Level.WARN, note) for note in loaded.notes]
+    agents: dict[str, Snapshot | str] = {}
+    for found in find_agents(environ):
+        try:
+            with ControlClient(found.path) as client:
+                agents[found.name] = client.snapshot()
+        except RmpaError as error:
+            agents[found.name] = str(error)
+    return Patient(environ, settings, tuple(problems), agents)
+
+
+def examine(patient: Patient) -> Iterator[Finding]:
+    """Each finding as soon as it is there; the whole takes some two seconds."""
+    settings, snapshots = patient.settings, patient.snapshots
+    yield from patient.problems
+    yield from judge_agents(patient.agents, rmpa.__version__)
+    cards = look_network.look_at_cards(settings.interfaces)
+    yield from judge_cards(cards, settings.interfaces, container=look_network.in_container())
+    yield from look_network.look_at_multicast(settings)
+    yield from look_network.look_at_firewall(settings)
+    yield from judge_rp_filter(look_network.look_at_rp_filter(), cards)
+    yield from judge_routes(_routes(patient))
+    yield from judge_ports(look_network.look_at_ports(settings, _ports(snapshots)))
+    yield from judge_shell(_shell(patient, {str(n.ip) for card in cards for n in card.networks}))
+    yield from judge_clock(look_machine.look_at_clock())
+    yield from judge_rights(look_machine.look_at_rights(wanted=settings.realtime.enabled))
+
+
+def _routes(patient: Patient) -> dict[str, str]:
+    targets = {
+        address.partition(":")[0]: f"{address.partition(':')[0]} ({peer.name})"
+        for snapshot in patient.snapshots.values()
+        for peer in snapshot.peers
+        for address in peer.addresses[:1]
+    }
+    names = [seed.host for seed in patient.settings.seeds]
+    for seed, addresses in resolve(names).items():
+        targets |= {address: f"{address} (seed {seed})" for address in addresses[:1]}
+    found = {text: look_network.look_at_route(host) for host, text in targets.items()}
+    known = resolve(names)
+    return found | {f"seed {name}": "nobody knows this name" for name in names if not known[name]}
+
+
+def _ports(snapshots: Mapping[str, Snapshot]) -> dict[int, str]:
+    """The ports that agents of this machine have."""
+    found = {}
+    for name, snapshot in snapshots.items():
+        core = snapshot.agent.core_uri.rstrip("/").rpartition(":")[2]
+        mesh = snapshot.agent.guid.partition("#")[0].rpartition(":")[2]
+        for number, what in ((core, "the core of agent"), (mesh, "agent")):
+            if number.isdecimal():
+                found[int(number)] = f"{what} {name}"
+    return found
+
+
+def _shell(patient: Patient, addresses: set[str]) -> Shell:
+    host_name = socket.gethostname()
+    environ = patient.environ
+    resolved = resolve(names_of(environ, host_name))
+    return Shell(
+        environ=environ,
+        host_name=host_name,
+        addresses=frozenset({*addresses, "127.0.0.1"}),
+        resolved=resolved,
+        cores={name: snapshot.agent.core_uri for name, snapshot in patient.snapshots.items()},
+        domains={name: snapshot.agent.domain for name, snapshot in patient.snapshots.items()},
+        answers=_answers(environ.get("ROS_MASTER_URI", "") or "http://localhost:11311"),
+    )
+
+
+def _answers(uri: str) -> bool:
+    """Whether somebody accepts connections where a URI says."""
+    host, port = host_of(uri), uri.rstrip("/").rpartition(":")[2]
+    try:
+        with socket.create_connection((host, int(port)), limits.CONTROL_LOOK_TIMEOUT):
+            return True
+    except (OSError, ValueError, OverflowError):
+        return False

@@ -1,0 +1,164 @@
+"""What ``rmpa why`` is made of: stages with their evidence, and what either side knows of a topic."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+import msgspec
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rmpa.monitor.snapshot import Snapshot
+
+
+class Verdict(StrEnum):
+    """What became of a stage."""
+
+    OK = "ok"
+    WARN = "warn"
+    """It works, though something about it is worth knowing."""
+    FAIL = "fail"
+    """Here it ends."""
+    UNKNOWN = "unknown"
+    """Nobody could tell; the walk goes on."""
+
+
+class Stage(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One stage on the way.
+
+    Attributes:
+        name: What it is about, a word or two.
+        verdict: What became of it.
+        text: The evidence, ready to read.
+        remedy: What to do, where something is to be done.
+    """
+
+    name: str
+    verdict: Verdict
+    text: str
+    remedy: str = ""
+
+
+class Diagnosis(msgspec.Struct, frozen=True, kw_only=True):
+    """One way from a publisher (or server) in one module to those who use it in another.
+
+    Attributes:
+        kind: ``topic`` or ``service``.
+        name: The name in the graph of the module that diagnoses.
+        peer: The module that it comes from.
+        to: The module that it goes to.
+        node: The publisher (server), by its name over there; empty where there is none.
+        flows: Whether it gets through.
+        stages: From the peer to the reader, up to the first that fails.
+    """
+
+    kind: str = "topic"
+    name: str
+    peer: str
+    to: str
+    node: str = ""
+    flows: bool
+    stages: tuple[Stage, ...]
+
+    @property
+    def failed(self) -> Stage | None:
+        """The first stage that fails."""
+        return next((stage for stage in self.stages if stage.verdict is Verdict.FAIL), None)
+
+
+class FarSource(msgspec.Struct, frozen=True, kw_only=True):
+    """One publisher, as its own agent sees it.
+
+    Attributes:
+        node: Its name.
+        type: Its message type; ``*`` where nobody has told it.
+        crosses: Whether policy over there lets it cross to the one that asks.
+        rule: The rule that says so.
+        offered: Whether peers are told of it.
+        route: What goes to the one that asks: empty (nothing), ``opening`` (its publisher has not answered) or
+            ``open``.
+        messages: That the agent has had of it since it connected.
+        dropped: Of these, those given up because a link was too slow.
+    """
+
+    node: str
+    type: str = ""
+    crosses: bool = True
+    rule: str = ""
+    offered: bool = True
+    route: str = ""
+    messages: int = 0
+    dropped: int = 0
+
+
+class FarTopic(msgspec.Struct, frozen=True, kw_only=True):
+    """What the publishing side's agent answers.
+
+    Attributes:
+        sources: Its module's own publishers of the topic.
+        subscribers: Its module's own subscribers.
+        near: A topic over there of nearly this name, or empty.
+    """
+
+    sources: tuple[FarSource, ...] = ()
+    subscribers: tuple[str, ...] = ()
+    near: str = ""
+
+
+class Reader(msgspec.Struct, frozen=True, kw_only=True):
+    """A local subscriber that is connected to a proxy.
+
+    Attributes:
+        number: The proxy's own number for its connection.
+        node: Its name.
+        held: Whether it waits for the header: the route is not open yet.
+        messages: Handed to its connection, dropped ones included.
+        waiting: Bytes that wait for it to read.
+        dropped: Messages given up because it read too slowly.
+    """
+
+    number: int
+    node: str
+    held: bool = False
+    messages: int = 0
+    waiting: int = 0
+    dropped: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Near:
+    """What this side knows of one topic of one peer.
+
+    Args:
+        snapshot: The agent's, of this topic at least.
+        topic: The topic's name here.
+        registered: Nodes of the peer whose proxies are in the local graph as publishers of it.
+        conflict: Nodes of the peer whose type is another one than that of the local publishers.
+        readers: Who is connected to the proxy of each node of the peer.
+        mismatches: Who was refused there or here, ready to read, by node of the peer.
+    """
+
+    snapshot: Snapshot
+    topic: str
+    registered: frozenset[str] = frozenset()
+    conflict: frozenset[str] = frozenset()
+    readers: Mapping[str, tuple[Reader, ...]] = field(default_factory=dict)
+    mismatches: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """Both sides at one moment.
+
+    Args:
+        near: This side.
+        far: What the peer's agent answered; ``None`` if it did not.
+        refusal: Why it did not.
+    """
+
+    near: Near
+    far: FarTopic | None = None
+    refusal: str = ""
