@@ -284,6 +284,26 @@ class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
     notes: tuple[str, ...] = ()
 
 
+class FollowedInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """One parameter of another module that this one follows; a value of the op ``followed``.
+
+    Attributes:
+        key: Its name here.
+        owner: The peer's name.
+        owner_key: Its name over there.
+        state: ``followed``; ``waiting`` for its owner; ``refused``.
+        size: Characters of its value as XML-RPC text; ``None`` where its owner has none, or has not told it.
+        problem: What is wrong, or empty.
+    """
+
+    key: str
+    owner: str
+    owner_key: str
+    state: str
+    size: int | None = None
+    problem: str = ""
+
+
 class PingReply(msgspec.Struct, kw_only=True, frozen=True):
     """The value of the op ``ping``.
 

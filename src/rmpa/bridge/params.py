@@ -1,0 +1,218 @@
+"""Which parameters another module may read, set and follow, and what this one follows: tables without I/O."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.config import FollowRule, ParamSettings, TimeSettings
+from rmpa.core.config_param import SIM_TIME, overlap, untouchable
+from rmpa.core.names import matches
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from rmpa.ros.xmlrpc import XmlRpcValue
+
+_OF_OTHERS: Final = "it is followed from {owner} ([[param]]); ask or set it there"
+
+
+def leaves(key: str, value: XmlRpcValue) -> Iterator[tuple[str, XmlRpcValue]]:
+    """The parameters that a value at a key makes: itself, or each member of a namespace, at any depth."""
+    waiting: list[tuple[str, XmlRpcValue]] = [(key, value)]
+    while waiting:
+        at, part = waiting.pop()
+        if isinstance(part, dict):
+            waiting.extend((f"{at.rstrip('/')}/{name}", member) for name, member in reversed(part.items()))
+        else:
+            yield at, part
+
+
+def key_problem(key: object) -> str:
+    """Why a peer's word is no parameter's name, or empty."""
+    if not isinstance(key, str) or not key.startswith("/"):
+        return f"{str(key)[:100]!r} is not the global name of a parameter"
+    if len(key) > limits.CROSSING_NAME_MAX or key.count("/") > limits.PARAM_DEPTH_MAX:
+        return f"the name of a parameter has {len(key)} characters, or too many namespaces"
+    # Masters take any characters, and parameters have been called joint-1 for long.
+    if "//" in key or not key.isprintable() or any(c.isspace() for c in key):
+        return f"{key[:100]!r} is not a parameter's name"
+    return ""
+
+
+class ParamPolicy:
+    """What peers may do with this module's parameters.
+
+    Args:
+        params: The user's globs, and what this module follows.
+        time: Whether it shares its time.
+    """
+
+    def __init__(self, params: ParamSettings, time: TimeSettings) -> None:
+        self._params = params
+        self._time = time
+
+    @property
+    def all_get(self) -> bool:
+        """Whether peers may read everything."""
+        return "/**" in self._params.remote_get or "**" in self._params.remote_get
+
+    def why_not_get(self, key: str) -> str:
+        """Why peers may not read a parameter, or empty."""
+        if any(matches(glob, key) for glob in self._params.remote_get):
+            return ""
+        return f"{key} may not be read by peers: no glob of params.remote_get fits"
+
+    def why_not_set(self, key: str) -> str:
+        """Why peers may not set or delete a parameter, or empty."""
+        if key == "/":
+            return "the root holds every parameter: name those that you mean"
+        if why := untouchable(key):
+            return f"{key} is never set from another module: {why}"
+        for rule in self._params.follow:
+            if overlap(rule.to, key):
+                return f"{key} cannot be set here: " + _OF_OTHERS.format(owner=f"{rule.owner}:{rule.key}")
+        if any(matches(glob, key) for glob in self._params.remote_set):
+            return ""
+        return f"{key} may not be set by peers: no glob of params.remote_set fits"
+
+    def why_not_follow(self, key: str) -> str:
+        """Why peers may not follow a parameter, or empty."""
+        if key == "/":
+            return "the root holds every parameter: name those that you mean"
+        if overlap(key, SIM_TIME):
+            if self._time.follow:
+                return f"time comes from {self._time.follow} here; follow that one's"
+            return "" if self._time.share else "this module does not share its time; set share = true in its [time]"
+        for rule in self._params.follow:
+            if overlap(rule.to, key):
+                # Whoever follows what is followed could be followed back, and two values would chase each other.
+                return f"{rule.to} is followed from {rule.owner}:{rule.key} here; follow that one"
+        return self.why_not_get(key)
+
+
+def follow_rules(params: ParamSettings, time: TimeSettings) -> tuple[FollowRule, ...]:
+    """All that this module follows, its time included."""
+    return params.follow + ((FollowRule(SIM_TIME, time.follow, SIM_TIME),) if time.follow else ())
+
+
+@dataclass(slots=True)
+class Followed:
+    """One followed parameter.
+
+    Args:
+        rule: What it is.
+        peer: The number of the link that it is followed over; ``None`` while its owner is not linked.
+        last: The same, of the last link: an owner that was restarted has another number.
+        text: The owner's value as XML-RPC text, as it was last told; ``None`` where it has none, or before.
+        known: Whether the owner has said anything yet.
+        had: Whether this run of the owner has had a value; where it never had one, what is here stays.
+        ask: Whether the value has to be asked for: it is larger than a portion.
+        due: Whether the local core has to be looked at, or set.
+        doubted: Whether somebody here has changed it since.
+        problem: What is wrong with it, or empty.
+    """
+
+    rule: FollowRule
+    peer: int | None = None
+    last: int | None = None
+    text: str | None = None
+    known: bool = False
+    had: bool = False
+    ask: bool = False
+    due: bool = False
+    doubted: bool = False
+    problem: str = ""
+
+    @property
+    def state(self) -> str:
+        """In one word, for people: ``followed``, ``waiting`` (for its owner) or ``refused``."""
+        if self.problem:
+            return "refused" if self.peer is not None else "waiting"
+        return "followed" if self.peer is not None and self.known else "waiting"
+
+
+class Following:
+    """Whose parameters are followed over which link: one owner each.
+
+    Args:
+        rules: What is followed.
+    """
+
+    def __init__(self, rules: Iterable[FollowRule] = ()) -> None:
+        self._entries: dict[FollowRule, Followed] = {rule: Followed(rule) for rule in rules}
+
+    def __iter__(self) -> Iterator[Followed]:
+        """All of them, in order."""
+        return iter(self._entries.values())
+
+    def change(self, rules: Iterable[FollowRule]) -> tuple[list[Followed], list[Followed]]:
+        """Follow these from now on; those that stay are not touched.
+
+        Returns:
+            Those that are not followed any more, and the new ones.
+        """
+        before = self._entries
+        self._entries = {rule: before.get(rule) or Followed(rule) for rule in rules}
+        gone = [entry for rule, entry in before.items() if rule not in self._entries]
+        return gone, [entry for rule, entry in self._entries.items() if rule not in before]
+
+    def linked(self, peer: int, name: str) -> tuple[list[Followed], list[Followed]]:
+        """A peer of this name has a link.
+
+        Returns:
+            Those that are followed over it now, and those that another peer of the same name owns already.
+        """
+        mine, others = [], []
+        for entry in self._entries.values():
+            if entry.rule.owner != name:
+                continue
+            if entry.peer in (None, peer):
+                entry.peer, entry.problem = peer, ""
+                entry.had = entry.had and entry.last == peer
+                entry.last = peer
+                mine.append(entry)
+            else:
+                others.append(entry)
+        return mine, others
+
+    def unlinked(self, peer: int) -> list[Followed]:
+        """A link is gone: the values stay as they are.
+
+        Returns:
+            Those that it concerns: another peer of the name may own them now.
+        """
+        gone = [entry for entry in self._entries.values() if entry.peer == peer]
+        for entry in gone:
+            entry.peer, entry.ask, entry.problem = None, False, ""
+        return gone
+
+    def told(self, peer: int, key: str, *, exists: bool, text: str | None) -> list[Followed]:
+        """The owner's value is this, or has to be asked for (``exists`` without a text)."""
+        found = [entry for entry in self._entries.values() if entry.peer == peer and entry.rule.key == key]
+        for entry in found:
+            if exists and text is None:
+                entry.ask = True
+            else:
+                learn(entry, text if exists else None)
+        return found
+
+    def touched(self, key: str) -> list[Followed]:
+        """Somebody here has changed a parameter: those that it may concern."""
+        return [entry for entry in self._entries.values() if overlap(entry.rule.to, key)]
+
+    @property
+    def size(self) -> int:
+        """Characters remembered of all of them."""
+        return sum(len(entry.text or "") for entry in self._entries.values())
+
+
+def learn(entry: Followed, text: str | None) -> None:
+    """Take the owner's value, or that it has none (``None``): from the beginning on, that leaves what is here."""
+    entry.ask = False
+    entry.known = True
+    if text is not None:
+        entry.had = True
+    entry.due = text is not None or entry.had
+    entry.text = text
