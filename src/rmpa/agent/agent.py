@@ -34,14 +34,14 @@ from rmpa.core.counters import Counters
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
 from rmpa.monitor.aio.control_server import ControlServer
 from rmpa.monitor.aio.runtime_dir import runtime_dir
-from rmpa.monitor.snapshot import PingReply, Snapshot
+from rmpa.monitor.snapshot import FollowedInfo, PingReply, Snapshot
 
 if TYPE_CHECKING:
     from rmpa.bridge.aio.bridge import Attached
     from rmpa.core.config import Settings
     from rmpa.mesh.aio.link import MeshLink
-    from rmpa.ros.aio.core_api import Core
     from rmpa.monitor.diagnosis import Diagnosis
+    from rmpa.ros.aio.core_api import Core
 
 _log = logging.getLogger(__name__)
 
@@ -63,8 +63,8 @@ class Agent:
                 "snapshot": self._snapshot,
                 "ping": self._ping,
                 "why": self._why,
-                "param": lambda args: self._param_ops.ask(args),
-                "followed": lambda args: self._param_ops.followed(args),
+                "param": self._param,
+                "followed": self._followed,
             },
         )
         self.core: Core = make_core(settings)
@@ -175,6 +175,12 @@ class Agent:
 
     async def _why(self, args: dict[str, object]) -> tuple[Diagnosis, ...]:
         return await self._whys.answer(args)
+
+    async def _param(self, args: dict[str, object]) -> object:
+        return await self._param_ops.ask(args)
+
+    def _followed(self, args: dict[str, object]) -> tuple[FollowedInfo, ...]:
+        return self._param_ops.followed(args)
 
     def _link(self, peer: str) -> MeshLink:
         return self._attached(peer).link

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.aio.bridge import Attached, Bridge
     from rmpa.core.config import Settings
     from rmpa.monitor.snapshot import PeerInfo
-    from rmpa.ros.aio.core import RosCore
+    from rmpa.ros.aio.core_api import Core
 
 _T = TypeVar("_T")
 TOPIC: Final = "why.topic"
@@ -42,7 +42,7 @@ class Why:
         view: Its snapshots.
     """
 
-    def __init__(self, settings: Settings, core: RosCore, bridge: Bridge, view: View) -> None:
+    def __init__(self, settings: Settings, core: Core, bridge: Bridge, view: View) -> None:
         self._core = core
         self._bridge = bridge
         self._view = view

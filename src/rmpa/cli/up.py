@@ -27,6 +27,7 @@ Examples:
   rmpa up --name base --interface wlan0   on one interface only
   rmpa up --seed 10.8.0.5:40001           greet an agent that multicast does not reach
   rmpa up --name b2 --core-port 11312     a second agent on this machine
+  rmpa up --core external                 join the graph of a roscore that runs already
   rmpa up --realtime                      punctual on a busy machine; the log says what was not granted
 """
 
@@ -37,6 +38,13 @@ Examples:
 @click.option(
     "--core-host", metavar="HOST", help="The address it listens at. [default: 127.0.0.1, this machine only]"
 )
+@click.option(
+    "--core",
+    "core_mode",
+    metavar="MODE",
+    help="embedded: run the ROS core; external: use the roscore of ROS_MASTER_URI. [default: embedded]",
+)
+@click.option("--master", "core_master", metavar="URI", help="The external core, if not ROS_MASTER_URI's.")
 @click.option("--port", metavar="PORT", help="The mesh's port, TCP and UDP. [default: 0, any]")
 @click.option("--domain", metavar="N", help="Only agents of one domain join, 0 to 232. [default: 0]")
 @click.option("--interface", "interfaces", metavar="NAME", multiple=True, help="Use only this interface; repeatable.")
@@ -56,6 +64,8 @@ def up(
     name: str | None,
     core_port: str | None,
     core_host: str | None,
+    core_mode: str | None,
+    core_master: str | None,
     port: str | None,
     domain: str | None,
     interfaces: tuple[str, ...],
@@ -71,6 +81,8 @@ def up(
         name,
         core_host,
         core_port,
+        core_mode,
+        core_master,
         port,
         domain,
         interfaces,

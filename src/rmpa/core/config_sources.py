@@ -192,10 +192,9 @@ def load_settings(
     file_layer = _file_layer(path) if path is not None else {}
     for name, given in file_layer.items():
         given.read(_OPTIONS[name])  # a mistake in the file is told even where a flag outweighs it
-    layers = [_ros_layer(environ, host_name, notes), file_layer, _variable_layer(environ, notes), _flag_layer(flags)]
-    strongest: _Layer = {}
-    for layer in layers:
-        strongest |= layer
+    said = file_layer | _variable_layer(environ, notes) | _flag_layer(flags)
+    external = "core_mode" in said and said["core_mode"].read(_OPTIONS["core_mode"]) == "external"
+    strongest = _ros_layer(environ, host_name, notes, external=external) | said
     chosen = {name: given.read(_OPTIONS[name]) for name, given in strongest.items()}
     chosen.setdefault("name", peer_name_from(host_name))
     rules = chosen.pop("contracts", ContractRules())
@@ -206,6 +205,7 @@ def load_settings(
     notes += [str(strongest["peers"].error(doubt.text, "", doubt.at)) for doubt in peers.doubts]
     chosen["peers"] = peers.rules
     settings = _assemble(chosen, rules, path)
+    _check_core(strongest, notes, external=external)
     if settings.discovery_port > 65535:
         source = strongest["multicast"].source if "multicast" in strongest else "domain"
         problem = f"port {settings.group_port} plus domain {settings.domain} is beyond 65535"
@@ -335,7 +335,17 @@ def _flag_layer(flags: Flags) -> _Layer:
     return layer
 
 
-def _ros_layer(environ: Mapping[str, str], host_name: str, notes: list[str]) -> _Layer:
+def _check_core(strongest: _Layer, notes: list[str], *, external: bool) -> None:
+    """Settings of the one kind of core say nothing about the other."""
+    if not external and "core_master" in strongest:
+        raise strongest["core_master"].error(
+            "is of no use with the embedded core", "say also that the core is external (--core external)", ()
+        )
+    useless = [strongest[name] for name in ("core_host", "core_port") if external and name in strongest]
+    notes += [str(given.error("is of no use with an external core", "", ())) for given in useless]
+
+
+def _ros_layer(environ: Mapping[str, str], host_name: str, notes: list[str], *, external: bool) -> _Layer:
     layer: _Layer = {}
     if environ.get("ROS_DOMAIN_ID"):
         layer["domain"] = _Given(environ["ROS_DOMAIN_ID"], "ROS_DOMAIN_ID")
@@ -355,7 +365,9 @@ def _ros_layer(environ: Mapping[str, str], host_name: str, notes: list[str]) -> 
     elif static:
         layer["seeds"] = _Given([p.strip() for p in static.split(";") if p.strip()], "ROS_STATIC_PEERS")
     uri = environ.get("ROS_MASTER_URI", "")
-    if uri:
+    if uri and external:
+        layer["core_master"] = _Given(uri, "ROS_MASTER_URI")
+    elif uri:
         port = _local_master_port(uri, environ, host_name, notes)
         if port is not None:
             layer["core_port"] = _Given(port, "ROS_MASTER_URI")

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 
 LOG_LEVELS: Final = ("debug", "info", "warning", "error")
+CORE_MODES: Final = ("embedded", "external")
+_MASTER: Final = re.compile(r"http://(?P<host>[^\s/:\[\]]+):(?P<port>[0-9]{1,5})/?")
 _HOST: Final = re.compile(r"(?=.{1,253}\Z)[A-Za-z0-9_](?:[A-Za-z0-9_.-]*[A-Za-z0-9_])?")
 _NUMERIC: Final = re.compile(r"[0-9.]+")
 _TOPIC_GLOB: Final = re.compile(r"[A-Za-z0-9_/*?]+")
@@ -151,6 +153,27 @@ def read_level(raw: object) -> str:
     if text not in LOG_LEVELS:
         remedy = f"the levels are {', '.join(LOG_LEVELS)}"
         raise BadValue(f"{raw!r} is not a log level", remedy, did_you_mean(text, LOG_LEVELS))
+    return text
+
+
+def read_core_mode(raw: object) -> str:
+    """Which ROS core the agent works with."""
+    text = str(raw).strip().lower()
+    if text not in CORE_MODES:
+        remedy = "embedded: the agent's own; external: a roscore that runs already"
+        raise BadValue(f"{raw!r} is not a kind of core", remedy, did_you_mean(text, CORE_MODES))
+    return text
+
+
+def read_master_uri(raw: object) -> str:
+    """The URI of a ROS master."""
+    text = read_text(raw).strip()
+    match = _MASTER.fullmatch(text)
+    if match is None:
+        better = f"http://{text.rstrip('/')}/" if _MASTER.fullmatch(f"http://{text}") else None
+        raise BadValue(f"{raw!r} is not a master's URI", "one looks like http://localhost:11311/", better)
+    read_host(match["host"])
+    read_port(match["port"])
     return text
 
 

@@ -1,0 +1,36 @@
+"""Which ROS core an agent works with: its own, or a roscore that runs already."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+from rmpa.bridge.policy import OWN_NODE
+from rmpa.ros.aio.core import RosCore
+from rmpa.ros.aio.external_core import ExternalCore
+from rmpa.ros.aio.local_addresses import local_addresses
+from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback
+
+if TYPE_CHECKING:
+    from rmpa.core.config import Settings
+    from rmpa.ros.aio.core_api import Core
+
+
+def make_core(settings: Settings) -> Core:
+    """The core that the settings ask for, not started.
+
+    Raises:
+        ConfigError: A ROS variable cannot be used.
+    """
+    if settings.core_mode == "embedded":
+        return RosCore(settings.core_host, settings.core_port)
+    uri = settings.core_master or DEFAULT_MASTER_URI
+    # The proxies are nodes like any other: where nobody asked for an address and the master is on this machine, so
+    # are they. A graph over several machines has its master at an address of the network.
+    variables = {name: os.environ.get(name, "") for name in ("ROS_HOSTNAME", "ROS_IP")}
+    environment = RosEnvironment.read(variables, (), local_addresses())
+    address = environment.host
+    if not environment.host_given and is_loopback(host_of(uri)):
+        address = "127.0.0.1"
+    host = "127.0.0.1" if is_loopback(address) else "0.0.0.0"  # noqa: S104 - as every node of such a graph does
+    return ExternalCore(uri, own_node=OWN_NODE, node_host=host, node_address=address)
