@@ -208,17 +208,36 @@ def md5sum(name: str, known: Mapping[str, Specification]) -> str:
     return _md5sum(name, known, {})
 
 
+def service_md5sum(request: str, response: str, known: Mapping[str, Specification]) -> str:
+    """The MD5 sum that ROS knows a service by, from the types of its request and its response.
+
+    Raises:
+        DefinitionError: As for ``md5sum``.
+    """
+    text = ""
+    for name in (request, response):
+        _walk(name, known)
+        text += _md5_text(name, known, {})
+    return _hash(text)
+
+
 def _md5sum(name: str, known: Mapping[str, Specification], sums: dict[str, str]) -> str:
     if name not in sums:
-        lines = list(known[name].constants)
-        lines += [
-            f"{field if field.primitive else _md5sum(field.type, known, sums)} {field.name}"
-            for field in known[name].fields
-        ]
-        sums[name] = hashlib.md5(
-            "\n".join(lines).strip().encode(errors="surrogateescape"), usedforsecurity=False
-        ).hexdigest()
+        sums[name] = _hash(_md5_text(name, known, sums))
     return sums[name]
+
+
+def _md5_text(name: str, known: Mapping[str, Specification], sums: dict[str, str]) -> str:
+    lines = list(known[name].constants)
+    lines += [
+        f"{field if field.primitive else _md5sum(field.type, known, sums)} {field.name}"
+        for field in known[name].fields
+    ]
+    return "\n".join(lines).strip()
+
+
+def _hash(text: str) -> str:
+    return hashlib.md5(text.encode(errors="surrogateescape"), usedforsecurity=False).hexdigest()
 
 
 def full_text(name: str, known: Mapping[str, Specification]) -> str:

@@ -147,7 +147,10 @@ class MessageType:
 
     @functools.cached_property
     def _store(self) -> Typestore:
-        return _learnt_store(self.name, self._specifications) if self._learnt else _known_store()
+        # rosbags brings most of the types that come with us; TFMessage is one that it does not.
+        if self._learnt or _inner(self.name) not in _known_store().types:
+            return _learnt_store(self.name, self._specifications)
+        return _known_store()
 
     def _class(self, name: str) -> Any:
         return self._store.types[_inner(name)]
