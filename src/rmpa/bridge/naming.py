@@ -1,4 +1,4 @@
-"""How the names of a peer's graph read in ours, and how ours read in theirs: pure functions of the ``[[peer]]`` rules.
+"""How the names of a peer's graph read in ours, and ours in theirs: pure functions of the ``[[peer]]`` rules.
 
 *Wire* names are those that cross: topics and services as the module has them that publishes or provides them. ::
 
@@ -15,15 +15,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
+from rmpa.core.config_peer import PEER
 from rmpa.core.names import matches
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from rmpa.core.config import PeerRule, Remap
-
-PEER: Final = "{peer}"
-"""Stands for the peer's name in a rule."""
 
 
 class PeerNames:
