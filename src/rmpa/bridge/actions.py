@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rmpa.bridge.messages import Description, Message, Source
+    from rmpa.bridge.messages import Description, Message, Origin, Source
     from rmpa.core.contract import Contract
 
 
@@ -92,12 +92,14 @@ class Publish:
         source: Which, by the name that its peer has for it.
         type: Its message type.
         topic: What it is called here; empty: the same.
+        origin: Whose it is, if its peer only passes it on.
     """
 
     peer: int
     source: Source
     type: str
     topic: str = ""
+    origin: Origin | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,21 +41,24 @@ from rmpa.bridge.messages import (
     is_crossing_type,
 )
 from rmpa.bridge.naming import Names, PeerNames
+from rmpa.bridge.relay import may_have
 from rmpa.core import limits
 from rmpa.core.contract import Contract, Contracts, Durability, Reliability, combine
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
+    from rmpa.bridge.messages import Origin
     from rmpa.bridge.policy import Policy
 
 
 @dataclass(frozen=True, slots=True)
 class LocalSource:
-    """A source of the local graph: its message type and its node's slave API."""
+    """A source of the local graph: its message type, its node's slave API, and whose it is if we relay it."""
 
     type: str
     uri: str
+    origin: Origin | None = None
 
 
 @dataclass(slots=True)
@@ -122,6 +125,7 @@ class _Peer:
         behind: Sources whose wire name another one has, by that name.
         routes: What it has open.
         beginning: Whether it has not heard everything once yet.
+        instance: The peer's run.
     """
 
     name: str
@@ -133,6 +137,7 @@ class _Peer:
     behind: dict[Source, list[Source]] = field(default_factory=dict)
     routes: dict[int, Source] = field(default_factory=dict)
     beginning: bool = True
+    instance: str = ""
 
 
 _NOTHING: Final = _Topic({})
@@ -175,7 +180,7 @@ class Exports:
         if known is None:
             return None
         source = known.by_wire.get(wire)
-        if source is None and not known.ruled and wire in self._local:
+        if source is None and not known.ruled and wire in self._local and self._offer(known, wire) is not None:
             return wire  # it is about to be told
         return source if source in self._local else None
 
@@ -234,9 +239,7 @@ class Exports:
         if before.seen == publishers and (before.rules == self._rules or not publishers):
             return []
         crossing = {
-            source: local
-            for node, local in publishers.items()
-            if self._crosses(source := Source(topic, node), local.type)
+            source: local for node, local in publishers.items() if self._crosses(source := Source(topic, node), local)
         }
         if publishers:
             self._topics[topic] = _Topic(publishers, crossing, self._rules)
@@ -250,12 +253,13 @@ class Exports:
             actions += self._came(source, local)
         return actions
 
-    def _crosses(self, source: Source, type_name: str) -> bool:
+    def _crosses(self, source: Source, local: LocalSource) -> bool:
+        node = source.node if local.origin is None else local.origin.node
         return (
-            is_crossing_type(type_name)
+            is_crossing_type(local.type)
             and is_crossing_name(source.topic)
             and is_crossing_name(source.node)
-            and self._policy.judge(source.topic, type_name, source.node).allowed
+            and self._policy.judge(source.topic, local.type, node).allowed
         )
 
     def _came(self, source: Source, local: LocalSource) -> list[Action]:
@@ -267,7 +271,7 @@ class Exports:
             return [Warn("sources.too_many", "local", text)]
         self._too_many.pop(source, None)
         self._local[source] = local
-        if before is None or before.type != local.type:
+        if before is None or (before.type, before.origin) != (local.type, local.origin):
             self._note(source)
         # A new address is nobody's business but ours.
         flow = self._flows.get(source)
@@ -332,23 +336,27 @@ class Exports:
         local = self._local.get(source)
         if local is None:
             return None
+        if local.origin is not None and not may_have(peer.instance, local.origin):
+            return None
         if not peer.ruled:
-            return Offer(source.topic, source.node, local.type)
+            return Offer(source.topic, source.node, local.type, local.origin)
         wire = peer.names.wire_name(source.topic, local.type)
         if not is_crossing_name(wire):
             return None
         if not self._policy.judge_for(peer.name, source.topic, local.type, wire).allowed:
             return None
-        return Offer(wire, source.node, local.type)
+        return Offer(wire, source.node, local.type, local.origin)
 
-    def link_up(self, peer: int, name: str = "") -> list[Action]:
+    def link_up(self, peer: int, name: str = "", instance: str = "") -> list[Action]:
         """A link is up: begin to tell all we have; ``tell`` goes on with it.
 
         Args:
             peer: Whose.
             name: The peer's name, which its rules go by.
+            instance: Its run, as 32 hexadecimal digits; nothing that came from there is relayed back to it.
         """
-        self._peers[peer] = new = _Peer(name, *self._rules_of(name), dict.fromkeys(self._local))
+        new = _Peer(name, *self._rules_of(name), dict.fromkeys(self._local), instance=instance)
+        self._peers[peer] = new
         message, actions = self._next(peer, new, full=True)
         return [*actions, Send(peer, message)]
 

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge.actions import Action, Describe, Detach, Publish, Retract, Send, Warn
 from rmpa.bridge.messages import Advertise, Close, Closed, Mismatch, Offer, Open, Opened, Source, is_crossing_name
 from rmpa.bridge.naming import Names, PeerNames
+from rmpa.bridge.relay import Linked, Ways
 from rmpa.core import limits
 from rmpa.core.backoff import Backoff
 from rmpa.core.contract import Contract, Contracts, Reliability
@@ -35,7 +36,7 @@ from rmpa.core.errors import LocalProtocolError
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping
 
-    from rmpa.bridge.messages import Description
+    from rmpa.bridge.messages import Description, Origin
     from rmpa.bridge.policy import Policy
 
 
@@ -84,6 +85,7 @@ class Import:
         contract: What holds for its route, once it was open.
         asked: What was last asked for.
         serial: Of the timer.
+        origin: Whose it is, if its peer only passes it on.
     """
 
     type: str
@@ -101,6 +103,7 @@ class Import:
     contract: Contract | None = None
     asked: Contract | None = None
     serial: int = 0
+    origin: Origin | None = None
 
 
 def _nothing(_peer: int, _source: Source) -> None:
@@ -127,6 +130,7 @@ class _Peer:
         away: Whether it has no link, and may come back.
         silent: Whether its link fell silent before, for nobody closed it.
         doubtful: What it offered over its last link and has not offered again since.
+        relayed: What it only passes on, by the instance of the module whose it is (dicts, for their order).
     """
 
     name: str
@@ -140,6 +144,7 @@ class _Peer:
     away: bool = False
     silent: bool = False
     doubtful: set[Source] = field(default_factory=set)
+    relayed: dict[str, dict[Source, None]] = field(default_factory=dict)
 
 
 class Imports:
@@ -167,6 +172,8 @@ class Imports:
         self._contracts = contracts if contracts is not None else Contracts()
         self._position = position
         self._peers: dict[int, _Peer] = {}
+        self.ways = Ways()
+        """By which of its ways each module is reached that relays offer."""
         self._local_types: dict[str, str] = {}
         # (when, serial, peer, source); what no longer is an entry's timer is passed over.
         self._timers: list[tuple[float, int, int, Source]] = []
@@ -185,6 +192,10 @@ class Imports:
     def knows(self, source: Source) -> bool:
         """Whether any peer offers a source."""
         return any(source in known.sources for known in self._peers.values())
+
+    def at(self, topic: str) -> Iterator[tuple[int, Source]]:
+        """What peers offer for a topic, by its name here: each source with its peer."""
+        return ((peer, source) for peer, known in self._peers.items() for source in known.topics.get(topic, ()))
 
     def offered_by(self, peer: int) -> Collection[str]:
         """The topics that a peer offers, as they are here."""
@@ -205,10 +216,12 @@ class Imports:
         for peer, known in self._peers.items():
             for source in known.topics.get(topic, ()):
                 entry = known.sources[source]
-                shown = entry.shown
+                shown, conflict = entry.shown, entry.conflict
                 actions += self._show_or_hide(peer, source, entry)
                 if shown and not entry.shown:
                     actions += self._report_conflict(peer, source, entry)
+                elif conflict and not entry.conflict:
+                    actions.append(Send(peer, Mismatch(source.topic, source.node, "", "")))
         return actions
 
     def rules(self, policy: Policy, contracts: Contracts, names: Names, now: float) -> Iterator[list[Action]]:
@@ -228,7 +241,7 @@ class Imports:
             return []
         known = self._peers[peer]
         actions: list[Action] = []
-        topic = known.names.local_name(source.topic, entry.type)
+        topic = self._names_of(known, entry.origin).local_name(source.topic, entry.type)
         if topic != entry.topic:
             actions += self._hide(peer, source, entry) if entry.shown else []
             self._unlist(known, source, entry)
@@ -240,18 +253,19 @@ class Imports:
             actions += self._open(peer, source, entry, now) if entry.wanted else []
         return actions
 
-    def link_up(self, peer: int, name: str = "") -> list[Action]:
+    def link_up(self, peer: int, name: str = "", who: Linked | None = None) -> list[Action]:
         """A link is up, perhaps of a peer that was away; its first message begins a full advertisement.
 
         Args:
             peer: Whose.
             name: The peer's name, which its rules go by.
+            who: Whose link it is: what relays offer of that module is not needed any more.
         """
         known = self._peers.setdefault(peer, _Peer(name, self._names.of(name)))
         known.away = known.silent = False
         known.routes = {}
         known.next_route = 1
-        return []
+        return self._ways_changed(self.ways.linked(peer, who)) if who is not None else []
 
     def link_away(self, peer: int, *, briefly: bool = False) -> tuple[list[Action], bool]:
         """A link is gone, but its peer may come back: what does not need a reliable route leaves the local graph.
@@ -310,6 +324,30 @@ class Imports:
         """
         known = self._peers.pop(peer, None)
         return _gone(peer, known.sources) if known is not None else iter(())
+
+    def unlinked(self, peer: int) -> list[Action]:
+        """Behind ``link_down``: what relays offer of the peer is needed now; what it offered, others may offer too."""
+        return self._ways_changed(self.ways.unlinked(peer))
+
+    def _ways_changed(self, instances: Collection[str]) -> list[Action]:
+        """Some modules may be reached another way: what leaves does so first, for the names of the nodes stay."""
+        touched = [
+            (not entry.shown, peer, source)
+            for instance in instances
+            for peer, known in self._peers.items()
+            for source in known.relayed.get(instance, ())
+            if (entry := known.sources.get(source)) is not None
+        ]
+        return [
+            action
+            for _, peer, source in sorted(touched)
+            if (entry := self.get(peer, source)) is not None
+            for action in self._show_or_hide(peer, source, entry)
+        ]
+
+    def _names_of(self, known: _Peer, origin: Origin | None) -> PeerNames:
+        """The rules that a source's name goes by: those for its own module, not for who passes it on."""
+        return known.names if origin is None else self._names.of(origin.name)
 
     def portions(self, peer: int, message: Advertise) -> Iterator[Advertise]:
         """The same as an advertisement says, in portions that ``advertised`` deals with in a moment."""
@@ -429,7 +467,7 @@ class Imports:
         actions: list[Action] = []
         if source in known:
             entry = known[source]
-            if entry.type == offer.type:
+            if (entry.type, entry.origin) == (offer.type, offer.origin):
                 # It was offered over a link before this one: ask again for what that took away.
                 waits = entry.state is RouteState.WAITING and entry.timer is None
                 return self._open(peer, source, entry, now) if waits else []
@@ -450,9 +488,13 @@ class Imports:
             ]
         nodes[source.node] += 1
         backoff = Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng)
-        topic = self._peers[peer].names.local_name(source.topic, offer.type)
-        entry = known[source] = Import(offer.type, topic, backoff)
+        topic = self._names_of(self._peers[peer], offer.origin).local_name(source.topic, offer.type)
+        entry = known[source] = Import(offer.type, topic, backoff, origin=offer.origin)
         self._peers[peer].topics.setdefault(topic, {})[source] = None
+        if offer.origin is not None:
+            self._peers[peer].relayed.setdefault(offer.origin.instance, {})[source] = None
+            if self.ways.learn(peer, offer.origin):
+                actions += self._ways_changed({offer.origin.instance})
         actions += self._show_or_hide(peer, source, entry)
         return actions + self._report_conflict(peer, source, entry)
 
@@ -464,7 +506,8 @@ class Imports:
             return self._hide(peer, source, entry)
         entry.shown = True
         self._peers[peer].places[entry.topic, source.node] = source
-        return [Publish(peer, source, entry.type, entry.topic if entry.topic != source.topic else "")]
+        topic = entry.topic if entry.topic != source.topic else ""
+        return [Publish(peer, source, entry.type, topic, entry.origin)]
 
     def _hide(self, peer: int, source: Source, entry: Import) -> list[Action]:
         entry.shown = False
@@ -475,7 +518,7 @@ class Imports:
         """A source has left the local graph: another one may have stood behind it."""
         known = self._peers[peer]
         del known.places[entry.topic, source.node]
-        if known.names.plain:
+        if self._names_of(known, entry.origin).plain:
             return []
         behind = [s for s in known.topics.get(entry.topic, ()) if s.node == source.node and s != source]
         return [action for s in behind for action in self._show_or_hide(peer, s, known.sources[s])]
@@ -497,9 +540,13 @@ class Imports:
 
     def _why_hidden(self, peer: int, source: Source, entry: Import) -> tuple[str, bool]:
         known, topic, type_name = self._peers[peer], entry.topic, entry.type
-        decision = self._policy.judge(topic, type_name, source.node)
-        if decision.allowed:
-            decision = self._policy.judge_for(known.name, topic, type_name, source.topic)
+        origin = entry.origin
+        if origin is not None and (why := self.ways.why_not(peer, origin)):
+            return why, False
+        decision = self._policy.judge(topic, type_name, source.node if origin is None else origin.node)
+        for name in (known.name,) if origin is None else (known.name, origin.name):
+            if decision.allowed:
+                decision = self._policy.judge_for(name, topic, type_name, source.topic)
         if not decision.allowed:
             return decision.rule, False
         if not is_crossing_name(topic):
@@ -529,6 +576,13 @@ class Imports:
         known.nodes[source.node] -= 1
         if not known.nodes[source.node]:
             del known.nodes[source.node]
+        if entry.origin is not None:
+            instance = entry.origin.instance
+            del known.relayed[instance][source]
+            if not known.relayed[instance]:
+                del known.relayed[instance]
+            if self.ways.forget(peer, entry.origin):
+                actions += self._ways_changed({instance})
         return actions
 
     def _move(self, peer: int, source: Source, entry: Import, state: RouteState, timer: float | None = None) -> None:
@@ -588,9 +642,10 @@ def _outlives(entry: Import, *, silent: bool) -> bool:
     """Whether an entry stays when its peer's link is gone.
 
     A reliable one does, so that nothing is lost. A latched one does if the link fell silent: its subscribers stay
-    connected, and are not told again what they know when the peer is back; late ones are told meanwhile.
+    connected, and are not told again what they know when the peer is back; late ones are told meanwhile. One that is
+    relayed does not: another relay may bring it on.
     """
-    if not entry.wanted or entry.state not in _LISTENED:
+    if not entry.wanted or entry.origin is not None or entry.state not in _LISTENED:
         return False
     if silent and entry.description is not None and entry.description.latching:
         return True
