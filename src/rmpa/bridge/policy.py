@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
+from rmpa.core import limits
+from rmpa.core.config_peer import PEER
 from rmpa.core.names import NEVER_CROSSING, matches
 
 if TYPE_CHECKING:
@@ -41,6 +43,7 @@ class Policy:
     def __init__(self, settings: PolicySettings, peers: tuple[PeerRule, ...] = ()) -> None:
         self._settings = settings
         self._peers = peers
+        self._known: dict[str, list[tuple[str, PolicySettings]]] = {}
 
     def judge(self, topic: str, type_name: str, node: str) -> Decision:
         """Decide about one source; the first "no" wins, in the order of the table below."""
@@ -52,7 +55,20 @@ class Policy:
 
     def has_rules_for(self, peer: str) -> bool:
         """Whether ``judge_for`` has anything to say about a peer."""
-        return any(matches(rule.name, peer) for rule in self._peers)
+        return bool(self._rules_for(peer))
+
+    def _rules_for(self, peer: str) -> list[tuple[str, PolicySettings]]:
+        """What is said about a peer: its place in the file, to show, and the globs with its name filled in."""
+        known = self._known.get(peer)
+        if known is None:
+            if len(self._known) >= limits.NAMES_REMEMBERED:
+                self._known.clear()
+            known = self._known[peer] = [
+                (f'peer "{rule.name}"', _filled(rule.policy, peer))
+                for rule in self._peers
+                if matches(rule.name, peer)
+            ]
+        return known
 
     def judge_for(self, peer: str, name: str, type_name: str | None = None, wire: str = "") -> Decision:
         """Decide whether what ``judge`` lets cross may do so between us and one peer.
@@ -66,17 +82,21 @@ class Policy:
         decision = Decision(True, "")
         if wire and wire != name and (why := never_crosses(wire)):
             return Decision(False, f"built in: {why} (it is {wire} there)")
-        for rule in self._peers:
-            if matches(rule.name, peer):
-                decision = _judge(rule.policy, f'peer "{rule.name}"', name, type_name)
-                if not decision.allowed:
-                    return decision
+        for where, settings in self._rules_for(peer):
+            decision = _judge(settings, where, name, type_name)
+            if not decision.allowed:
+                return decision
         return decision
 
 
 def never_crosses(topic: str) -> str:
     """Why a topic never crosses, or empty."""
     return next((why for pattern, why in BUILT_IN_DENY.items() if matches(pattern, topic)), "")
+
+
+def _filled(settings: PolicySettings, peer: str) -> PolicySettings:
+    allow, deny = (tuple(glob.replace(PEER, peer) for glob in globs) for globs in (settings.allow, settings.deny))
+    return replace(settings, allow=allow, deny=deny)
 
 
 def _judge(settings: PolicySettings, where: str, name: str, type_name: str | None) -> Decision:

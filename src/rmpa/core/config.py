@@ -66,7 +66,7 @@ class PeerRule:
         prefix: What is put in front of their names here, and taken from ours there; ``{peer}`` is the peer's name.
         remap_in: Their names (before) and what they are here (after); the first that fits.
         remap_out: Our names (before) and what they are there (after).
-        policy: What may cross to and from them, on top of ``[bridge]``; in our names.
+        policy: What may cross to and from them, on top of ``[bridge]``; in our names, with ``{peer}``.
     """
 
     name: str

@@ -38,9 +38,22 @@ _SOME_PEER: Final = "peer"
 _PEER_GLOB: Final = re.compile(r"[A-Za-z0-9_*?]+")
 _REMAP_KEYS: Final = ("direction", "from", "to", "types")
 _DIRECTIONS: Final = ("in", "out")
+
+
+def _read_own_glob(raw: object) -> str:
+    """A glob over topics, with ``{peer}`` in it perhaps."""
+    try:
+        read_topic_glob(raw.replace(PEER, _SOME_PEER) if isinstance(raw, str) else raw)
+    except BadValue as error:
+        if error.better is not None and isinstance(raw, str):
+            error.better = f"/{raw.strip()}"
+        raise
+    return read_text(raw).strip()
+
+
 _POLICY: Final = {
-    "allow": read_topic_glob,
-    "deny": read_topic_glob,
+    "allow": _read_own_glob,
+    "deny": _read_own_glob,
     "allow_types": read_type_glob,
     "deny_types": read_type_glob,
 }
