@@ -154,12 +154,29 @@ json = true
 
 
 def test_every_flag(load: Load) -> None:
-    flags = Flags("a", "localhost", "1", "2", "3", ("lo", "eth0"), ("h:1",), "off", None, "error", True, True)
+    flags = Flags(
+        "a",
+        "localhost",
+        "1",
+        "external",
+        "http://h:1",
+        "2",
+        "3",
+        ("lo", "eth0"),
+        ("h:1",),
+        "off",
+        None,
+        "error",
+        True,
+        True,
+    )
     settings = load(flags=flags).settings
     assert settings == Settings(
         name="a",
         core_host="localhost",
         core_port=1,
+        core_mode="external",
+        core_master="http://h:1",
         port=2,
         domain=3,
         interfaces=("lo", "eth0"),
@@ -169,6 +186,28 @@ def test_every_flag(load: Load) -> None:
         log_json=True,
         realtime=RealtimeSettings(True),
     )
+
+
+def test_an_external_core_is_that_of_ROS_MASTER_URI_or_another_one_that_is_named(load: Load) -> None:  # noqa: N802
+    environ = {"ROS_MASTER_URI": "http://robot:11312", "RMPA_CORE": "external"}
+    loaded = load(environ=environ)
+    assert loaded.settings == Settings(name="base", core_mode="external", core_master="http://robot:11312")
+    assert loaded.notes == ()
+    text = '[core]\nmode = "external"\nmaster = "http://other:1/"\nport = 11311\n'
+    loaded = load(text, environ={"ROS_MASTER_URI": "http://robot:11312"})
+    assert loaded.settings.core_master == "http://other:1/"
+    assert loaded.notes == ()
+
+
+def test_what_does_not_fit_the_kind_of_core_is_told(load: Load) -> None:
+    with pytest.raises(ConfigError, match=r"--master: is of no use with the embedded core; .*--core external"):
+        load(flags=Flags(core_master="http://h:1/"))
+    with pytest.raises(ConfigError, match=r"'robot:11311' is not a master's URI.*did you mean .*http://robot:11311/"):
+        load(environ={"RMPA_CORE": "external", "RMPA_MASTER": "robot:11311"})
+    with pytest.raises(ConfigError, match=r"rmpa\.toml:2: core\.mode: 'extern' is not a kind.* \"external\""):
+        load('[core]\nmode = "extern"\n')
+    notes = load("", flags=Flags(core_mode="external", core_port="1")).notes
+    assert notes == ("--core-port: is of no use with an external core",)
 
 
 def test_every_variable(load: Load) -> None:

@@ -341,7 +341,8 @@ def _check_core(strongest: _Layer, notes: list[str], *, external: bool) -> None:
         raise strongest["core_master"].error(
             "is of no use with the embedded core", "say also that the core is external (--core external)", ()
         )
-    useless = [strongest[name] for name in ("core_host", "core_port") if external and name in strongest]
+    given_here = [strongest[name] for name in ("core_host", "core_port") if external and name in strongest]
+    useless = [given for given in given_here if given.path is None]  # a file may be written for both
     notes += [str(given.error("is of no use with an external core", "", ())) for given in useless]
 
 
