@@ -559,6 +559,10 @@ DOCTOR_CLOCK_STEP: Final = 0.005
 DOCTOR_CLOCK_APART: Final = 0.02
 """Seconds between the clocks of two modules from which on tf complains: two periods of a 100 Hz transform."""
 
+# --- resources ------------------------------------------------------------------------------------------------
+DESCRIPTOR_MAX: Final = 1 * MIB
+"""Characters of a resource's descriptor: one with a hundred profiles of twenty attributes has some 100 KB."""
+
 # --- logging --------------------------------------------------------------------------------------------------
 LOG_WAITING: Final = 10_000
 """Lines that wait for a reader of the log who has stopped: some 1 MB. The newest are lost beyond it."""

@@ -1,0 +1,640 @@
+"""What a user writes: a ``Resource`` and what it consists of. Nothing runs here; ``resource.aio`` brings it to life.
+
+::
+
+    sonar = Resource("sonar", role="sensing")
+    ranges = sonar.output("ranges", "sensor_msgs/Range", deadline="100 ms")
+    gain = sonar.parameter("gain", 1.0, low=0.0, high=10.0)
+
+    @sonar.profile(offers={"rate": "40 Hz"})
+    def precise() -> None: ...
+
+    @sonar.task(rate="40 Hz")
+    def measure() -> None:
+        ranges.publish(range=0.3)
+
+A mistake is found when it is written: each call raises ``ConfigError`` with what is wrong and what to do.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
+
+from rmpa.core.config_contract import read_contracts
+from rmpa.core.config_file import LISTS
+from rmpa.core.config_values import BadValue, did_you_mean
+from rmpa.core.contract import Contract
+from rmpa.core.errors import ConfigError, LocalProtocolError
+from rmpa.core.names import is_legal_name
+from rmpa.resource.attributes import MEASURED, Attribute, Category, Direction, Scale
+from rmpa.resource.profiles import Profile, check_profiles
+from rmpa.resource.requirements import Bound, bound, find_attribute
+from rmpa.resource.units import quantity
+from rmpa.ros.messages import MessageType
+
+if TYPE_CHECKING:
+    from rmpa.resource.attributes import Value
+
+ParameterValue = bool | int | float | str
+Hook = Callable[[], Awaitable[None] | None]
+TaskFunction = Callable[..., Awaitable[None] | None]
+"""Without arguments if periodic; with the message if it runs on an input."""
+_Function = TypeVar("_Function", bound=Callable[..., object])
+RESERVED: Final = frozenset(
+    {
+        "alarms", "context", "decision", "descriptor", "parameter_descriptions", "parameter_updates", "profile",
+        "quality", "requirements", "responses", "set_parameters", "state",
+    }
+)  # fmt: skip
+"""Names below a resource's node that are its own topics and services, and parameters with a meaning of their own."""
+
+
+class Role(StrEnum):
+    """What a module is to the robot (paper, section 3)."""
+
+    SENSING = "sensing"
+    ACTING = "acting"
+    CONTROLLING = "controlling"
+
+
+class OnFailure(StrEnum):
+    """What becomes of a task that raised, or that is stuck."""
+
+    RESTART = "restart"
+    """It goes on, after a pause that grows with each failure in a row."""
+    STOP = "stop"
+    """It ends; the resource goes on without it, and says so."""
+    DEACTIVATE = "deactivate"
+    """The whole resource becomes inactive."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What is asked of one attribute, before it is known which resource it is asked of."""
+
+    at_least: float | str | None = None
+    at_most: float | str | None = None
+    exactly: float | str | tuple[str, ...] | None = None
+    weight: float = 1.0
+    hard: bool = False
+
+    def __str__(self) -> str:
+        """As ``resource.requirement_text`` reads it: ``>= 20 Hz hard weight=2``."""
+        if self.exactly is not None:
+            values = self.exactly if isinstance(self.exactly, tuple) else (self.exactly,)
+            text = "= " + " | ".join(map(str, values))
+        elif self.at_least is not None and self.at_most is not None:
+            text = f"{self.at_least} .. {self.at_most}"
+        else:
+            text = f">= {self.at_least}" if self.at_least is not None else f"<= {self.at_most}"
+        hard = " hard" if self.hard else ""
+        return text + hard + (f" weight={self.weight:g}" if self.weight != 1 else "")
+
+    def bound(self, attribute: Attribute) -> Bound:
+        """Read it as a bound of an attribute.
+
+        Raises:
+            ConfigError: It makes no sense for that one.
+        """
+        return bound(
+            attribute,
+            at_least=self.at_least,
+            at_most=self.at_most,
+            exactly=self.exactly,
+            weight=self.weight,
+            hard=self.hard,
+        )
+
+
+def at_least(value: float | str, *, hard: bool = False, weight: float = 1.0) -> Wish:
+    """Ask for this or more: ``at_least("20 Hz")``."""
+    return Wish(at_least=value, hard=hard, weight=weight)
+
+
+def at_most(value: float | str, *, hard: bool = False, weight: float = 1.0) -> Wish:
+    """Ask for this or less: ``at_most("50 ms")``."""
+    return Wish(at_most=value, hard=hard, weight=weight)
+
+
+def exactly(*values: float | str, hard: bool = False, weight: float = 1.0) -> Wish:
+    """Ask for this value, or for one of these words."""
+    one: Any = values[0] if len(values) == 1 else tuple(map(str, values))
+    return Wish(exactly=one, hard=hard, weight=weight)
+
+
+def between(low: float | str, high: float | str, *, hard: bool = False, weight: float = 1.0) -> Wish:
+    """Ask for a value within an interval."""
+    return Wish(at_least=low, at_most=high, hard=hard, weight=weight)
+
+
+class Outlet(Protocol):
+    """Where an output's messages go while the resource is active."""
+
+    def publish(self, values: Mapping[str, Any], message: object | None) -> None:
+        """Send a message, built from values or given whole."""
+        ...
+
+
+class Observer(Protocol):
+    """Where an attribute's observations go."""
+
+    def observe(self, attribute: str, value: Value) -> None:
+        """Take one."""
+        ...
+
+
+@dataclass(eq=False)
+class Output:
+    """A topic that the resource publishes.
+
+    Args:
+        name: As declared, in the resource's namespace unless it is global.
+        type: Its message type.
+        contract: What its messages need; the agent's rules apply on top.
+        latch: Whether a late subscriber gets the last message.
+    """
+
+    name: str
+    type: MessageType
+    contract: Contract
+    latch: bool = False
+    outlet: Outlet | None = field(default=None, repr=False)
+
+    def publish(self, message: object | None = None, /, **values: Any) -> None:
+        """Send a message: whole, or its fields.
+
+        Raises:
+            MessageError: It does not fit the output's type.
+            LocalProtocolError: The resource does not run.
+        """
+        if self.outlet is None:
+            raise LocalProtocolError(f"{self.name} has nowhere to go: its resource does not run (rmpa run)")
+        self.outlet.publish(values, message)
+
+
+@dataclass(frozen=True, slots=True)
+class Input:
+    """A topic that the resource needs.
+
+    Args:
+        name: As declared.
+        type: Its message type.
+        contract: What is asked of its messages.
+        required: Whether the resource is stale while nobody publishes it.
+    """
+
+    name: str
+    type: MessageType
+    contract: Contract
+    required: bool = True
+
+
+@dataclass(eq=False)
+class Parameter:
+    """A configuration or task parameter; its value may change while the resource runs.
+
+    Args:
+        name: A ROS base name.
+        default: Its value before anybody set it; its type is the parameter's.
+        low: The least value of a number.
+        high: The greatest.
+        choices: The only values, if there are only some.
+        unit: For people.
+        description: For people.
+    """
+
+    name: str
+    default: ParameterValue
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[ParameterValue, ...] = ()
+    unit: str = ""
+    description: str = ""
+    value: Any = None
+
+    def __post_init__(self) -> None:
+        self.value = self.default
+
+    @property
+    def type(self) -> str:
+        """``bool``, ``int``, ``double`` or ``str``, as dynamic_reconfigure has it."""
+        kinds = {bool: "bool", int: "int", float: "double", str: "str"}
+        return kinds[type(self.default)]
+
+    def check(self, value: ParameterValue) -> ParameterValue:
+        """A value as this parameter may have it; whole numbers are numbers with a point too.
+
+        Raises:
+            ConfigError: It is of another type, out of range, or none of the choices.
+        """
+        where = f"parameter {self.name}"
+        if isinstance(self.default, float) and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if type(value) is not type(self.default):
+            raise ConfigError(where, f"{value!r} is no {self.type}", f"for example {self.default!r}")
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(where, f"{value} is no number that can be used", f"for example {self.default!r}")
+        if self.choices and value not in self.choices:
+            near = did_you_mean(str(value), map(str, self.choices))
+            remedy = f"did you mean {near}?" if near else f"it is one of {', '.join(map(str, self.choices))}"
+            raise ConfigError(where, f"{value!r} is none of its values", remedy)
+        if not isinstance(value, str | bool):
+            if self.low is not None and value < self.low:
+                raise ConfigError(where, f"{value:g} is too little", f"the least is {self.low:g}")
+            if self.high is not None and value > self.high:
+                raise ConfigError(where, f"{value:g} is too much", f"the most is {self.high:g}")
+        return value
+
+
+@dataclass(eq=False)
+class DeclaredAttribute:
+    """An attribute of the user's own; ``observe`` what was measured of it."""
+
+    attribute: Attribute
+    observer: Observer | None = field(default=None, repr=False)
+
+    def observe(self, value: Value) -> None:
+        """Take one observation, in the attribute's unit; without effect while the resource does not run.
+
+        Raises:
+            ConfigError: It is no value of this attribute.
+        """
+        checked = self.attribute.check(value, f"observation of {self.attribute.name}")
+        if self.observer is not None:
+            self.observer.observe(self.attribute.name, checked)
+
+
+@dataclass(frozen=True, slots=True)
+class DeclaredProfile:
+    """A System Profile with what applies it."""
+
+    profile: Profile
+    apply: Hook
+    needs: Callable[[], str | bool | None] | None = None
+    """Its precondition: true or ``None`` while it can be taken; else false, or a text why it cannot."""
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """A situation of the robot: what it requires, and which information flows.
+
+    Args:
+        name: Unique.
+        when: A rule over topics and parameters (``resource.contexts``) that chooses it, or empty.
+        requires: What it asks of the resource's quality, by attribute.
+        profiles: The only profiles that may run in it; empty: any.
+        outputs: The only outputs that flow in it; ``None``: all.
+        enter: Called when it begins.
+    """
+
+    name: str
+    when: str = ""
+    requires: Mapping[str, Wish] = field(default_factory=dict, hash=False)
+    profiles: tuple[str, ...] = ()
+    outputs: tuple[str, ...] | None = None
+    enter: Hook | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """Something that the resource does again and again.
+
+    Args:
+        name: Unique; the function's name by default.
+        function: Plain (then it runs in a thread of its own) or ``async``.
+        rate: Hz of a periodic one, else ``None``.
+        on: The input whose messages it runs on, else ``None``.
+        on_failure: What becomes of it when it raises or is stuck.
+        stuck_after: Seconds that one run may take before it counts as stuck; ``None``: ten periods, at least 5 s.
+    """
+
+    name: str
+    function: TaskFunction
+    rate: float | None = None
+    on: Input | None = None
+    on_failure: OnFailure = OnFailure.RESTART
+    stuck_after: float | None = None
+
+
+class Resource:
+    """One Smart Resource, as declared.
+
+    Args:
+        name: A ROS base name; its node is ``/<name>``.
+        role: ``sensing``, ``acting`` or ``controlling``.
+        physical: Whether there is a device; else it is simulated.
+        description: For people.
+
+    Raises:
+        ConfigError: The name or role cannot be.
+    """
+
+    def __init__(self, name: str, *, role: str, physical: bool = True, description: str = "") -> None:
+        if not name or not is_legal_name(name) or "/" in name or name.startswith("~"):
+            raise ConfigError("resource", f"{name!r} is not a ROS base name", "letters, digits and _, a letter first")
+        if role not in set(Role):
+            near = did_you_mean(role, list(Role))
+            remedy = f"did you mean {near}?" if near else f"it is one of {', '.join(Role)}"
+            raise ConfigError(f"resource {name}", f"there is no role {role!r}", remedy)
+        self.name = name
+        self.role = Role(role)
+        self.physical = physical
+        self.description = description
+        self.outputs: dict[str, Output] = {}
+        self.inputs: dict[str, Input] = {}
+        self.parameters: dict[str, Parameter] = {}
+        self.declared_attributes: dict[str, DeclaredAttribute] = {}
+        self.profiles: dict[str, DeclaredProfile] = {}
+        self.contexts: dict[str, Context] = {}
+        self.tasks: dict[str, Task] = {}
+        self.hooks: dict[str, Hook] = {}
+
+    # --- what it offers and needs -------------------------------------------------------------------------------
+
+    def output(self, name: str, kind: str, *, latch: bool = False, **contract: object) -> Output:
+        """Declare a topic that it publishes.
+
+        Args:
+            name: In its namespace, or global (``/cmd_vel``).
+            kind: The message type, ``package/Name``.
+            latch: Whether a late subscriber gets the last message.
+            contract: The words of a ``[[contract]]``: ``deadline="100 ms"``, ``reliability="reliable"`` …
+
+        Raises:
+            ConfigError: A name twice, an illegal one, or a word that no contract has.
+            DefinitionError: The type is not known.
+        """
+        self._new("output", name, self.outputs)
+        made = Output(name, MessageType(kind), _contract(f"output {name} of {self.name}", contract), latch)
+        self.outputs[name] = made
+        return made
+
+    def input(self, name: str, kind: str, *, required: bool = True, **contract: object) -> Input:
+        """Declare a topic that it needs; arguments and errors as for ``output``."""
+        self._new("input", name, self.inputs)
+        made = Input(name, MessageType(kind), _contract(f"input {name} of {self.name}", contract), required)
+        self.inputs[name] = made
+        return made
+
+    def parameter(
+        self,
+        name: str,
+        default: ParameterValue,
+        *,
+        low: float | None = None,
+        high: float | None = None,
+        choices: Sequence[ParameterValue] = (),
+        unit: str = "",
+        description: str = "",
+    ) -> Parameter:
+        """Declare a parameter; its type is that of its default.
+
+        Raises:
+            ConfigError: A name twice or an illegal one, bounds the wrong way round, a default that it cannot have.
+        """
+        self._new("parameter", name, self.parameters)
+        where = f"parameter {name} of {self.name}"
+        if type(default) not in (bool, int, float, str):
+            raise ConfigError(where, f"{default!r} is no bool, int, float or str", "give a default of one of these")
+        if (low is not None or high is not None) and isinstance(default, bool | str):
+            raise ConfigError(where, f"bounds of {default!r}, which is no number", "leave low and high out")
+        if low is not None and high is not None and low > high:
+            raise ConfigError(where, f"low is {low:g} and high {high:g}", "the bounds are the wrong way round")
+        made = Parameter(name, default, low, high, tuple(choices), unit, description)
+        made.check(default)
+        self.parameters[name] = made
+        return made
+
+    def attribute(
+        self,
+        name: str,
+        *,
+        better: str,
+        unit: str = "",
+        scale: str = "linear",
+        category: str = "performance",
+        tolerance: float | str | None = None,
+        words: Sequence[str] = (),
+    ) -> DeclaredAttribute:
+        """Declare a quality of its own, beside those that are measured anyway (``resource.attributes.MEASURED``).
+
+        Args:
+            name: ``accuracy``, ``energy`` …
+            better: ``max``, ``min``, ``target`` or ``exact``.
+            unit: See ``resource.units``.
+            scale: ``linear``, ``log``, ``ordinal`` or ``nominal``.
+            category: ``temporal``, ``spatial``, ``reliability`` or ``performance``.
+            tolerance: A shortfall of this size counts 1; with a unit, or a ratio on a log scale.
+            words: Of ordinal and nominal scales.
+
+        Raises:
+            ConfigError: It cannot be.
+        """
+        where = f"attribute {name} of {self.name}"
+        if name in self.attributes:
+            raise ConfigError(where, "there is one of this name already", "name it otherwise")
+        plain = tolerance if tolerance is None or scale != "linear" else quantity(tolerance, unit, where)
+        made = DeclaredAttribute(
+            Attribute(
+                name,
+                _word(Direction, better, where),
+                unit,
+                _word(Scale, scale, where),
+                _word(Category, category, where),
+                float(plain) if plain is not None else None,
+                tuple(words),
+            )
+        )
+        self.declared_attributes[name] = made
+        return made
+
+    @property
+    def attributes(self) -> dict[str, Attribute]:
+        """Everything that can be asked for: its own attributes, and what is measured of each output and input.
+
+        ``rate`` means the first output; ``scan.rate`` names the output or input.
+        """
+        found: dict[str, Attribute] = {}
+        for position, name in enumerate((*self.outputs, *self.inputs)):
+            base = name.rsplit("/", 1)[-1]
+            for key, attribute in MEASURED.items():
+                if position == 0 and self.outputs:
+                    found[key] = attribute
+                found[f"{base}.{key}"] = attribute
+        return found | {name: declared.attribute for name, declared in self.declared_attributes.items()}
+
+    # --- what it does -------------------------------------------------------------------------------------------
+
+    def profile(
+        self,
+        *,
+        offers: Mapping[str, float | str],
+        cost: float = 0.0,
+        best_effort: bool = False,
+        needs: Callable[[], str | bool | None] | None = None,
+        name: str = "",
+        description: str = "",
+    ) -> Callable[[_Function], _Function]:
+        """Declare a System Profile; the function that is decorated applies it.
+
+        Args:
+            offers: The quality under it: attribute to value, with a unit (``"40 Hz"``) or in the attribute's own.
+            cost: What it takes, beside the others.
+            best_effort: Whether it runs when none can serve.
+            needs: Its precondition.
+            name: By default the function's.
+            description: By default the first line of the function's docstring.
+
+        Raises:
+            ConfigError: A name twice, an unknown attribute or unit, a second best-effort profile.
+        """
+
+        def declare(function: _Function) -> _Function:
+            title = name or function.__name__
+            where = f"profile {title} of {self.name}"
+            if title in self.profiles:
+                raise ConfigError(where, "there are two of this name", "name one of them otherwise")
+            attributes = self.attributes
+            values: dict[str, Value] = {}
+            for key, value in offers.items():
+                attribute = find_attribute(attributes, key, self.name)
+                said = value if attribute.of_words else quantity(value, attribute.unit, f"{where}, {key}")
+                values[key] = attribute.check(said, f"{where}, {key}")
+            text = description or (function.__doc__ or "").strip().partition("\n")[0]
+            made = Profile(title, values, cost, best_effort, text)
+            check_profiles([*(p.profile for p in self.profiles.values()), made], attributes, self.name)
+            self.profiles[title] = DeclaredProfile(made, function, needs)  # type: ignore[arg-type] # as told
+            return function
+
+        return declare
+
+    def context(
+        self,
+        name: str,
+        *,
+        when: str = "",
+        requires: Mapping[str, Wish] | None = None,
+        profiles: Sequence[str] = (),
+        outputs: Sequence[Output] | None = None,
+        enter: Hook | None = None,
+    ) -> Context:
+        """Declare a context; behind the profiles and attributes that it names.
+
+        Raises:
+            ConfigError: A name twice, an unknown profile or attribute, or an output of another resource.
+        """
+        where = f"context {name} of {self.name}"
+        if name in self.contexts:
+            raise ConfigError(where, "there are two of this name", "name one of them otherwise")
+        for profile in profiles:
+            if profile not in self.profiles:
+                near = did_you_mean(profile, self.profiles)
+                remedy = f"did you mean {near}?" if near else "declare the profile before the context"
+                raise ConfigError(where, f"there is no profile {profile}", remedy)
+        for key, wish in (requires or {}).items():
+            wish.bound(find_attribute(self.attributes, key, self.name))
+        if outputs is not None and (strange := [o.name for o in outputs if o not in self.outputs.values()]):
+            raise ConfigError(where, f"{strange[0]} is no output of this resource", "name its own outputs")
+        names = tuple(output.name for output in outputs) if outputs is not None else None
+        made = Context(name, when, dict(requires or {}), tuple(profiles), names, enter)
+        self.contexts[name] = made
+        return made
+
+    def task(
+        self,
+        *,
+        rate: float | str | None = None,
+        on: Input | None = None,
+        name: str = "",
+        on_failure: str = "restart",
+        stuck_after: float | str | None = None,
+    ) -> Callable[[_Function], _Function]:
+        """Declare what it does: periodically at a rate, or with each message of an input.
+
+        Raises:
+            ConfigError: Neither or both of ``rate`` and ``on``, a rate that cannot be, an input of another resource.
+        """
+
+        def declare(function: _Function) -> _Function:
+            title = name or function.__name__
+            where = f"task {title} of {self.name}"
+            if title in self.tasks:
+                raise ConfigError(where, "there are two of this name", "name one of them otherwise")
+            if (rate is None) == (on is None):
+                raise ConfigError(where, "it needs either a rate or an input", 'rate="10 Hz", or on=an input')
+            hertz = quantity(rate, "Hz", where) if rate is not None else None
+            if hertz is not None and not 0 < hertz <= 10_000:
+                raise ConfigError(where, f"a rate of {hertz:g} Hz", "it is above 0 and at most 10 kHz")
+            if on is not None and on not in self.inputs.values():
+                raise ConfigError(where, f"{on.name} is no input of this resource", "declare it there first")
+            seconds = quantity(stuck_after, "s", where) if stuck_after is not None else None
+            policy = _word(OnFailure, on_failure, where)
+            self.tasks[title] = Task(title, function, hertz, on, policy, seconds)  # type: ignore[arg-type] # as told
+            return function
+
+        return declare
+
+    def on(self, event: str) -> Callable[[_Function], _Function]:
+        """Declare what is done at a change of the life cycle.
+
+        Args:
+            event: ``configure``, ``activate``, ``deactivate`` or ``finalize``.
+
+        Raises:
+            ConfigError: There is no such change, or it has its function already.
+        """
+        known = ("configure", "activate", "deactivate", "finalize")
+        if event not in known:
+            near = did_you_mean(event, known)
+            remedy = f"did you mean {near}?" if near else f"there are {', '.join(known)}"
+            raise ConfigError(f"resource {self.name}", f"no change {event!r}", remedy)
+        if event in self.hooks:
+            raise ConfigError(f"resource {self.name}", f"{event} has its function already", "call both from one")
+
+        def declare(function: _Function) -> _Function:
+            self.hooks[event] = function  # type: ignore[assignment] # as told
+            return function
+
+        return declare
+
+    def _new(self, what: str, name: str, known: Mapping[str, object]) -> None:
+        where = f"{what} {name} of {self.name}"
+        if not name or not is_legal_name(name) or name.startswith("~"):
+            raise ConfigError(where, f"{name!r} is not a ROS name", "letters, digits, _ and /, a letter or / first")
+        if what == "parameter" and "/" in name:
+            raise ConfigError(where, "a parameter has a base name", "leave the / out")
+        if name in known:
+            raise ConfigError(where, "there is one of this name already", "name it otherwise")
+        if name in RESERVED:
+            raise ConfigError(where, "that name is the resource's own", f"not one of {', '.join(sorted(RESERVED))}")
+
+
+def _contract(where: str, words: Mapping[str, object]) -> Contract:
+    known = [key for key in LISTS["contract"] if key not in ("topics", "types")]
+    for word in words:
+        if word not in known:
+            near = did_you_mean(word, known)
+            remedy = f"did you mean {near}?" if near else f"known here: {', '.join(known)}"
+            raise ConfigError(where, f"a contract has no {word!r}", remedy)
+    if not words:
+        return Contract()
+    try:
+        rules = read_contracts([{"topics": ["/**"], **words}]).rules
+    except BadValue as error:
+        key = error.at[-1] if error.at else ""
+        remedy = error.remedy or (f"did you mean {error.better}?" if error.better else "")
+        raise ConfigError(f"{where}, {key}" if key else where, error.problem, remedy) from None
+    return Contract(**rules[0].values)  # type: ignore[arg-type] # as Rule.values promises
+
+
+def _word(kind: type[Any], word: str, where: str) -> Any:
+    words = [item.value for item in kind]
+    if word not in words:
+        near = did_you_mean(word, words)
+        remedy = f"did you mean {near}?" if near else f"it is one of {', '.join(words)}"
+        raise ConfigError(where, f"{word!r} is not known here", remedy)
+    return kind(word)
