@@ -150,7 +150,8 @@ def test_another_type_than_the_local_one_is_refused_loudly_on_both_sides_until_i
     assert isinstance(told, Send)
     assert isinstance(told.message, Mismatch)
     assert imports.demand(1, CMD, 0.0, wanted=False) == []
-    assert imports.local_type("/cmd", None) == [Publish(1, CMD, "sensor_msgs/Joy")]
+    over = Send(1, Mismatch("/cmd", "/joy", "", ""))
+    assert imports.local_type("/cmd", None) == [Publish(1, CMD, "sensor_msgs/Joy"), over]
     retract, *loud = imports.local_type("/cmd", "std_msgs/String")
     assert retract == Retract(1, CMD)
     assert [type(action) for action in loud] == [Warn, Send]

@@ -176,7 +176,10 @@ class Closed(msgspec.Struct, frozen=True, tag_field="op", tag="closed"):
 
 
 class Mismatch(msgspec.Struct, frozen=True, tag_field="op", tag="mismatch"):
-    """A node of mine wants your source with another definition; it was refused. For your log and users."""
+    """A node of mine wants your source with another definition; it was refused. For your log and users.
+
+    With an empty ``text`` that is over: the node has gone, or comes anew.
+    """
 
     topic: str
     node: str
