@@ -10,7 +10,7 @@ import random
 import signal
 import sys
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rmpa.agent.clocks import Clocks
 from rmpa.agent.core_choice import make_core
@@ -35,6 +35,7 @@ from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableErr
 from rmpa.monitor.aio.control_server import ControlServer
 from rmpa.monitor.aio.runtime_dir import runtime_dir
 from rmpa.monitor.snapshot import FollowedInfo, PingReply, Snapshot
+from rmpa.ros.aio.logger_services import LoggerServices
 
 if TYPE_CHECKING:
     from rmpa.bridge.aio.bridge import Attached
@@ -44,6 +45,11 @@ if TYPE_CHECKING:
     from rmpa.ros.aio.core_api import Core
 
 _log = logging.getLogger(__name__)
+
+_LOGGERS: Final = {
+    name: name for name in ("rmpa", "rmpa.agent", "rmpa.bridge", "rmpa.discovery", "rmpa.mesh", "rmpa.ros")
+}
+"""What /rmpa/set_logger_level turns up and down: the whole agent, or one room."""
 
 
 class Agent:
@@ -69,7 +75,11 @@ class Agent:
         )
         self.core: Core = make_core(settings)
         self.bridge = Bridge(
-            self.core, Policy(settings.policy), rng=random.random, contracts=Contracts(settings.contracts)
+            self.core,
+            Policy(settings.policy),
+            rng=random.random,
+            contracts=Contracts(settings.contracts),
+            relay=settings.relay,
         )
         self.station: Station | None = None
         self._moving: asyncio.Task[None] | None = None
@@ -107,6 +117,9 @@ class Agent:
             diagnostics = Diagnostics(self.core, self.bridge, self._view, self._clocks)
             diagnostics.start()
             undo.callback(diagnostics.close)
+            loggers = LoggerServices(self.bridge.node, self.core.call, _LOGGERS)
+            loggers.start()
+            undo.callback(loggers.close)
             await self._join(self._settings.port)
             undo.push_async_callback(self._leave)
             await self._control.start()

@@ -18,16 +18,19 @@ import contextlib
 import logging
 import os
 import time
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from rmpa.core import limits
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros.aio.http_client import call_api
 from rmpa.ros.aio.local_addresses import local_addresses
+from rmpa.ros.aio.node_services import Handler, Service, ServiceClient
+from rmpa.ros.aio.service_client import ServiceConnection
 from rmpa.ros.aio.slave_server import SlaveNode
 from rmpa.ros.aio.topics import Publisher, Received, Subscriber
 from rmpa.ros.environment import RosEnvironment, host_of, is_loopback
 from rmpa.ros.messages import MessageType
+from rmpa.ros.service_types import ServiceType
 from rmpa.ros.tcpros import ANY, Description
 
 if TYPE_CHECKING:
@@ -36,7 +39,7 @@ if TYPE_CHECKING:
 
     from rmpa.ros.xmlrpc import Reply, XmlRpcValue
 
-__all__ = ["Node", "Publisher", "Received", "Subscriber"]
+__all__ = ["Node", "Publisher", "Received", "Service", "ServiceClient", "Subscriber"]
 
 _log = logging.getLogger(__name__)
 _REMEDY: Final = "start one (rmpa up, or roscore), or set ROS_MASTER_URI to one that runs"
@@ -87,6 +90,7 @@ class Node:
         self._on_param_update = on_param_update
         self._publishers: dict[str, Publisher] = {}
         self._subscribers: dict[str, Subscriber] = {}
+        self._services: dict[str, Service] = {}
         self._followed: set[str] = set()
         self._watch: asyncio.Task[None] | None = None
         self._ending: asyncio.Task[None] | None = None
@@ -233,6 +237,90 @@ class Node:
             raise
         return subscriber
 
+    # --- services ---------------------------------------------------------------------------------------------
+
+    async def advertise_service(
+        self,
+        name: str,
+        kind: str | ServiceType,
+        handler: Handler,
+        *,
+        timeout: float = limits.SERVICE_TIMEOUT,  # noqa: ASYNC109 - of each call, which the client hears of
+    ) -> Service:
+        """Serve a service.
+
+        Args:
+            name: Resolved in the namespace; ``~name`` is the node's own.
+            kind: The type.
+            handler: Called in the loop with each request's object; gives the response, as an object or plain values,
+                at once or as an awaitable. What it raises becomes the client's error.
+            timeout: Seconds for a call before the client gets an error.
+
+        Raises:
+            DefinitionError: The type is not known.
+            UnreachableError: The master does not answer.
+            PeerRefused: The master refuses the registration.
+            ValueError: The node serves that service already.
+        """
+        resolved = self._resolve(name)
+        kind = ServiceType(kind) if isinstance(kind, str) else kind
+        service = Service(resolved, self.name, kind, handler, timeout, self._unadvertise_service)
+        self._slave.add_service(service.endpoint)
+        self._services[resolved] = service
+        try:
+            await self._register_service(service)
+        except BaseException:
+            self._services.pop(resolved, None)
+            self._slave.remove_service(resolved)
+            raise
+        return service
+
+    async def lookup_service(self, name: str) -> str:
+        """Where a service is served, ``rosrpc://host:port``.
+
+        Raises:
+            UnreachableError: No node serves it, or the master does not answer.
+        """
+        resolved = self._resolve(name)
+        reply = await self._call("lookupService", resolved)
+        if reply.code != 1:
+            where = f"the ROS master {self.master_uri}"
+            raise UnreachableError(f"server of service {resolved}", where, "does its node run?")
+        return str(reply.value)
+
+    async def connect_service(self, name: str, kind: str | ServiceType, *, persistent: bool = True) -> ServiceClient:
+        """Connect to a service, for many calls or for one; close the result.
+
+        Raises:
+            DefinitionError: The type is not known.
+            UnreachableError: No node serves it, or its server does not answer.
+            PeerRefused: The server has another version of the type, or another service.
+        """
+        kind = ServiceType(kind) if isinstance(kind, str) else kind
+        uri = await self.lookup_service(name)
+        opened = await ServiceConnection.open(
+            uri, self._resolve(name), self.name, md5sum=kind.md5sum, persistent=persistent
+        )
+        return ServiceClient(opened, kind)
+
+    async def call_service(
+        self,
+        name: str,
+        kind: str | ServiceType,
+        request: object = None,
+        timeout: float | None = limits.SERVICE_TIMEOUT,  # noqa: ASYNC109 - the message names it
+    ) -> Any:
+        """Call a service once; arguments and errors are those of ``connect_service`` and ``ServiceClient.call``.
+
+        Returns:
+            The response as an object.
+        """
+        client = await self.connect_service(name, kind, persistent=False)
+        try:
+            return await client.call(request, timeout)
+        finally:
+            client.close()
+
     # --- the master -------------------------------------------------------------------------------------------
 
     async def call_master(self, method: str, *params: XmlRpcValue) -> XmlRpcValue:
@@ -322,6 +410,15 @@ class Node:
         if isinstance(uris, list):
             subscriber.subscription.update([str(uri) for uri in uris], keep=keep)
 
+    async def _register_service(self, service: Service) -> None:
+        await self.call_master("registerService", service.name, self._slave.service_uri, self.uri)
+
+    async def _unadvertise_service(self, name: str) -> None:
+        if self._services.pop(name, None) is not None:
+            with contextlib.suppress(RmpaError):
+                await self.call_master("unregisterService", name, self._slave.service_uri)
+            self._slave.remove_service(name)
+
     async def _unadvertise(self, topic: str) -> None:
         if self._publishers.pop(topic, None) is not None:
             with contextlib.suppress(RmpaError):
@@ -337,7 +434,7 @@ class Node:
     async def _watch_master(self) -> None:
         while True:
             await asyncio.sleep(limits.NODE_MASTER_CHECK)
-            if not (self._publishers or self._subscribers or self._followed):
+            if not (self._publishers or self._subscribers or self._services or self._followed):
                 continue
             try:
                 if await self._is_forgotten():
@@ -358,6 +455,8 @@ class Node:
             await self._register_publisher(publisher)
         for subscriber in tuple(self._subscribers.values()):
             await self._register_subscriber(subscriber, keep=True)
+        for service in tuple(self._services.values()):
+            await self._register_service(service)
         for key in tuple(self._followed):
             await self.call_master("subscribeParam", self.uri, key)
 
@@ -399,5 +498,7 @@ class Node:
             await self.call_master("unregisterPublisher", topic, self.uri)
         for topic in self._subscribers:
             await self.call_master("unregisterSubscriber", topic, self.uri)
+        for service in self._services:
+            await self.call_master("unregisterService", service, self._slave.service_uri)
         for key in self._followed:
             await self.call_master("unsubscribeParam", self.uri, key)

@@ -9,6 +9,7 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
+from rmpa.ros.aio.logger_services import LoggerServices
 from rmpa.ros.aio.publication import Publication
 from rmpa.ros.aio.slave_server import SlaveNode
 from rmpa.ros.aio.subscription import PublisherConnection, Subscription
@@ -26,6 +27,8 @@ _log = logging.getLogger(__name__)
 NODE: Final = "/rosout"
 TOPIC: Final = "/rosout"
 AGGREGATED: Final = "/rosout_agg"
+_LOGGERS: Final = {"ros": "rmpa.ros", "ros.rosout": "rmpa.ros.aio.rosout"}
+"""By the names that a roscore's rosout has for the like."""
 LOG_TYPE: Final = "rosgraph_msgs/Log"
 LOG_MD5: Final = "acffd30cd6b6de30f120938c17c593fb"
 _DEFINITION: Final = (
@@ -89,6 +92,7 @@ class Rosout:
             queue_messages=limits.ROSOUT_QUEUE,
         )
         self._subscription: Subscription | None = None
+        self._loggers = LoggerServices(self._node, call, _LOGGERS)
 
     @property
     def uri(self) -> str:
@@ -118,9 +122,11 @@ class Rosout:
         self._call("registerPublisher", NODE, AGGREGATED, LOG_TYPE, self._node.uri)
         reply = self._call("registerSubscriber", NODE, TOPIC, LOG_TYPE, self._node.uri)
         self._subscription.update(_texts(reply.value))
+        self._loggers.start()
 
     async def close(self) -> None:
         """Unregister and close."""
+        self._loggers.close()
         self._call("unregisterSubscriber", NODE, TOPIC, self._node.uri)
         self._call("unregisterPublisher", NODE, AGGREGATED, self._node.uri)
         await self._node.close()
