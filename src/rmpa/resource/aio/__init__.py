@@ -1,0 +1,1 @@
+"""Brings resources to life: nodes, tasks, topics."""

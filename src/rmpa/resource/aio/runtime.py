@@ -1,0 +1,206 @@
+"""One resource at work: its node, its topics, and the parts that make it smart.
+
+The runtime itself only connects: what a part cares for it hears by the methods of ``RuntimePart``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+from rmpa.core.errors import LocalProtocolError
+from rmpa.resource.descriptor import TOPIC, describe, topic_of
+from rmpa.ros.messages import MessageError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rmpa.resource.attributes import Value
+    from rmpa.resource.declare import Input, Output, Parameter, ParameterValue, Resource
+    from rmpa.ros.aio.node import Node
+    from rmpa.ros.aio.topics import Publisher, Received
+
+_log = logging.getLogger(__name__)
+
+
+class RuntimePart:
+    """Hears of everything and does nothing; parts override what they care for. All calls come from the loop."""
+
+    async def start(self) -> None:
+        """The node is registered and the outputs are advertised; tasks do not run yet."""
+
+    async def close(self) -> None:
+        """The resource ends; the node is still registered."""
+
+    def published(self, output: Output, raw: bytes, now_ns: int) -> None:
+        """A message has left by an output."""
+
+    def received(self, item: Input, message: Received) -> None:
+        """A message has come by an input."""
+
+    def observed(self, attribute: str, value: Value) -> None:
+        """An attribute of the user's own was observed."""
+
+    def parameter_changed(self, parameter: Parameter) -> None:
+        """A parameter has another value."""
+
+
+class Runtime:
+    """Runs one resource on a node.
+
+    Args:
+        resource: Declared completely.
+        node: Named as the resource; not yet entered.
+    """
+
+    def __init__(self, resource: Resource, node: Node) -> None:
+        self.resource = resource
+        self.node = node
+        self.descriptor = describe(resource, node.name)
+        self.parts: list[RuntimePart] = []
+        self._publishers: dict[str, Publisher] = {}
+        self._texts: dict[str, tuple[Publisher, str]] = {}
+        self._held: list[tuple[Output, bytes]] | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._thread = 0
+        self._undo = contextlib.AsyncExitStack()
+
+    async def start(self) -> None:
+        """Register the node, its outputs and inputs, and start the parts in order.
+
+        Raises:
+            UnreachableError: The master does not answer.
+            PeerRefused: The master refuses a registration.
+        """
+        self._loop, self._thread = asyncio.get_running_loop(), threading.get_ident()
+        async with contextlib.AsyncExitStack() as undo:
+            await undo.enter_async_context(self.node)
+            for output in self.resource.outputs.values():
+                topic = topic_of(output.name, self.node.name)
+                self._publishers[output.name] = await self.node.advertise(topic, output.type, latch=output.latch)
+                output.outlet = _Outlet(self, output)
+                undo.callback(setattr, output, "outlet", None)
+            for declared in self.resource.declared_attributes.values():
+                declared.observer = _Observer(self)
+                undo.callback(setattr, declared, "observer", None)
+            await self.say(TOPIC, self.descriptor.serialize())
+            for item in self.resource.inputs.values():
+                await self._listen(item)
+            for part in self.parts:
+                await part.start()
+                undo.push_async_callback(part.close)
+            self._undo = undo.pop_all()
+
+    async def close(self) -> None:
+        """End the parts, the last one first, then the node."""
+        await self._undo.aclose()
+
+    async def say(self, name: str, text: str) -> None:
+        """Publish a text on a latched topic ``std_msgs/String`` of the resource's own; the same text is said once."""
+        known = self._texts.get(name)
+        if known is not None and known[1] == text:
+            return
+        if known is None:
+            publisher = await self.node.advertise(f"{self.node.name}/{name}", "std_msgs/String", latch=True)
+        else:
+            publisher = known[0]
+        self._texts[name] = (publisher, text)
+        publisher.publish(publisher.make({"data": text}))
+
+    def set_parameter(self, name: str, value: ParameterValue) -> None:
+        """Set a parameter, and let the parts know.
+
+        Raises:
+            ConfigError: It cannot have that value.
+            KeyError: There is no such parameter.
+        """
+        parameter = self.resource.parameters[name]
+        parameter.value = parameter.check(value)
+        for part in self.parts:
+            part.parameter_changed(parameter)
+
+    def hold(self) -> None:
+        """Keep what is published from now on: a profile is being applied, and no output may mix two of them."""
+        self._held = []
+
+    def release(self, *, drop: bool = False) -> None:
+        """Let what was kept leave, in order; or drop it, for it belongs to a profile that was not applied."""
+        held, self._held = self._held, None
+        for output, raw in held or ():
+            if not drop:
+                self._send(output, raw)
+
+    def call_in_loop(self, function: Any, *args: Any) -> None:
+        """Call a function in the loop: now if this is its thread, else soon."""
+        if threading.get_ident() == self._thread:
+            function(*args)
+        elif self._loop is not None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended: nobody listens any more
+                self._loop.call_soon_threadsafe(function, *args)
+
+    # --- inside -------------------------------------------------------------------------------------------------
+
+    async def _listen(self, item: Input) -> None:
+        def received(message: Received) -> None:
+            for part in self.parts:
+                part.received(item, message)
+
+        await self.node.subscribe(topic_of(item.name, self.node.name), item.type, received)
+
+    def send(self, output: Output, raw: bytes) -> None:
+        """Send one message of an output, or keep it while a profile is being applied."""
+        if self._held is not None:
+            self._held.append((output, raw))
+        else:
+            self._send(output, raw)
+
+    def _send(self, output: Output, raw: bytes) -> None:
+        publisher = self._publishers.get(output.name)
+        if publisher is None:
+            return
+        publisher.publish_raw(raw)
+        now_ns = time.time_ns()
+        for part in self.parts:
+            part.published(output, raw, now_ns)
+
+    def observe(self, attribute: str, value: Value) -> None:
+        """Hand an observation to the parts."""
+        for part in self.parts:
+            part.observed(attribute, value)
+
+
+class _Outlet:
+    """Where an output's messages go; may be called from any thread."""
+
+    def __init__(self, runtime: Runtime, output: Output) -> None:
+        self._runtime = runtime
+        self._output = output
+
+    def publish(self, values: Mapping[str, Any], message: object | None) -> None:
+        """Serialize here, where the mistake is the caller's, and send in the loop."""
+        kind = self._output.type
+        if message is not None and values:
+            raise LocalProtocolError(f"{self._output.name}: a message and fields; give one or the other")
+        if message is None:
+            message = kind.make(dict(values))
+        else:
+            given = getattr(message, "__msgtype__", "").replace("/msg/", "/")
+            if given != kind.name:
+                shown = given or type(message).__name__
+                raise MessageError(f"{self._output.name} has messages of type {kind.name}, not {shown}")
+        self._runtime.call_in_loop(self._runtime.send, self._output, kind.serialize(message))
+
+
+class _Observer:
+    """Where observations go; may be called from any thread."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+
+    def observe(self, attribute: str, value: Value) -> None:
+        """Hand one on."""
+        self._runtime.call_in_loop(self._runtime.observe, attribute, value)
