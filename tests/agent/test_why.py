@@ -1,0 +1,111 @@
+"""``why`` between whole agents: each side tells what only it knows."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.core import limits
+from rmpa.core.config import PolicySettings, Settings
+from rmpa.core.errors import ConfigError
+from rmpa.monitor.diagnosis import Diagnosis, Verdict
+from tests.agent.test_agent import node, running, settings, until  # noqa: F401 - a fixture among them
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.agent import Agent
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "WHY_WINDOW", 0.2)
+
+
+async def ask(agent: Agent, name: str, peer: str | None = None) -> tuple[Diagnosis, ...]:
+    return await agent._why({"name": name, "peer": peer})
+
+
+def stopped_at(found: tuple[Diagnosis, ...]) -> tuple[str, str]:
+    """Name and text of the stage at which the only way ends."""
+    (diagnosis,) = found
+    assert diagnosis.failed is not None, diagnosis
+    assert diagnosis.failed is diagnosis.stages[-1]
+    assert not diagnosis.flows
+    assert diagnosis.failed.remedy
+    return diagnosis.failed.name, diagnosis.failed.text
+
+
+async def test_from_no_publisher_to_a_flowing_topic(settings: Callable[..., Settings]) -> None:  # noqa: F811
+    async with (
+        running(settings("a"), settings("b")) as (a, b),
+        node("talker", a) as talker,
+        node("hearer", b) as hearer,
+    ):
+        assert stopped_at(await ask(b, "/chatter", "a")) == ("publisher", "no node of a publishes /chatter")
+        assert stopped_at(await ask(b, "/chatter"))[0] == "publisher"
+        publisher = await talker.advertise("/chatter", "std_msgs/String")
+        await until(lambda: b.bridge.imports.offered_by(next(iter(b.bridge.attached())).peer))
+        stage, text = stopped_at(await ask(b, "/chatter", "a"))
+        assert (stage, text) == ("subscriber", "no node here subscribes to /chatter, so nothing is sent")
+        (near,) = await ask(b, "/chater", "a")
+        assert near.failed is not None
+        assert near.failed.remedy == "did you mean /chatter?"
+        subscriber = await hearer.subscribe("/chatter", "std_msgs/String", lambda _: None)
+        await until(lambda: publisher.subscribers and subscriber.publishers)
+        stage, text = stopped_at(await ask(b, "/chatter", "a"))
+        assert (stage, text) == ("sent", "its publisher /talker is connected, and has published nothing since")
+        publisher.publish(publisher.make({"data": "one"}))
+        (found,) = await ask(b, "/chatter", "a")
+        assert found.flows
+        assert (found.peer, found.to, found.node) == ("a", "b", "/talker")
+        assert [stage.verdict for stage in found.stages] == [Verdict.OK] * len(found.stages)
+        assert found.stages[-1].text == "/hearer takes them"
+        # Asked on the publisher's side, the subscriber's agent says the same.
+        (there,) = await ask(a, "/chatter")
+        assert (there.peer, there.to, there.flows) == ("a", "b", True)
+        assert there.stages[-1].text == "/hearer takes them"
+        (there,) = await ask(a, "/chatter", "b")
+        assert (there.peer, there.to, there.flows) == ("a", "b", True)
+
+
+@pytest.mark.parametrize("where", ["there", "here"])
+async def test_policy_of_either_side(settings: Callable[..., Settings], where: str) -> None:  # noqa: F811
+    deny = PolicySettings(deny=("/secret",))
+    a, b = (settings("a", deny), settings("b")) if where == "there" else (settings("a"), settings("b", deny))
+    async with running(a, b) as (first, second), node("talker", first) as talker:
+        await talker.advertise("/secret", "std_msgs/String")
+        if where == "here":
+            await until(lambda: next(iter(second.bridge.imports), None))
+        for found in (await ask(second, "/secret", "a"), await ask(second, "/secret")):
+            stage, text = stopped_at(found)
+            assert stage == f"policy {where}"
+            assert "bridge.deny has '/secret'" in text
+
+
+async def test_built_in_rules_and_other_types(settings: Callable[..., Settings]) -> None:  # noqa: F811
+    async with running(settings("a"), settings("b")) as (a, b), node("one", a) as one, node("two", b) as two:
+        await one.advertise("/clock", "rosgraph_msgs/Clock")
+        stage, text = stopped_at(await ask(b, "/clock", "a"))
+        assert stage == "policy there"
+        assert "time stays home" in text
+        await one.advertise("/x", "std_msgs/String")
+        await two.advertise("/x", "std_msgs/Bool")
+        await until(lambda: any(entry.conflict for _, _, entry in b.bridge.imports))
+        stage, text = stopped_at(await ask(b, "/x", "a"))
+        assert stage == "type"
+        assert "std_msgs/String" in text
+        assert "std_msgs/Bool" in text
+
+
+async def test_unknown_peers_and_names(settings: Callable[..., Settings]) -> None:  # noqa: F811
+    async with running(settings("a"), settings("b")) as (_, b):
+        (found,) = await ask(b, "/x", "aa")
+        assert found.failed is not None
+        assert found.failed.name == "peer"
+        assert found.failed.remedy.startswith("did you mean a?")
+        with pytest.raises(ConfigError, match="not a topic"):
+            await ask(b, "x y")
+    async with running(settings("lonely")) as (lonely,):
+        assert stopped_at(await ask(lonely, "/x"))[0] == "publisher"
