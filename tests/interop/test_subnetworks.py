@@ -43,7 +43,7 @@ def test_one_seed_and_gossip_join_two_networks_behind_a_router(
     )
     full_mesh(a, b, c, d)
     heard = d.ros.roscpp("listener", topic="/chatter")
-    b.ros.roscpp("talker", topic="/chatter", rate=100)
+    b.ros.roscpp("talker", "__name:=talker", topic="/chatter", rate=100)
     flows(heard)
     assert "/rmpa/b/talker" in d.ros.tool("rosnode", "list")
 
@@ -91,3 +91,62 @@ def test_a_module_whose_first_cable_leads_nowhere_is_found_by_its_second(
     full_mesh(a, b)
     a.ros.roscpp("talker", topic="/chatter", rate=100)
     flows(b.ros.roscpp("listener", topic="/chatter"))
+
+
+RELAY = "[relay]\nenabled = true\n"
+
+
+def test_relays_pass_on_what_two_networks_without_a_router_publish(
+    lab: Lab, agent: AgentFactory, shell: ShellFactory
+) -> None:
+    """Two relays stand between two networks; one of them is chosen, and the other takes over when it is gone."""
+    hosts = [lab.host("a", 0), lab.host("b", 1), lab.host("r", 0, 1), lab.host("s", 0, 1)]
+    a, b, r, s = (
+        Module(host, agent(host, name=host.name, config=RELAY if host.name in "rs" else ""), shell(host))
+        for host in hosts
+    )
+    for relay in (r, s):
+        full_mesh(a, relay)
+        full_mesh(b, relay)
+    heard = {kind: b.ros.node(kind, "listener", f"__name:={kind}", topic="/chatter") for kind in ("rospy", "roscpp")}
+    a.ros.roscpp("talker", "__name:=talker", topic="/chatter", rate=100, latch=True)
+    b.ros.roscpp("talker", "__name:=back", topic="/back", rate=100)
+    for listener in heard.values():
+        report = flows(listener)
+        assert (report["bad"], report["doubled"]) == (0, 0), "one relay alone passes it on"
+
+    # Each sees the other as if it were linked, under the other's own name; and nothing comes back.
+    assert "/rmpa/a/talker" in b.ros.tool("rosnode", "list").split()
+    assert "/rmpa/b/back" in a.ros.tool("rosnode", "list").split()
+    assert not [node for node in a.ros.tool("rosnode", "list").split() if node.startswith("/rmpa/a/")]
+    for relay in (r, s):
+        nodes = relay.ros.tool("rosnode", "list").split()
+        assert len(nodes) == len(set(nodes))
+        assert {"/rmpa/a/talker", "/rmpa/b/back"} <= set(nodes)
+        assert not [node for node in nodes if node.startswith(("/rmpa/r/", "/rmpa/s/"))]
+    info = b.agent.peers()["a"]
+    assert (info["state"], info["via"] in {"r", "s"}) == ("relayed", True)
+    chosen, other = (r, s) if info["via"] == "r" else (s, r)
+
+    chosen.agent.kill()
+    for listener in heard.values():
+        report = flows(listener)
+        assert (report["bad"], report["doubled"]) == (0, 0)
+    eventually(lambda: b.agent.peers()["a"]["via"] == other.name, what="the other relay")
+    other.agent.terminate()
+    eventually(lambda: "a" not in b.agent.peers(), what="no way to a")
+    b.wait_no_topic("/rmpa/a/talker", 1.0)
+    assert "/rmpa/a/talker" not in b.ros.tool("rosnode", "list")
+
+
+def test_a_relay_is_not_needed_where_there_is_a_way(lab: Lab, agent: AgentFactory, shell: ShellFactory) -> None:
+    """All on one network: each source appears once, by its own link."""
+    hosts = lab.hosts("a", "b", "r")
+    a, b, r = (Module(h, agent(h, name=h.name, config=RELAY if h.name == "r" else ""), shell(h)) for h in hosts)
+    full_mesh(a, b, r)
+    heard = b.ros.roscpp("listener", topic="/chatter")
+    a.ros.roscpp("talker", topic="/chatter", rate=100)
+    report = flows(heard, 50)
+    assert (report["bad"], report["gaps"], report["doubled"]) == (0, 0, 0)
+    assert b.ros.tool("rostopic", "info", "/chatter").count("/talker") == 1
+    assert b.agent.peers()["a"]["state"] == "linked"

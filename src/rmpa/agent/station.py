@@ -68,6 +68,7 @@ class Station:
             settings.domain,
             further_addresses(usable, address),
         )
+        bridge.place(self.identity)
         self.mesh = Mesh(
             self.identity,
             tcp,

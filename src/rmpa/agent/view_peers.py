@@ -10,6 +10,8 @@ from rmpa.core.aio.clock import SystemClock
 from rmpa.monitor.snapshot import LinkInfo, PeerInfo
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rmpa.agent.station import Station
     from rmpa.bridge.aio.bridge import Attached, Bridge
     from rmpa.discovery.events import PeerView
@@ -43,7 +45,19 @@ class PeersView:
                 theirs = len(self._bridge.imports.offered_by(attached.peer))
                 info = msgspec.structs.replace(info, topics_in=theirs, topics_out=ours)
             infos.append(info)
-        return tuple(sorted(infos, key=lambda info: (info.name, info.guid)))
+        relayed = self._relayed({info.instance: info for info in infos})
+        infos = [info for info in infos if info.instance not in {one.instance for one in relayed}]
+        return tuple(sorted((*infos, *relayed), key=lambda info: (info.name, info.guid)))
+
+    def _relayed(self, known: Mapping[str, PeerInfo]) -> list[PeerInfo]:
+        """Modules without a link whose topics a relay passes on; their beacons may be heard all the same."""
+        infos = []
+        for origin, via in self._bridge.imports.ways:
+            blank = PeerInfo(name=origin.name, guid=origin.guid, instance=origin.instance, state="", since_ago=0.0)
+            info = known.get(origin.instance, blank)
+            topics = self._bridge.imports.relayed_topics(origin.instance)
+            infos.append(msgspec.structs.replace(info, state="relayed", via=via, topics_in=len(topics)))
+        return infos
 
     def _peer(
         self, view: PeerView | None, status: PeerStatus | None, attached: Attached | None, now: float

@@ -201,6 +201,15 @@ class Imports:
         """The topics that a peer offers, as they are here."""
         return known.topics.keys() if (known := self._peers.get(peer)) is not None else ()
 
+    def relayed_topics(self, instance: str) -> set[str]:
+        """The topics of a module that relays pass on, as they are here."""
+        return {
+            known.sources[source].topic
+            for known in self._peers.values()
+            for source in known.relayed.get(instance, ())
+            if known.sources[source].shown
+        }
+
     def local_type(self, topic: str, type_name: str | None) -> list[Action]:
         """Say the type of a topic that local nodes publish, or ``None`` for one that they do not.
 
@@ -326,7 +335,7 @@ class Imports:
         return _gone(peer, known.sources) if known is not None else iter(())
 
     def unlinked(self, peer: int) -> list[Action]:
-        """Behind ``link_down``: what relays offer of the peer is needed now; what it offered, others may offer too."""
+        """Behind ``link_down``: relays may bring on what the peer brought, and what it passed on."""
         return self._ways_changed(self.ways.unlinked(peer))
 
     def _ways_changed(self, instances: Collection[str]) -> list[Action]:

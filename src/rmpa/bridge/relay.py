@@ -1,4 +1,4 @@
-"""Relaying: what a module with a cable in two networks passes on between them (the paper's proxy functionality). Pure.
+"""Relaying: what a module with a cable in two networks passes on between them, as the paper's proxies do. Pure.
 
 ::
 
@@ -127,6 +127,9 @@ class Ways:
             best = self._best(instance)
             if best is not None and not self._direct(instance):
                 yield known.origin, self._linked[best].name
+
+    def __contains__(self, instance: str) -> bool:
+        return instance in self._origins
 
     def linked(self, peer: int, who: Linked) -> set[str]:
         """A peer has a link; return the modules whose way may be another one now."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rmpa.monitor.snapshot import PeerInfo, RouteInfo, Snapshot, TopicInfo
 
 _HERE: Final = "rmpa.cli.peer"
-_COLOURS: Final = {"linked": "green", "linking": "yellow", "refused": "red", "conflict": "red"}
+_COLOURS: Final = {"linked": "green", "relayed": "green", "linking": "yellow", "refused": "red", "conflict": "red"}
 _COLUMNS: Final = (
     Column("PEER"),
     Column("STATE"),
@@ -91,6 +91,8 @@ def list_(as_json: bool, agent: str | None) -> None:
 def _row(info: PeerInfo) -> list[str]:
     name = printable(info.name)
     link = info.link
+    if info.via:
+        return [name, info.state, "-", f"via {printable(info.via)}", "-", "-", "-", "-", "-", "-", "-"]
     if link is None:
         address = info.guid.partition("#")[0]
         return [name, info.state, duration(info.since_ago), address, "-", "-", "-", "-", "-", "-", "-"]
@@ -114,7 +116,7 @@ def _troubles(snapshot: Snapshot) -> list[str]:
     found = list(snapshot.notes)
     for info in snapshot.peers:
         found += [f"{info.name}: {conflict}" for conflict in info.conflicts]
-        if info.last_error and info.state != "linked":
+        if info.last_error and info.state not in {"linked", "relayed"}:
             again = "" if info.next_attempt is None else f"; next attempt in {duration(info.next_attempt)}"
             found.append(f"{info.name}: {info.last_error}{again}")
     return [printable(text) for text in found]
@@ -181,7 +183,7 @@ def _facts(info: PeerInfo) -> list[tuple[str, str]]:
     facts = [
         ("Peer", info.name),
         ("GUID", info.guid),
-        ("State", f"{info.state} for {duration(info.since_ago)}"),
+        ("State", f"relayed by {info.via}" if info.via else f"{info.state} for {duration(info.since_ago)}"),
         ("Addresses", ", ".join(info.addresses) or "-"),
         ("Found", f"{duration(info.found_ago)} ago by {info.source or 'a link'}"),
         ("Last beacon", f"{duration(info.beacon_ago)} ago" if info.beacon_ago is not None else "-"),

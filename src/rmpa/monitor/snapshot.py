@@ -86,7 +86,8 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
         instance: The random id of its run, 32 hexadecimal digits.
         addresses: Where it can be reached, best first.
         state: ``linked``; ``linking`` (dialling, or waiting to be dialled); ``refused`` (it said no, or we did);
-            ``conflict`` (shares a GUID or a name with another).
+            ``conflict`` (shares a GUID or a name with another); ``relayed`` (no link, but another peer passes on what
+            it publishes).
         since_ago: Seconds since it came into this state.
         found_ago: Seconds since it was first heard of.
         beacon_ago: Seconds since its last beacon.
@@ -97,6 +98,7 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
         conflicts: What is wrong with its identity, each ready to read.
         topics_in: Topics that it offers us.
         topics_out: Topics that we offer it.
+        via: The name of the peer that passes on what it publishes, if one does.
     """
 
     name: str
@@ -114,6 +116,7 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
     conflicts: tuple[str, ...] = ()
     topics_in: int = 0
     topics_out: int = 0
+    via: str = ""
 
 
 class Spread(msgspec.Struct, kw_only=True, frozen=True):

@@ -26,25 +26,29 @@ from rmpa.bridge.messages import (
     Mismatch,
     Open,
     Opened,
+    Origin,
     Source,
     decode,
     encode,
 )
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import OWN_NODE, Policy, is_own
-from rmpa.bridge.proxy_names import proxy_prefix
+from rmpa.bridge.proxy_names import proxy_name, proxy_prefix
+from rmpa.bridge.relay import Linked, Relay
 from rmpa.core import limits
 from rmpa.core.aio.loop import breathe
 from rmpa.core.contract import Contracts, Priority
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
 from rmpa.core.names import is_type_name
 from rmpa.mesh.frames import Kind as FrameKind
 from rmpa.ros.aio.slave_server import SlaveNode
 from rmpa.ros.master.effects import GraphChange, Kind
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
     from rmpa.bridge.aio.part import DataTaker, Part
     from rmpa.bridge.watch import Occurred
@@ -80,6 +84,7 @@ class Bridge:
         policy: What may cross.
         contracts: What its topics need.
         names: How names read at the peers, and theirs here.
+        relay: Whether what comes from one peer is offered to others.
         rng: Uniform numbers in [0, 1) for back-off jitter.
     """
 
@@ -91,6 +96,7 @@ class Bridge:
         rng: Callable[[], float],
         contracts: Contracts | None = None,
         names: Names | None = None,
+        relay: bool = False,
     ) -> None:
         self._core = core
         self.names = names if names is not None else Names()
@@ -133,7 +139,14 @@ class Bridge:
         self._refusals = RefusalLog(_log, self.counters)
         self.asks = Asks(self.counters)
         self._presence = Presence(self._exports, self._imports, self._by_number.get, self._refusals)
+        self.relay = Relay(enabled=relay)
+        """What is passed on between peers."""
+        self._relayed: dict[str, str] = {}
         self._parts: list[Part] = [self.asks, self._presence]
+
+    def place(self, identity: Identity) -> None:
+        """Who we are, from now on: what comes back to us by relays is told by it. There are no links yet."""
+        self.relay.instance = self._imports.ways.instance = identity.instance.hex()
 
     def add(self, part: Part) -> None:
         """Let a part hear of everything; before ``start()``."""
@@ -220,13 +233,12 @@ class Bridge:
             back.back = self._loop.call_later(limits.RESUME_CLAIM, self._unclaimed, back)
             back.inbound.time.resumed_at = lambda: link.resumed_at
             self._by_link[link] = back
-            self._act(self._imports.link_up(back.peer, link.identity.name))
-            self._act(self._exports.link_up(back.peer, link.identity.name))
+            self._introduce(back)
             self._parts_link_up(back)
             self._schedule()
             return
         peer = next(self._numbers)
-        prefix = proxy_prefix(link.identity, {attached.inbound.prefix for attached in self._by_number.values()})
+        prefix = proxy_prefix(link.identity, self._prefixes(link.identity.instance.hex()))
         inbound = Inbound(
             self._core,
             prefix,
@@ -239,10 +251,29 @@ class Bridge:
         inbound.time.resumed_at = lambda: link.resumed_at
         attached = Attached(peer, link, inbound)
         self._by_number[peer] = self._by_link[link] = attached
-        self._act(self._imports.link_up(peer, link.identity.name))
-        self._act(self._exports.link_up(peer, link.identity.name))
+        self._introduce(attached)
         self._parts_link_up(attached)
         self._schedule()
+
+    def _introduce(self, attached: Attached) -> None:
+        who = attached.link.identity
+        linked = Linked(who.name, who.instance.hex(), who.guid)
+        self._act(self._imports.link_up(attached.peer, who.name, linked))
+        self._act(self._exports.link_up(attached.peer, who.name, linked.instance))
+
+    def _prefixes(self, instance: str) -> set[str]:
+        """The namespaces of proxies that a module must leave to others."""
+        linked = (a for a in self._by_number.values() if a.link.identity.instance.hex() != instance)
+        relayed = (prefix for other, prefix in self._relayed.items() if other != instance)
+        return {*(attached.inbound.prefix for attached in linked), *relayed}
+
+    def _stands_for(self, origin: Origin) -> str:
+        """What stands here for a node that a relay passes on: the same as if its module had a link."""
+        prefix = self._relayed.get(origin.instance)
+        if prefix is None:
+            module = Identity(Guid.parse(origin.guid), bytes.fromhex(origin.instance), origin.name)
+            prefix = self._relayed[origin.instance] = proxy_prefix(module, self._prefixes(origin.instance))
+        return proxy_name(prefix, origin.node)
 
     def _parts_link_up(self, attached: Attached) -> None:
         for part in self._parts:
@@ -390,6 +421,9 @@ class Bridge:
         if source is None:
             return  # it went meanwhile
         who = f"{attached.link.name}: {source}"
+        if not message.text:
+            self._mismatches.get(source, {}).pop(f"{attached.link.name}{message.subscriber}", None)
+            return
         self._remember(source, f"{attached.link.name}{message.subscriber}", message.text)
         self._warn("mismatch.remote", who, f"{who}: {message.text}")
 
@@ -412,6 +446,7 @@ class Bridge:
             if timer is not None:
                 timer.cancel()
         self._by_number.pop(attached.peer, None)
+        self._forget_mismatches(attached.link.name)
         if self._by_link.pop(attached.link, None) is not None:
             for part in self._parts:
                 part.link_down(attached)
@@ -421,6 +456,8 @@ class Bridge:
             self._act([action])
         # Its actions are what closing the inbound side does at once.
         self._forgetting.append(self._imports.link_down(attached.peer))
+        self.relay.peer_gone(attached.peer)
+        self._act(self._imports.unlinked(attached.peer))
         self._schedule()
         task = asyncio.create_task(attached.inbound.close(), name=f"retract {attached.inbound.prefix}")
         self._closing.add(task)
@@ -447,6 +484,8 @@ class Bridge:
                 self._types.pop(source, None)
             elif is_type_name(change.type):
                 self._types[source] = change.type
+        elif change.kind is Kind.SUBSCRIBER and self._mismatches:
+            self._comes_anew(change.name, change.node)
         if change.kind is not Kind.SERVICE:
             self._changed[change.name] = None
             self._schedule()
@@ -518,11 +557,23 @@ class Bridge:
         return self._imports.portions(attached.peer, message)
 
     def _look_at(self, topic: str) -> None:
-        nodes = {node: uri for node, uri in self._core.publishers(topic).items() if not is_own(node)}
+        publishers = self._core.publishers(topic)
+        nodes = {node: uri for node, uri in publishers.items() if not is_own(node)}
         said = self._core.type_of(topic) if nodes else ""
         local = {node: LocalSource(self._types.get(Source(topic, node)) or said, uri) for node, uri in nodes.items()}
-        self._act(self._exports.graph(topic, local))
+        self._act(self._exports.graph(topic, local | self._to_relay(topic, publishers)))
         self._act(self._imports.local_type(topic, next((one.type for one in reversed(local.values())), None)))
+
+    def _to_relay(self, topic: str, publishers: Mapping[str, str]) -> dict[str, LocalSource]:
+        """What of a topic is passed on for other modules."""
+        if not self.relay.enabled:
+            return {}
+        said = self._core.type_of(topic)
+        return {
+            node: LocalSource(self._types.get(Source(topic, node)) or said, uri, origin)
+            for node, uri in publishers.items()
+            if (origin := self.relay.origin((topic, node))) is not None
+        }
 
     def _reconcile(self) -> None:
         self._reconciler = self._loop.call_later(limits.RECONCILE_INTERVAL, self._reconcile)
@@ -532,6 +583,7 @@ class Bridge:
             breathe()
             if again := attached.inbound.reconcile(publishers):
                 self.counters.add("proxy.registered_again", again)
+        self._relayed = {i: prefix for i, prefix in self._relayed.items() if i in self._imports.ways}
         for part in self._parts:
             breathe()
             part.reconcile()
@@ -553,6 +605,18 @@ class Bridge:
         known = self._mismatches.setdefault(source, {})
         if who in known or len(known) < limits.MISMATCHES_MAX:
             known[who] = text
+
+    def _comes_anew(self, topic: str, subscriber: str) -> None:
+        """A local subscriber has gone, or begins again: that it did not fit before is over, here and over there."""
+        for peer, source in list(self._imports.at(topic)):
+            if self._mismatches.get(source, {}).pop(subscriber, None) is not None:
+                self._act([act.Send(peer, Mismatch(source.topic, source.node, subscriber, ""))])
+
+    def _forget_mismatches(self, name: str) -> None:
+        """A peer is gone, with all its nodes that were refused."""
+        for known in self._mismatches.values():
+            for who in [who for who in known if who == name or who.startswith(name + "/")]:
+                del known[who]
 
     def _described(self, source: Source, description: Description) -> None:
         self._act(self._exports.described(source, description))
@@ -632,8 +696,9 @@ class Bridge:
             return
         match action:
             case act.Publish():
-                attached.inbound.publish(action)
+                self._publish(attached, action)
             case act.Retract():
+                self.relay.gone(action.peer, action.source)
                 attached.inbound.retract(action)
             case act.Describe():
                 # This link: of the next one the same number is another source's route.
@@ -644,6 +709,16 @@ class Bridge:
                 self._presence.changed(action.peer, action.source)
             case act.Detach():
                 attached.inbound.detach(action)
+
+    def _publish(self, attached: Attached, action: act.Publish) -> None:
+        source, origin, who = action.source, action.origin, attached.link.identity
+        name = proxy_name(attached.inbound.prefix, source.node)
+        if origin is not None:
+            name = attached.inbound.names[source.node] = self._stands_for(origin)
+        if self.relay.enabled:
+            whose = origin or Origin(who.name, str(who.guid), who.instance.hex(), source.node)
+            self.relay.shown(action.peer, source, (action.topic or source.topic, name), whose)
+        attached.inbound.publish(action)
 
     def _warn(self, kind: str, who: str, text: str) -> None:
         self._refusals.refuse(self._loop.time(), kind, who, text)

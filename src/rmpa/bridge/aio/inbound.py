@@ -104,6 +104,8 @@ class Inbound:
         self._holds: dict[tuple[str, str], Callable[[SlaveNode], None]] = {}
         self._jobs: asyncio.Queue[Publish | Retract | _Hold | None] = asyncio.Queue()
         self._task = asyncio.create_task(self._work(), name=f"proxies {prefix}")
+        self.names: dict[str, str] = {}
+        """Of nodes of other modules that the peer passes on: what stands for them here."""
         self.flows: dict[int, ImportFlow] = {}
         """Open routes; the data path looks here."""
         self.time = LinkTime()
@@ -373,7 +375,7 @@ class Inbound:
         """The proxy of a node, made if it is not there."""
         proxy = self._proxies.get(remote)
         if proxy is None:
-            name = proxy_name(self.prefix, remote)
+            name = self.names.get(remote) or proxy_name(self.prefix, remote)
             node = SlaveNode(
                 name,
                 self._core.node_host,
