@@ -16,11 +16,13 @@ from rmpa.agent.clocks import Clocks
 from rmpa.agent.core_choice import make_core
 from rmpa.agent.diagnostics import Diagnostics
 from rmpa.agent.params import ParamOps
+from rmpa.agent.reload import Hangups, Reloader
 from rmpa.agent.station import Station
 from rmpa.agent.view import View
 from rmpa.agent.why import Why
 from rmpa.bridge.aio.bridge import Bridge
 from rmpa.bridge.aio.params import Params
+from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
 from rmpa.core import limits
 from rmpa.core.aio import realtime
@@ -38,10 +40,14 @@ from rmpa.monitor.snapshot import FollowedInfo, PingReply, Snapshot
 from rmpa.ros.aio.logger_services import LoggerServices
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rmpa.bridge.aio.bridge import Attached
     from rmpa.core.config import Settings
+    from rmpa.core.config_sources import Loaded
     from rmpa.mesh.aio.link import MeshLink
     from rmpa.monitor.diagnosis import Diagnosis
+    from rmpa.monitor.reloading import ReloadReply
     from rmpa.ros.aio.core_api import Core
 
 _log = logging.getLogger(__name__)
@@ -58,9 +64,15 @@ class Agent:
     Args:
         settings: Complete: the name is filled in.
         wishes: What ``realtime.apply`` brought.
+        load: Reads the settings again, as they were read for this agent; it may block.
     """
 
-    def __init__(self, settings: Settings, wishes: tuple[realtime.Wish, ...] = ()) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        wishes: tuple[realtime.Wish, ...] = (),
+        load: Callable[[], Loaded] | None = None,
+    ) -> None:
         self._settings = settings
         self._control = ControlServer(
             runtime_dir(os.environ, settings.runtime_dir),
@@ -69,6 +81,7 @@ class Agent:
                 "snapshot": self._snapshot,
                 "ping": self._ping,
                 "why": self._why,
+                "reload": self._reload,
                 "param": self._param,
                 "followed": self._followed,
             },
@@ -76,9 +89,10 @@ class Agent:
         self.core: Core = make_core(settings)
         self.bridge = Bridge(
             self.core,
-            Policy(settings.policy),
+            Policy(settings.policy, settings.peers),
             rng=random.random,
             contracts=Contracts(settings.contracts),
+            names=Names(settings.peers),
             relay=settings.relay,
         )
         self.station: Station | None = None
@@ -99,6 +113,8 @@ class Agent:
         self.params = Params(self.core, self.bridge, settings.name, settings.params, settings.time)
         self.bridge.add(self.params)
         self._param_ops = ParamOps(self.params, self.bridge.asks, self._attached)
+        self.reloader = Reloader(settings, load, self._take)
+        self._view.waiting = lambda: self.reloader.waiting
         self._whys = Why(settings, self.core, self.bridge, self._view)
 
     async def start(self) -> None:
@@ -169,6 +185,14 @@ class Agent:
         finally:
             self._moving = None
 
+    def _take(self, settings: Settings) -> None:
+        """Let other settings hold; only what ``agent.reload`` calls live differs."""
+        self._settings = settings
+        logging.getLogger().setLevel(settings.log_level.upper())
+        self.bridge.reload(settings)
+        self._view.reload(settings)
+        self._whys.reload(settings)
+
     # --- the control socket's handlers -------------------------------------------------------------------------
 
     def _snapshot(self, args: dict[str, object]) -> Snapshot:
@@ -185,6 +209,9 @@ class Agent:
         times = [await link.ping() for _ in range(count)]
         host, port = link.remote_endpoint
         return PingReply(times=tuple(times), remote=f"{host}:{port}")
+
+    async def _reload(self, args: dict[str, object]) -> ReloadReply:
+        return await self.reloader.reload(check=args.get("check") is True)
 
     async def _why(self, args: dict[str, object]) -> tuple[Diagnosis, ...]:
         return await self._whys.answer(args)
@@ -211,13 +238,17 @@ class Agent:
         raise UnreachableError("linked peer", repr(peer), remedy)
 
 
-async def _serve(settings: Settings, wishes: tuple[realtime.Wish, ...]) -> None:
-    agent = Agent(settings, wishes)
+async def _serve(
+    settings: Settings, wishes: tuple[realtime.Wish, ...], load: Callable[[], Loaded] | None = None
+) -> None:
+    agent = Agent(settings, wishes, load)
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     loop.set_default_executor(realtime.worker_pool())
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop.set)
+    hangups = Hangups(agent.reloader, stop.set)
+    hangups.start()
     await agent.start()
     try:
         notify_service_manager("READY=1")
@@ -225,11 +256,16 @@ async def _serve(settings: Settings, wishes: tuple[realtime.Wish, ...]) -> None:
         notify_service_manager("STOPPING=1")
         _log.info("= ending")
     finally:
+        await hangups.close()
         await agent.close()
 
 
-def run(settings: Settings) -> int:
+def run(settings: Settings, load: Callable[[], Loaded] | None = None) -> int:
     """Run an agent until SIGINT or SIGTERM; return the exit code.
+
+    Args:
+        settings: Complete.
+        load: Reads them again, at SIGHUP and `rmpa reload`.
 
     Raises:
         StartError: It cannot start on this machine as asked.
@@ -238,5 +274,5 @@ def run(settings: Settings) -> int:
     sys.setswitchinterval(limits.THREAD_SWITCH)
     wishes = realtime.apply(settings.realtime)
     with asyncio.Runner(loop_factory=AgentLoop) as runner:
-        runner.run(_serve(settings, wishes))
+        runner.run(_serve(settings, wishes, load))
     return 0

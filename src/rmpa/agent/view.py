@@ -18,7 +18,7 @@ from rmpa.core.aio.realtime import refused
 from rmpa.monitor.snapshot import AgentInfo, Snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Callable, Collection
 
     from rmpa.agent.clocks import Clocks
     from rmpa.agent.station import Station
@@ -65,6 +65,13 @@ class View:
         self._peers = PeersView(bridge)
         self._topics = TopicsView(settings, core, bridge, clocks)
         self.station: Station | None = None
+        self.waiting: Callable[[], tuple[str, ...]] = tuple
+        """What the settings say and only a restart brings."""
+
+    def reload(self, settings: Settings) -> None:
+        """Other settings hold from now on."""
+        self._settings = settings
+        self._topics.reload(settings)
 
     def snapshot(self, topics: Collection[str] | None = None) -> Snapshot:
         """Everything at this moment; data goes on in between.
@@ -91,6 +98,7 @@ class View:
     def _notes(self) -> tuple[str, ...]:
         notes = tuple(self.station.discovery.notes()) if self.station is not None else ()
         notes += self._core.notes()
+        notes += tuple(f"{key} waits for a restart" for key in self.waiting())
         missing = refused(self._wishes)
         return (*notes, missing) if missing else notes
 

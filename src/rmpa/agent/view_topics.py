@@ -47,7 +47,11 @@ class TopicsView:
         self._clocks = clocks
         self._bridge = bridge
         self._clock = SystemClock()
-        self._policy = Policy(settings.policy)
+        self.reload(settings)
+
+    def reload(self, settings: Settings) -> None:
+        """Other settings hold from now on."""
+        self._policy = Policy(settings.policy, settings.peers)
         self._contracts = Contracts(settings.contracts)
 
     def infos(self, wanted: Collection[str] | None = None) -> tuple[TopicInfo, ...]:

@@ -46,9 +46,13 @@ class Why:
         self._core = core
         self._bridge = bridge
         self._view = view
-        self._policy = Policy(settings.policy)
+        self.reload(settings)
         bridge.asks.on(TOPIC, self._tell_topic)
         bridge.asks.on(HERE, self._tell_here)
+
+    def reload(self, settings: Settings) -> None:
+        """Other settings hold from now on."""
+        self._policy = Policy(settings.policy, settings.peers)
 
     async def answer(self, args: dict[str, object]) -> tuple[Diagnosis, ...]:
         """The control socket's op ``why``.

@@ -7,6 +7,8 @@ import logging
 import os
 import socket
 import sys
+from functools import partial
+from pathlib import Path
 
 import click
 
@@ -93,7 +95,8 @@ def up(
         log_json,
         realtime,
     )
-    loaded = load_settings(flags, os.environ, host_name=socket.gethostname())
+    load = partial(load_settings, flags, dict(os.environ), host_name=socket.gethostname(), cwd=Path.cwd())
+    loaded = load()
     writer = LogWriter(sys.stderr.fileno())
     configure_logging(loaded.settings.log_level, writer, as_json=loaded.settings.log_json)
     for note in loaded.notes:
@@ -103,6 +106,6 @@ def up(
     from rmpa.agent import run
 
     try:
-        return run(loaded.settings)
+        return run(loaded.settings, load)
     finally:
         writer.close()

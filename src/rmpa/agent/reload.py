@@ -1,0 +1,201 @@
+"""Reads the settings again while the agent runs, and lets those take effect that can (SIGHUP, ``rmpa reload``)."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+import time
+from dataclasses import fields, is_dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core.aio.notify import notify_service_manager
+from rmpa.core.errors import ConfigError
+from rmpa.monitor.reloading import ReloadReply
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from rmpa.core.config import Settings
+    from rmpa.core.config_sources import Loaded
+
+_log = logging.getLogger(__name__)
+
+LIVE: Final = frozenset({"policy", "peers", "contracts", "services", "params", "time", "log_level"})
+"""The settings that a running agent takes; all others need a restart."""
+_KEYS: Final = {
+    "core_mode": "core.mode",
+    "core_master": "core.master",
+    "core_host": "core.host",
+    "core_port": "core.port",
+    "port": "mesh.port",
+    "interfaces": "discovery.interfaces",
+    "seeds": "discovery.seeds",
+    "group": "discovery.multicast",
+    "group_port": "discovery.multicast",
+    "multicast": "discovery.multicast",
+    "policy": "bridge",
+    "contracts": "[[contract]]",
+    "peers": "[[peer]]",
+    "params.follow": "[[param]]",
+    "services.rules": "[[service]]",
+    "relay": "relay.enabled",
+    "log_level": "log.level",
+    "log_json": "log.json",
+}
+"""What users call a setting, where that is not its own name."""
+_VALUE_SHOWN: Final = 60
+"""Characters of a value that are shown."""
+
+
+class Reloader:
+    """Reads the settings again, one request after the other.
+
+    Args:
+        settings: Those that the agent runs with.
+        load: Reads all sources again; may take long and raise ``ConfigError``.
+        apply: Takes the settings that hold from now on; only what is in ``LIVE`` differs.
+    """
+
+    def __init__(
+        self, settings: Settings, load: Callable[[], Loaded] | None, apply: Callable[[Settings], None]
+    ) -> None:
+        self._settings = settings
+        self._load = load
+        self._apply = apply
+        self._one = asyncio.Lock()
+        self.waiting: tuple[str, ...] = ()
+        """What the settings say and only a restart brings, as of the last time that they were read."""
+
+    async def reload(self, *, check: bool = False) -> ReloadReply:
+        """Read the settings and let take effect what can; settings that cannot be used change nothing.
+
+        Args:
+            check: Only say what would come of it.
+
+        Raises:
+            ConfigError: This agent was started from a program, without a file to read again.
+        """
+        if self._load is None:
+            raise ConfigError("the settings", "this agent was given them by a program", "change them there")
+        async with self._one:
+            try:
+                # A long file takes long to read, and longer to find a mistake's line in.
+                loaded = await asyncio.to_thread(self._load)
+            except ConfigError as error:
+                if not check:
+                    _log.error("! the settings stay as they are: %s", error)
+                return ReloadReply(problem=str(error))
+            reply = self._compare(loaded)
+            if not check:
+                self._take(loaded.settings, reply)
+            return reply
+
+    def _compare(self, loaded: Loaded) -> ReloadReply:
+        differences = list(_differences(self._settings, loaded.settings))
+        return ReloadReply(
+            file=str(loaded.settings.config_file or ""),
+            changed=tuple(dict.fromkeys(key for name, key, _, _ in differences if name in LIVE)),
+            restart=tuple(
+                f"{key} ({_shown(new)} instead of {_shown(old)})"
+                for name, key, old, new in differences
+                if name not in LIVE
+            ),
+            notes=loaded.notes,
+        )
+
+    def _take(self, settings: Settings, reply: ReloadReply) -> None:
+        self._settings = replace(
+            self._settings,
+            config_file=settings.config_file,
+            **{name: getattr(settings, name) for name in LIVE},
+        )
+        self.waiting = reply.restart
+        if reply.changed:
+            self._apply(self._settings)
+        _log.info("= settings read again: %s", ", ".join(reply.changed) if reply.changed else "nothing has changed")
+        for note in reply.notes:
+            _log.warning("%s", note)
+        for key in reply.restart:
+            _log.warning("! %s only holds after a restart", key)
+
+
+class Hangups:
+    """What SIGHUP does: read the settings again; but where our terminal was closed, end, as every program there does.
+
+    Args:
+        reloader: Reads them.
+        stop: Ends the agent.
+    """
+
+    def __init__(self, reloader: Reloader, stop: Callable[[], object]) -> None:
+        self._reloader = reloader
+        self._stop = stop
+        self._had_terminal = _has_terminal()
+        self._running: set[asyncio.Task[None]] = set()
+
+    def start(self) -> None:
+        """Listen, unless the signal is ignored: then somebody wants it so (``nohup``)."""
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+            asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._came)
+
+    async def close(self) -> None:
+        """Listen no more."""
+        asyncio.get_running_loop().remove_signal_handler(signal.SIGHUP)
+        for task in self._running:
+            task.cancel()
+        await asyncio.gather(*self._running, return_exceptions=True)
+
+    def _came(self) -> None:
+        if self._had_terminal and not _has_terminal():
+            _log.info("= the terminal is gone")
+            self._stop()
+            return
+        task = asyncio.create_task(self._reload(), name="read the settings again")
+        self._running.add(task)
+        task.add_done_callback(self._running.discard)
+
+    async def _reload(self) -> None:
+        notify_service_manager(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
+        try:
+            await self._reloader.reload()
+        except ConfigError as error:
+            _log.error("! the settings stay as they are: %s", error)
+        except Exception:  # noqa: BLE001 - the task's top
+            _log.exception("! the settings could not be read again")
+        finally:
+            notify_service_manager("READY=1")
+
+
+def _has_terminal() -> bool:
+    """Whether this process has a controlling terminal that is still there."""
+    try:
+        os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY | os.O_CLOEXEC))
+    except OSError:
+        return False
+    return True
+
+
+def _differences(old: Settings, new: Settings) -> Iterator[tuple[str, str, object, object]]:
+    """``(setting, its key, old value, new value)`` of each that differs."""
+    for item in fields(old):
+        before, after = getattr(old, item.name), getattr(new, item.name)
+        if before == after or item.name == "config_file":
+            continue
+        key = _KEYS.get(item.name, item.name)
+        if is_dataclass(before) and is_dataclass(after):
+            for part in fields(before):
+                one, other = getattr(before, part.name), getattr(after, part.name)
+                if one != other:
+                    yield item.name, _KEYS.get(f"{item.name}.{part.name}", f"{key}.{part.name}"), one, other
+        else:
+            yield item.name, key, before, after
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, tuple):
+        text = "[" + ", ".join(map(str, value)) + "]"
+    else:
+        text = str(value).lower() if isinstance(value, bool) else str(value) or "nothing"
+    return text if len(text) <= _VALUE_SHOWN else text[: _VALUE_SHOWN - 3] + "..."
