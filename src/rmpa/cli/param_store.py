@@ -1,0 +1,224 @@
+"""Where ``rmpa param`` reads and writes: a ROS master, or a peer through this machine's agent."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import secrets
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from rmpa.bridge import param_transfer as transfer
+from rmpa.bridge.params import key_problem, leaves
+from rmpa.cli.master import Master, choose_master
+from rmpa.core.config_values import did_you_mean
+from rmpa.core.errors import ConfigError, LocalProtocolError, RmpaError, UnreachableError
+from rmpa.core.names import is_legal_name
+from rmpa.monitor.aio.control_client import ControlClient, choose_agent
+
+if TYPE_CHECKING:
+    from collections.abc import Generator, Mapping
+
+    from rmpa.ros.xmlrpc import Reply, XmlRpcValue
+
+_CALLER: Final = "/rmpa_param"
+_FOR_ALL: Final = 30.0
+"""Seconds for one call of a master: megabytes of XML, on a busy machine."""
+
+
+class Store(Protocol):
+    """The parameters of one master."""
+
+    @property
+    def title(self) -> str:
+        """Whose they are, for texts."""
+        ...
+
+    def get(self, key: str) -> XmlRpcValue:
+        """A value, or a namespace.
+
+        Raises:
+            RmpaError: There is none; the nearest name is offered.
+        """
+        ...
+
+    def names(self) -> list[str]:
+        """The names of all parameters, in order."""
+        ...
+
+    def set(self, key: str, value: XmlRpcValue) -> int:
+        """Set a parameter, or each member of a namespace; return how many. Nothing is set where one cannot be."""
+        ...
+
+    def delete(self, key: str) -> None:
+        """Take a parameter or namespace away.
+
+        Raises:
+            RmpaError: There is none.
+        """
+        ...
+
+
+def open_store(peer: str | None, master: str | None, agent: str | None) -> Store:
+    """The store that the flags name.
+
+    Raises:
+        ConfigError: Flags that exclude each other.
+        RmpaError: There is no such agent.
+    """
+    if peer is None:
+        return MasterStore(choose_master(master, agent, os.environ))
+    if master is not None:
+        raise ConfigError("--peer", "a peer is asked through this machine's agent, not at a master", "leave one out")
+    return PeerStore(ControlClient(choose_agent(os.environ, agent).path), peer)
+
+
+def read_key(text: str, environ: Mapping[str, str], *, root: bool = False) -> str:
+    """A parameter's global name from what a user writes; a relative one is of ROS_NAMESPACE.
+
+    Raises:
+        ConfigError: It is none.
+    """
+    from rmpa.core.names import resolve_name
+
+    namespace = environ.get("ROS_NAMESPACE") or "/"
+    if not text and root:
+        return resolve_name("", namespace if is_legal_name(namespace) else "/")
+    if text.startswith("~"):
+        raise ConfigError("KEY", f"{text!r} is private to a node", "write the node's name in front: /node/name")
+    key = text if text.startswith("/") else f"{namespace.rstrip('/')}/{text}"
+    key = "/" + key.strip("/")
+    if problem := key_problem(key):
+        raise ConfigError("KEY", problem, "one looks like /robot_description")
+    return key
+
+
+def check(key: str, value: XmlRpcValue) -> list[tuple[str, XmlRpcValue]]:
+    """The parameters that a value makes.
+
+    Raises:
+        RmpaError: A name in it cannot be one.
+    """
+    found = list(leaves(key, value))
+    for name, one in found:
+        if name == "/":
+            raise RmpaError(f"the root can only be set to a dictionary, not to {one!r}")
+        if problem := key_problem(name):
+            raise RmpaError(problem)
+    return found
+
+
+def absent(key: str, names: list[str], title: str) -> RmpaError:
+    """The error for a parameter that is not there."""
+    known = {name for full in names for name in _with_namespaces(full)}
+    near = did_you_mean(key, known)
+    return RmpaError(f"{title} has no parameter {key}; " + (f"did you mean {near}?" if near else "`rmpa param list`"))
+
+
+def _with_namespaces(name: str) -> list[str]:
+    parts = name.split("/")
+    return ["/".join(parts[:end]) for end in range(2, len(parts) + 1)]
+
+
+@dataclass
+class MasterStore:
+    """The parameters of a ROS master, whichever it is."""
+
+    master: Master
+
+    @property
+    def title(self) -> str:
+        """Its address."""
+        return self.master.uri
+
+    def get(self, key: str) -> XmlRpcValue:
+        """A value, or a namespace."""
+        reply = self._call("getParam", key)
+        if reply.code != 1:
+            raise absent(key, self.names(), self.title)
+        return reply.value
+
+    def names(self) -> list[str]:
+        """The names of all parameters, in order."""
+        value = self._call("getParamNames").value
+        return sorted(str(name) for name in value) if isinstance(value, list) else []
+
+    def set(self, key: str, value: XmlRpcValue) -> int:
+        """Set a parameter, or each member of a namespace."""
+        from rmpa.ros.xmlrpc import serialize_response
+
+        parameters = check(key, value)
+        serialize_response(value)  # what cannot be said is told before anything is set
+        for name, one in parameters:
+            reply = self._call("setParam", name, one)
+            if reply.code != 1:
+                raise RmpaError(f"{self.title} does not set {name}: {reply.status}")
+        return len(parameters)
+
+    def delete(self, key: str) -> None:
+        """Take a parameter or namespace away."""
+        reply = self._call("deleteParam", key)
+        if reply.code != 1:
+            raise absent(key, self.names(), self.title)
+
+    def _call(self, method: str, *params: XmlRpcValue) -> Reply:
+        from rmpa.ros.aio.http_client import call_api
+
+        try:
+            return asyncio.run(call_api(self.master.uri, method, _CALLER, *params, timeout=_FOR_ALL))
+        except UnreachableError:
+            raise self.master.unreachable() from None
+
+
+@dataclass
+class PeerStore:
+    """The parameters of a peer's module, asked from agent to agent."""
+
+    client: ControlClient
+    peer: str
+
+    @property
+    def title(self) -> str:
+        """The peer's name."""
+        return self.peer
+
+    def get(self, key: str) -> XmlRpcValue:
+        """A value, or a namespace."""
+        return self._value(transfer.GET, {"key": key})
+
+    def names(self) -> list[str]:
+        """The names of all parameters that we may read, in order."""
+        value = self._value(transfer.NAMES, {})
+        return sorted(str(name) for name in value) if isinstance(value, list) else []
+
+    def set(self, key: str, value: XmlRpcValue) -> int:
+        """Set a parameter, or each member of a namespace."""
+        from rmpa.ros.xmlrpc import serialize_response
+
+        check(key, value)
+        try:
+            text = serialize_response(value).decode()
+        except LocalProtocolError as error:
+            raise RmpaError(f"{key}: {error}") from None
+        return self._drive(transfer.writing(key, text, secrets.randbits(31)))
+
+    def delete(self, key: str) -> None:
+        """Take a parameter or namespace away."""
+        self._ask((transfer.DELETE, {"key": key}))
+
+    def _value(self, what: str, args: dict[str, Any]) -> XmlRpcValue:
+        from rmpa.ros.xmlrpc import parse_response
+
+        return parse_response(self._drive(transfer.reading(what, args)).encode())
+
+    def _drive(self, steps: Generator[transfer.Question, object, Any]) -> Any:
+        try:
+            question = next(steps)
+            while True:
+                question = steps.send(self._ask(question))
+        except StopIteration as done:
+            return done.value
+
+    def _ask(self, question: transfer.Question) -> object:
+        what, args = question
+        return self.client.call("param", dict[str, Any], peer=self.peer, what=what, args=args)
