@@ -1,0 +1,133 @@
+"""A real roscore in place of the embedded core: ``rmpa up --core external``."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from tests.interop.modules import Module, flows
+from tests.interop.processes import eventually
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from tests.interop.agents import Agent
+    from tests.interop.conftest import AgentFactory, ShellFactory
+    from tests.interop.namespaces import Lab
+    from tests.interop.processes import Process
+
+pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
+
+EXTERNAL: Final = ("--core", "external")
+Joined = tuple[Module, Module, "Process"]
+
+
+@pytest.fixture
+def joined(lab: Lab, shell: ShellFactory, agent: AgentFactory) -> Callable[[], Joined]:
+    """Make two linked modules, ``a`` with a real master and ``b`` with the embedded core; and that master."""
+
+    def make() -> Joined:
+        first, second = lab.hosts("a", "b")
+        ros = shell(first)
+        master = ros.master()
+        a = Module(first, agent(first, name="a", flags=EXTERNAL), ros)
+        b = Module(second, agent(second, name="b"), shell(second))
+        a.agent.wait_peer("b")
+        return a, b, master
+
+    return make
+
+
+def nodes(module: Module) -> set[str]:
+    """What the stock ``rosnode list`` says."""
+    return set(module.ros.tool("rosnode", "list").split())
+
+
+def notes(agent: Agent) -> str:
+    """What the agent wants its user to know."""
+    code, output = agent.rmpa("peer", "list")
+    assert code == 0, output
+    return output
+
+
+def test_nodes_of_a_roscore_and_of_an_embedded_core_hear_each_other_and_it_is_left_clean(
+    joined: Callable[[], Joined],
+) -> None:
+    a, b, _ = joined()
+    there = b.ros.rospy("listener", topic="/from_a")
+    here = a.ros.roscpp("listener", topic="/from_b")
+    talker = a.ros.rospy("talker", "__name:=speaker", topic="/from_a", rate=50)
+    b.ros.roscpp("talker", "__name:=speaker", topic="/from_b", rate=50)
+    flows(there)
+    flows(here)
+    assert {"/speaker", "/rmpa", "/rmpa/b/speaker"} <= nodes(a)
+    assert "/rmpa/a/speaker" in nodes(b)
+    assert "std_msgs/UInt8MultiArray" in a.ros.tool("rostopic", "info", "/from_b")
+    assert "data: " in a.ros.tool("rostopic", "echo", "-n", "1", "/from_b")
+
+    # The same name at another address: rosmaster's state is the same as before.
+    talker.kill()
+    a.ros.rospy("talker", "__name:=speaker", topic="/from_a", rate=50, source=2)
+    there.wait_event("report", where=lambda event: "2" in event["sources"])  # type: ignore[operator]
+
+    begin = time.monotonic()
+    assert a.agent.terminate() == 0
+    assert time.monotonic() - begin < 5.0
+    assert not [name for name in nodes(a) if name.startswith("/rmpa")]
+    assert "/from_b" not in a.ros.tool("rostopic", "list", "-p").split()
+
+
+def test_a_new_node_is_seen_within_a_second_and_a_dead_one_crosses_no_more(joined: Callable[[], Joined]) -> None:
+    a, b, _ = joined()
+    talker = a.ros.roscpp("talker", topic="/chatter", rate=10)
+    a.wait_topic("/chatter")
+    begin = time.monotonic()
+    eventually(lambda: "/chatter" in b.topics(), what="/chatter at b", every=0.01)
+    assert time.monotonic() - begin < 2.5, "a second and the time that rostopic takes"
+    flows(b.ros.roscpp("listener", topic="/chatter"))
+    talker.kill()
+    # The listener's subscription to the proxy goes with the proxy: only then is the topic's last name gone there.
+    eventually(lambda: "/rmpa/a/talker" not in b.ros.tool("rostopic", "info", "/chatter"), what="no proxy at b")
+    assert "/chatter" in a.topics(), "rosmaster keeps what nobody unregisters, and it is not ours to change"
+
+
+def test_what_flows_outlives_the_roscore_and_the_next_one_gets_all_of_ours(joined: Callable[[], Joined]) -> None:
+    a, b, master = joined()
+    a.ros.roscpp("talker", topic="/chatter", rate=100)
+    b.ros.roscpp("talker", "__name:=other", topic="/from_b", rate=10)
+    abroad = b.ros.roscpp("listener", topic="/chatter")
+    flows(abroad)
+    master.kill()
+    eventually(lambda: "does not answer" in notes(a.agent), what="the note")
+    flows(abroad, 50)
+    a.ros.master()
+    eventually(lambda: "does not answer" not in notes(a.agent), what="no note")
+    eventually(lambda: {"/rmpa", "/rmpa/b/other"} <= nodes(a), what="our nodes at the new master")
+    a.ros.roscpp("talker", "__name:=fresh", topic="/fresh", rate=100)
+    flows(b.ros.rospy("listener", topic="/fresh"))
+    flows(a.ros.rospy("listener", topic="/from_b"))
+    report = flows(abroad, 50)
+    assert (report["gaps"], report["doubled"]) == (0, 0)
+
+
+def test_one_agent_a_roscore_and_what_a_killed_one_left_is_purged(
+    joined: Callable[[], Joined], agent: AgentFactory
+) -> None:
+    a, b, _ = joined()
+    b.ros.roscpp("talker", "__name:=speaker", topic="/chatter", rate=50)
+    flows(a.ros.roscpp("listener", topic="/chatter"))
+    rival = agent(a.host, name="rival", flags=EXTERNAL, ready=False)
+    assert rival.process.wait() == 1
+    assert "another agent (/rmpa at http://127.0.0.1:" in rival.process.output
+    assert f"process {a.agent.pid}) joins this roscore's graph" in rival.process.output
+
+    a.agent.kill()
+    assert "/rmpa/b/speaker" in nodes(a), "else there is nothing to purge"
+    b.agent.terminate()
+    a.agent.restart()
+    eventually(lambda: "/rmpa/b/speaker" not in nodes(a), what="no leftovers")
+    b.agent.restart()
+    b.ros.roscpp("talker", "__name:=speaker2", topic="/chatter", rate=50)
+    flows(a.ros.rospy("listener", topic="/chatter"))

@@ -1,0 +1,289 @@
+"""The mirror beside a master that is another program: here the embedded one, asked as over XML-RPC."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.ros.master.api import MasterApi
+from rmpa.ros.master.effects import GraphChange, Kind
+from rmpa.ros.master.mirror import Call, Mirror, leftovers
+from rmpa.ros.master.survey import lookup_calls, read_lookups, read_survey, survey_calls
+
+if TYPE_CHECKING:
+    from rmpa.ros.master.survey import Survey
+    from rmpa.ros.xmlrpc import XmlRpcValue
+
+OURS: Final = "http://127.0.0.1:1/"
+THEIRS: Final = "http://127.0.0.1:2/"
+MOVED: Final = "http://127.0.0.1:3/"
+STRING: Final = "std_msgs/String"
+
+
+class Pair:
+    """A master, the mirror, and what the one has not been told by the other."""
+
+    def __init__(self) -> None:
+        self.master = MasterApi("http://m:1/", 1, lambda _: None)
+        self.mirror = Mirror()
+        self.writes: list[Call] = []
+        self.nodes: tuple[str, ...] = ()
+
+    def restart(self) -> None:
+        """The master is another one now, which knows nothing."""
+        self.master = MasterApi("http://m:1/", 2, lambda _: None)
+        self.writes.clear()
+
+    def theirs(self, method: str, *params: str) -> None:
+        """Another program calls the master."""
+        self.master.call(method, params)
+
+    def call(self, method: str, *params: str) -> XmlRpcValue:
+        """We do, by the mirror."""
+        self.writes.append((method, params))
+        return self.mirror.apply(method, params).value
+
+    def flush(self) -> None:
+        """What we called arrives."""
+        for method, params in self.writes:
+            assert self.master.call(method, params).code == 1
+        self.writes.clear()
+
+    def survey(self) -> Survey:
+        """Ask the master for everything."""
+        found = read_survey(self._many(survey_calls("/rmpa", self.nodes, ())), self.nodes, ())
+        nodes = [node for node in found.nodes() if node not in found.uris]
+        services = list(found.holders_of_services())
+        self.nodes = tuple(found.nodes())
+        return found.with_more(*read_lookups(self._many(lookup_calls("/rmpa", nodes, services)), nodes, services))
+
+    def look(self) -> list[Call]:
+        """Look at the master and learn; what must be registered again is written."""
+        seen = self.mirror.asked
+        again = self.mirror.learn(self.survey(), seen, {})
+        self.writes += again
+        return again
+
+    def changes(self) -> set[tuple[str, str, str]]:
+        """What has changed: ``+`` or ``-``, the topic or service, the node."""
+        return {("+" if c.added else "-", c.name, c.node) for c in self.mirror.take_changes()}
+
+    def _many(self, calls: list[XmlRpcValue]) -> XmlRpcValue:
+        return self.master.answer("system.multicall", [calls])
+
+
+@pytest.fixture
+def pair() -> Pair:
+    return Pair()
+
+
+def test_what_others_registered_is_learnt_with_types_and_places(pair: Pair) -> None:
+    pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
+    pair.theirs("registerSubscriber", "/s", "/t", "*", MOVED)
+    pair.theirs("registerService", "/p", "/srv", "rosrpc://h:9", THEIRS)
+    assert pair.look() == []
+    assert GraphChange(Kind.PUBLISHER, True, "/t", "/p", THEIRS, STRING) in pair.mirror.take_changes()
+    state = pair.mirror.state()
+    assert state == pair.master.registrations.state()
+    assert state.services == {"/srv": {"/p": "rosrpc://h:9"}}
+    assert (pair.mirror.publishers("/t"), pair.mirror.type_of("/t")) == ({"/p": THEIRS}, STRING)
+    pair.look()
+    assert pair.mirror.state() is state, "nothing is new"
+    assert pair.changes() == set()
+
+
+def test_what_is_gone_there_goes_here(pair: Pair) -> None:
+    pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
+    pair.theirs("registerService", "/p", "/srv", "rosrpc://h:9", THEIRS)
+    pair.look()
+    pair.theirs("unregisterPublisher", "/p", "/t", THEIRS)
+    pair.theirs("unregisterService", "/p", "/srv", "rosrpc://h:9")
+    pair.changes()
+    pair.look()
+    assert pair.changes() == {("-", "/t", "/p"), ("-", "/srv", "/p")}
+
+
+def test_a_node_that_restarts_between_two_looks_went_and_came(pair: Pair) -> None:
+    pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
+    pair.theirs("registerService", "/p", "/srv", "rosrpc://h:9", THEIRS)
+    pair.look()
+    pair.changes()
+    pair.theirs("registerPublisher", "/p", "/t", STRING, MOVED)
+    pair.theirs("registerService", "/p", "/srv", "rosrpc://h:10", MOVED)
+    pair.look()
+    assert pair.changes() == {(sign, name, "/p") for sign in "+-" for name in ("/t", "/srv")}
+    assert pair.mirror.state() == pair.master.registrations.state()
+
+
+def test_a_type_that_comes_later_is_told_but_each_publisher_keeps_its_own(pair: Pair) -> None:
+    pair.theirs("registerSubscriber", "/s", "/t", "*", MOVED)
+    pair.look()
+    pair.theirs("registerSubscriber", "/s2", "/t", STRING, MOVED)
+    pair.look()
+    assert pair.mirror.type_of("/t") == STRING
+    pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
+    pair.look()
+    pair.mirror.take_changes()
+    pair.theirs("registerPublisher", "/other", "/t", "std_msgs/Int8", THEIRS)
+    pair.look()
+    changes = pair.mirror.take_changes()
+    assert [(change.node, change.type) for change in changes] == [("/other", "std_msgs/Int8")]
+
+
+def test_ours_counts_at_once_and_a_look_from_before_takes_nothing_back(pair: Pair) -> None:
+    pair.theirs("registerSubscriber", "/s", "/t", STRING, THEIRS)
+    pair.look()
+    seen, survey = pair.mirror.asked, pair.survey()
+    assert pair.call("registerPublisher", "/rmpa", "/t", STRING, OURS) == [THEIRS]
+    assert pair.call("registerSubscriber", "/rmpa", "/t", STRING, OURS) == [OURS]
+    assert pair.mirror.publishers("/t") == {"/rmpa": OURS}
+    assert pair.mirror.learn(survey, seen, {}) == []
+    assert pair.mirror.publishers("/t") == {"/rmpa": OURS}
+    pair.flush()
+    assert pair.look() == []
+    seen, survey = pair.mirror.asked, pair.survey()
+    assert pair.call("unregisterPublisher", "/rmpa", "/t", OURS) == 1
+    assert pair.call("unregisterPublisher", "/rmpa", "/t", OURS) == 0
+    assert pair.mirror.strangers(survey, "/rmpa", seen) == {}
+    assert pair.mirror.learn(survey, seen, {}) == []
+    assert pair.mirror.publishers("/t") == {}
+
+
+def test_what_the_master_lacks_of_ours_is_registered_again(pair: Pair) -> None:
+    calls: list[Call] = [
+        ("registerPublisher", ("/rmpa", "/t", STRING, OURS)),
+        ("registerSubscriber", ("/rmpa", "/u", "*", OURS)),
+        ("registerService", ("/rmpa/b/n", "/srv", "rosrpc://h:9", OURS)),
+        ("subscribeParam", ("/rmpa", OURS, "/key")),
+    ]
+    pair.look()
+    for method, params in calls:
+        pair.call(method, *params)
+    pair.flush()
+    assert pair.look() == []
+    pair.restart()
+    assert sorted(pair.look()) == sorted(calls)
+    pair.flush()
+    assert pair.look() == []
+    assert pair.mirror.state() == pair.master.registrations.state()
+    for method, params in pair.mirror.undo_all():
+        pair.call(method, *params)
+    pair.flush()
+    assert pair.master.registrations.nodes() == {}
+
+
+def test_nodes_of_a_master_that_is_no_more_stay_until_they_die_or_come_back(pair: Pair) -> None:
+    for node, api in (("/dies", THEIRS), ("/returns", MOVED)):
+        pair.theirs("registerPublisher", node, "/t", STRING, api)
+    pair.look()
+    pair.restart()
+    pair.look()
+    assert pair.mirror.publishers("/t") == {"/dies": THEIRS, "/returns": MOVED}
+    pair.theirs("registerPublisher", "/returns", "/other", STRING, "http://127.0.0.1:4/")
+    pair.mirror.buried("/dies", THEIRS)
+    pair.look()
+    assert pair.mirror.publishers("/t") == {}
+    assert pair.mirror.state().nodes == {"/returns": "http://127.0.0.1:4/"}
+
+
+def test_a_dead_node_counts_no_more_until_it_is_somewhere_else_or_lives_after_all(pair: Pair) -> None:
+    pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
+    pair.look()
+    pair.changes()
+    pair.mirror.buried("/p", THEIRS)
+    pair.look()
+    assert pair.changes() == {("-", "/t", "/p")}
+    pair.mirror.risen("/p")
+    pair.look()
+    assert pair.mirror.publishers("/t") == {"/p": THEIRS}
+    pair.mirror.buried("/p", THEIRS)
+    pair.theirs("registerPublisher", "/p", "/t", STRING, MOVED)
+    pair.look()
+    assert (pair.mirror.publishers("/t"), dict(pair.mirror.dead)) == ({"/p": MOVED}, {})
+
+
+def test_a_local_provider_takes_a_service_from_us_and_it_is_not_taken_back(pair: Pair) -> None:
+    pair.call("registerService", "/rmpa/b/n", "/srv", "rosrpc://h:9", OURS)
+    pair.flush()
+    pair.look()
+    pair.theirs("registerService", "/local", "/srv", "rosrpc://h:10", THEIRS)
+    pair.changes()
+    assert pair.look() == []
+    assert pair.changes() == {("-", "/srv", "/rmpa/b/n"), ("+", "/srv", "/local")}
+    assert pair.mirror.state().services == {"/srv": {"/local": "rosrpc://h:10"}}
+
+
+def test_names_of_an_agent_that_are_not_ours_are_strangers_and_leave_nothing(pair: Pair) -> None:
+    pair.theirs("registerPublisher", "/rmpa", "/diagnostics", STRING, THEIRS)
+    pair.theirs("registerSubscriber", "/rmpa", "/t", STRING, THEIRS)
+    pair.theirs("registerService", "/rmpa/b/n", "/srv", "rosrpc://h:9", MOVED)
+    pair.theirs("registerPublisher", "/rmpaint", "/t", STRING, THEIRS)
+    survey = pair.survey()
+    strangers = pair.mirror.strangers(survey, "/rmpa", pair.mirror.asked)
+    assert strangers == {"/rmpa": THEIRS, "/rmpa/b/n": MOVED}
+    assert pair.mirror.learn(survey, 0, strangers) == []
+    assert set(pair.mirror.state().nodes) == {"/rmpaint"}
+    for method, params in leftovers(survey, strangers):
+        pair.theirs(method, *map(str, params))
+    assert set(pair.master.registrations.nodes()) == {"/rmpaint"}
+
+
+def test_what_the_master_does_not_take_is_none(pair: Pair) -> None:
+    pair.call("registerPublisher", "/rmpa", "/t", STRING, OURS)
+    pair.mirror.forget(("registerPublisher", ("/rmpa", "/t", STRING, OURS)))
+    assert pair.mirror.state().publishers == {}
+    assert pair.look() == []
+    assert pair.mirror.apply("registerPublisher", ["/rmpa", "/t"]).code == -1
+    assert pair.mirror.apply("registerPublisher", ["/rmpa", "/t", STRING, 5]).code == -1
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [None, "x", [], [[[1, "", 0]]] * 4, [[[1, "", [[], []]]]] + [[[1, "", []]]] * 3, [[[1, "", [[5], [], []]]]] * 4],
+)
+def test_an_answer_that_is_no_survey_is_an_error(answer: XmlRpcValue) -> None:
+    with pytest.raises(RemoteProtocolError):
+        read_survey(answer, (), ())
+    with pytest.raises(RemoteProtocolError):
+        read_lookups(answer, ["/a"] * 5, [])
+
+
+NAMES: Final = st.sampled_from(["/a", "/b"])
+APIS: Final = st.sampled_from([THEIRS, MOVED])
+METHODS: Final = st.sampled_from(
+    ["registerPublisher", "registerSubscriber", "unregisterPublisher", "unregisterSubscriber"]
+)
+STEPS: Final = st.lists(
+    st.one_of(
+        st.tuples(st.just("theirs"), METHODS, st.sampled_from(["/x", "/y"]), NAMES, APIS),
+        st.tuples(st.just("ours"), METHODS, st.sampled_from(["/rmpa", "/rmpa/b/n"]), NAMES, st.just(OURS)),
+        st.tuples(st.just("look"), st.integers(0, 3)),
+    ),
+    max_size=30,
+)
+
+
+@given(STEPS)
+def test_whatever_happened_the_next_look_shows_what_the_master_has(steps: list[tuple[str, ...]]) -> None:
+    """Our calls leave in portions, and before each look, as those of the external core do."""
+    pair = Pair()
+    for step in steps:
+        if step[0] == "look":
+            pair.flush()
+            pair.look()
+            continue
+        who, method, node, topic, api = step
+        kind = [STRING] if method.startswith("register") else []
+        (pair.theirs if who == "theirs" else pair.call)(method, node, topic, *kind, api)
+    pair.flush()
+    assert pair.look() == []
+    mirror, master = pair.mirror.state(), pair.master.registrations.state()
+    assert (mirror.publishers, mirror.subscribers, mirror.nodes) == (
+        master.publishers,
+        master.subscribers,
+        master.nodes,
+    )
