@@ -22,8 +22,10 @@ from rmpa.agent.view import View
 from rmpa.agent.why import Why
 from rmpa.bridge.aio.bridge import Bridge
 from rmpa.bridge.aio.params import Params
+from rmpa.bridge.aio.services import Services
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
+from rmpa.bridge.service_rules import ServiceRules
 from rmpa.core import limits
 from rmpa.core.aio import realtime
 from rmpa.core.aio.collector import Collector
@@ -112,6 +114,9 @@ class Agent:
         )
         self.params = Params(self.core, self.bridge, settings.name, settings.params, settings.time)
         self.bridge.add(self.params)
+        rules = ServiceRules(settings.services, Policy(settings.policy, settings.peers), Names(settings.peers))
+        self.services = Services(self.core, self.bridge, rules)
+        self.bridge.add(self.services)
         self._param_ops = ParamOps(self.params, self.bridge.asks, self._attached)
         self.reloader = Reloader(settings, load, self._take)
         self._view.waiting = lambda: self.reloader.waiting

@@ -59,6 +59,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _ADVERTISE: Final = b'{"op":"advertise"'
+_SERVICES: Final = b'{"op":"services"'
 
 
 @dataclass(slots=True)
@@ -358,6 +359,8 @@ class Bridge:
         if attached is None:
             return
         if payload[: len(_ADVERTISE)] != _ADVERTISE:
+            if len(payload) > limits.ADVERTISEMENT_MAX and payload[: len(_SERVICES)] == _SERVICES:
+                raise LimitExceeded("advertisement", len(payload), limits.ADVERTISEMENT_MAX)
             self._dispatch(attached, decode(payload))
             return
         if len(payload) > limits.ADVERTISEMENT_MAX:

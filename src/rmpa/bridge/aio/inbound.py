@@ -288,8 +288,8 @@ class Inbound:
                 if self.publication(source) is None:
                     self._jobs.put_nowait(action)
             for (node, key), ready in breathing(list(self._holds.items())):
-                proxy = self._proxies.get(node)
-                if proxy is None or proxy.held.get(key) is not ready:
+                kept = self._proxies.get(node)
+                if kept is None or kept.held.get(key) is not ready:
                     self._jobs.put_nowait(_Hold(node, key))
         return len(missing)
 

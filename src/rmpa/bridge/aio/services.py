@@ -1,0 +1,493 @@
+"""Services across the mesh: what this module provides is called by peers, and what they provide stands here.
+
+The two plans are pure (``bridge.services``, ``bridge.service_exports``); this part of the bridge carries them out. A
+call takes this way::
+
+    client → proxy's ServiceEndpoint → Caller ⇢ link ⇢ Server → ServicePool → server
+                                              ⇠      ⇠
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+from rmpa.bridge.actions import Send, Warn
+from rmpa.bridge.aio.part import Part
+from rmpa.bridge.aio.service_calls import Budgets, Caller, CallStats
+from rmpa.bridge.aio.service_serving import Serving
+from rmpa.bridge.messages import (
+    AdvertiseServices,
+    CloseService,
+    OpenService,
+    ServiceClosed,
+    ServiceOpened,
+    encode,
+)
+from rmpa.bridge.naming import Names
+from rmpa.bridge.policy import Policy, is_own
+from rmpa.bridge.service_exports import About, ExportAction, LocalService, ServiceExports
+from rmpa.bridge.service_rules import ServiceRules
+from rmpa.bridge.services import (
+    EndedService,
+    ForgetAbout,
+    ImportAction,
+    OpenedService,
+    Provide,
+    ServiceImports,
+    SessionState,
+    Withdraw,
+)
+from rmpa.core import limits
+from rmpa.core.aio.loop import breathe, breathing
+from rmpa.core.counters import RefusalLog
+from rmpa.ros.aio.service_server import ServiceCall, ServiceEndpoint
+from rmpa.ros.master.effects import GraphChange, Kind
+from rmpa.ros.services import ServiceDescription
+from rmpa.ros.tcpros import printable
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from rmpa.bridge.aio.bridge import Attached, Bridge
+    from rmpa.bridge.messages import Message
+    from rmpa.core.config import Settings
+    from rmpa.ros.aio.core_api import Core
+    from rmpa.ros.aio.slave_server import SlaveNode
+
+_log = logging.getLogger(__name__)
+
+_MISMATCH: Final = "service.mismatch"
+
+
+@dataclass(slots=True, eq=False)
+class Shown:
+    """A peer's service in the local graph.
+
+    Args:
+        peer: Whose.
+        service: Its name here.
+        node: Its node, in the peer's graph.
+        stats: What became of its calls.
+        proxy: The node that stands for that one, once it is there.
+        endpoint: What clients connect to, likewise.
+        caller: Where calls go, while the service is open.
+        waiting: Calls that wait until it is.
+        asking: Who wants to know what it is.
+        mismatch: What a client was told whose md5 sum did not fit; empty if none was.
+    """
+
+    peer: int
+    service: str
+    node: str
+    stats: CallStats = field(default_factory=CallStats)
+    proxy: SlaveNode | None = None
+    endpoint: ServiceEndpoint | None = None
+    caller: Caller | None = None
+    waiting: list[ServiceCall] = field(default_factory=list)
+    asking: list[asyncio.Future[ServiceDescription | str]] = field(default_factory=list)
+    mismatch: str = ""
+
+
+class Services(Part):
+    """Both directions, for all peers.
+
+    Args:
+        core: The local core.
+        bridge: Whose part this is.
+        rules: What may cross, under which names, and for how long.
+    """
+
+    def __init__(self, core: Core, bridge: Bridge, rules: ServiceRules) -> None:
+        self._core = core
+        self._bridge = bridge
+        self._rules = rules
+        self.exports = ServiceExports(rules)
+        """The outbound plan, for the monitor."""
+        self.imports = ServiceImports(rules)
+        """The inbound plan, for the monitor."""
+        self._refusals = RefusalLog(_log, bridge.counters)
+        self._attached: dict[int, Attached] = {}
+        self._budgets: dict[int, Budgets] = {}
+        self._shown: dict[tuple[int, str], Shown] = {}
+        self._callers: dict[tuple[int, int], Shown] = {}
+        self._serving = Serving(core, self.exports, self._attached, self._budgets, self._act)
+        self._grace: dict[int, asyncio.TimerHandle] = {}
+        self._changed: dict[str, None] = {}
+        self._lessons: deque[tuple[int, AdvertiseServices]] = deque()
+        self._actions: deque[ExportAction | ImportAction] = deque()
+        self._acting = False
+        self._rescan: asyncio.Handle | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._closed = False
+        bridge.asks.on_tell(_MISMATCH, self._told_of_mismatch)
+
+    def __iter__(self) -> Iterator[Shown]:
+        """The peers' services in the local graph."""
+        return iter(self._shown.values())
+
+    def shown(self, peer: int, service: str) -> Shown | None:
+        """One of them."""
+        return self._shown.get((peer, service))
+
+    @property
+    def served(self) -> Mapping[str, CallStats]:
+        """What became of the calls of our services by peers."""
+        return self._serving.stats
+
+    def reload(self, settings: Settings) -> None:
+        """Other settings hold from now on."""
+        policy, names = Policy(settings.policy, settings.peers), Names(settings.peers)
+        self.obey(ServiceRules(settings.services, policy, names))
+
+    def obey(self, rules: ServiceRules) -> None:
+        """Other rules hold from now on; what they do not touch goes on."""
+        self._rules = rules
+        self._act(self.exports.obey(rules))
+        self._act(self.imports.obey(rules))
+        for shown in self._shown.values():
+            if shown.endpoint is not None:
+                shown.endpoint.timeout = rules.timeout(shown.service)
+        self._schedule()
+
+    # --- the bridge's part -------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Follow the local graph."""
+        self._loop = asyncio.get_running_loop()
+        self._changed |= dict.fromkeys(self._core.state().services)
+        self._schedule()
+        self._serving.start()
+
+    async def close(self) -> None:
+        """End every call, and every connection to a server."""
+        self._closed = True
+        for handle in (self._rescan, self._timer, *self._grace.values()):
+            if handle is not None:
+                handle.cancel()
+        await self._serving.close()
+
+    def link_up(self, attached: Attached) -> None:
+        """Tell what we have; what the peer has is told by it."""
+        peer, link = attached.peer, attached.link
+        if (grace := self._grace.pop(peer, None)) is not None:
+            grace.cancel()
+        self._attached[peer] = attached
+        self._budgets[peer] = Budgets()
+        self._act(self.imports.link_up(peer, link.name, link.guid.value))
+        self._act(self.exports.link_up(peer, link.name))
+        for shown in [one for one in self._shown.values() if one.peer == peer and (one.waiting or one.asking)]:
+            self._want(shown)
+        self._schedule()
+
+    def link_down(self, attached: Attached) -> None:
+        """Calls under way fail; the services stay for a moment if the link just fell silent."""
+        peer = attached.peer
+        self._act(self.imports.link_down(peer))
+        self._act(self.exports.link_down(peer))
+        if peer in self._grace:
+            return
+        if attached.link.silent and not self._closed:
+            self._grace[peer] = self._loop.call_later(limits.AWAY_GRACE, self._stay_away, peer)
+        else:
+            self._stay_away(peer)
+
+    def gone(self, attached: Attached) -> None:
+        """The peer will not come back."""
+        self._stay_away(attached.peer)
+        self._attached.pop(attached.peer, None)
+        self._budgets.pop(attached.peer, None)
+
+    def _stay_away(self, peer: int) -> None:
+        if (grace := self._grace.pop(peer, None)) is not None:
+            grace.cancel()
+        self._act(self.imports.gone(peer))
+
+    def message(self, attached: Attached, message: Message) -> bool:
+        """Take what is said of services."""
+        peer = attached.peer
+        match message:
+            case AdvertiseServices():
+                if message.added or message.removed:
+                    changes = (len(message.added), len(message.removed))
+                    _log.info("< %s provides %d more services, %d less", attached.link.name, *changes)
+                self._lessons.append((peer, message))
+                self._schedule()
+            case OpenService():
+                self._act(self.exports.opened(peer, message))
+            case CloseService():
+                self._act(self.exports.closed(peer, message))
+            case ServiceOpened():
+                self._act(self.imports.opened(peer, message))
+            case ServiceClosed():
+                _log.debug("< %s closes route %d: %s", attached.link.name, message.route, message.reason)
+                self._act(self.imports.closed(peer, message))
+            case _:
+                return False
+        return True
+
+    def graph_changed(self, change: GraphChange) -> None:
+        """Somebody provides a service, or no longer does."""
+        if change.kind is Kind.SERVICE:
+            self._changed[change.name] = None
+            self._schedule()
+
+    def lane_lost(self, attached: Attached) -> None:
+        """Calls that used the bulk lane may never be answered."""
+        peer = attached.peer
+        for (owner, _), shown in list(self._callers.items()):
+            if owner == peer and shown.caller is not None:
+                shown.caller.lane_lost()
+        self._serving.lane_lost(peer)
+
+    def reconcile(self) -> None:
+        """Register again what is missing, and close what nobody uses."""
+        services = self._core.state().services
+        self._changed |= dict.fromkeys((*self.exports.seen, *services))
+        self._schedule()
+        before = self._loop.time() - limits.SERVICE_IDLE
+        for shown in breathing(list(self._shown.values()), every=16):
+            proxy, caller = shown.proxy, shown.caller
+            if proxy is not None and shown.service not in services:
+                self._register(shown, proxy)
+            if caller is not None and not caller.active and caller.used_at < before:
+                self._act(self.imports.release(shown.peer, shown.service))
+        self._serving.close_idle(before)
+
+    # --- the local graph ---------------------------------------------------------------------------------------
+
+    def _schedule(self) -> None:
+        if self._rescan is None and not self._closed:
+            self._rescan = self._loop.call_soon(self._scan)
+
+    def _scan(self) -> None:
+        """Do a part of what has to be done since graphs have changed, the local one or a peer's."""
+        self._rescan = None
+        services = self._core.state().services
+        for _ in range(min(len(self._changed), limits.RESCANNED_AT_ONCE)):
+            service = next(iter(self._changed))
+            del self._changed[service]
+            breathe()
+            self._look_at(service, services.get(service, {}))
+        self._act(self.exports.tell())
+        if self._lessons:
+            self._learn()
+        if self._changed or self._lessons or self.exports.untold:
+            self._schedule()
+
+    def _look_at(self, service: str, providers: Mapping[str, str]) -> None:
+        local = next((LocalService(node, uri) for node, uri in providers.items() if not is_own(node)), None)
+        # That it is taken is known before it is told on: nobody may be shown two of a name.
+        self._act(self.imports.local(service, local.node if local is not None else None))
+        self._act(self.exports.graph(service, local))
+
+    def _learn(self) -> None:
+        """Take in a portion of what a peer provides."""
+        peer, message = self._lessons.popleft()
+        first, rest = message.added[: limits.LEARNT_AT_ONCE], message.added[limits.LEARNT_AT_ONCE :]
+        if rest:
+            # What is no more is taken in at the end: what takes its place must not find it there.
+            self._lessons.appendleft((peer, AdvertiseServices(rest, more=message.more)))
+            message = AdvertiseServices(first, message.removed, message.full, more=True)
+        self._act(self.imports.advertised(peer, message))
+
+    # --- carrying out ------------------------------------------------------------------------------------------
+
+    def _act(self, actions: list[ExportAction] | list[ImportAction]) -> None:
+        """Do these behind those that are being done: in between data may come first, and bring more of them."""
+        self._actions.extend(actions)
+        if self._acting:
+            return
+        self._acting = True
+        try:
+            while self._actions:
+                self._do(self._actions.popleft())
+                breathe()
+        finally:
+            self._acting = False
+        self._set_timer()
+
+    def _do(self, action: ExportAction | ImportAction) -> None:
+        match action:
+            case Send():
+                attached = self._attached.get(action.peer)
+                if attached is not None and attached.away is None:
+                    attached.link.send_control(encode(action.message))
+            case Warn():
+                self._refusals.refuse(self._loop.time(), action.kind, action.who, action.text)
+            case Provide() | Withdraw() | OpenedService() | EndedService() | ForgetAbout():
+                self._do_shown(action)
+            case _:
+                self._serving.do(action)
+
+    def _do_shown(self, action: Provide | Withdraw | OpenedService | EndedService | ForgetAbout) -> None:
+        match action:
+            case Provide():
+                self._provide(action)
+            case Withdraw():
+                self._withdraw(action)
+            case OpenedService():
+                self._opened(action)
+            case EndedService():
+                self._ended(action)
+            case ForgetAbout():
+                shown = self._shown.get((action.peer, action.service))
+                if shown is not None and shown.endpoint is not None:
+                    shown.endpoint.description = None
+
+    def _set_timer(self) -> None:
+        due = self.imports.next_timer()
+        if self._timer is not None:
+            if self._timer.when() == due:
+                return
+            self._timer.cancel()
+            self._timer = None
+        if due is not None and not self._closed:
+            self._timer = self._loop.call_at(due, self._on_timer)
+
+    def _on_timer(self) -> None:
+        self._timer = None
+        # The loop's clock may round a timer to a moment before it is due.
+        self._act(self.imports.handle_timer(self._loop.time() + 0.001))
+
+    # --- peers' services here ----------------------------------------------------------------------------------
+
+    def _provide(self, action: Provide) -> None:
+        attached = self._attached.get(action.peer)
+        if attached is None:
+            return
+        shown = self._shown[action.peer, action.service] = Shown(action.peer, action.service, action.node)
+        attached.inbound.hold(action.node, f"service {action.service}", lambda proxy: self._expose(shown, proxy))
+
+    def _expose(self, shown: Shown, proxy: SlaveNode) -> None:
+        """The proxy is there: register the service, unless it is gone again."""
+        if self._shown.get((shown.peer, shown.service)) is not shown or shown.endpoint is not None:
+            return
+        shown.proxy = proxy
+        shown.endpoint = ServiceEndpoint(
+            shown.service,
+            proxy.name,
+            lambda call: self._call(shown, call),
+            lambda: self._describe(shown),
+            timeout=self._rules.timeout(shown.service),
+            on_mismatch=lambda fields, text: self._mismatched(shown, fields, text),
+        )
+        proxy.add_service(shown.endpoint)
+        self._register(shown, proxy)
+
+    def _register(self, shown: Shown, proxy: SlaveNode) -> None:
+        providers = self._core.state().services.get(shown.service, {})
+        if any(node != proxy.name for node in providers):
+            return  # somebody came first: the scan hides ours, or did so already
+        code, status, _ = self._core.call("registerService", proxy.name, shown.service, proxy.service_uri, proxy.uri)
+        if code != 1:
+            _log.error("! the local core does not take %s of %s: %s", shown.service, proxy.name, status)
+
+    def _withdraw(self, action: Withdraw) -> None:
+        shown = self._shown.pop((action.peer, action.service), None)
+        if shown is None:
+            return
+        proxy = shown.proxy
+        text = f"service [{shown.service}] of {self._name(shown)}: {action.reason}"
+        self._fail_waiting(shown, text)
+        if proxy is not None:
+            self._core.call("unregisterService", proxy.name, shown.service, proxy.service_uri)
+            proxy.remove_service(shown.service, text)
+        attached = self._attached.get(action.peer)
+        if attached is not None:
+            attached.inbound.release(action.node, f"service {action.service}")
+
+    def _call(self, shown: Shown, call: ServiceCall) -> None:
+        """A client's request; the hot path."""
+        if shown.caller is not None:
+            shown.caller.call(call)
+            return
+        shown.waiting.append(call)
+        call.on_gone = lambda: shown.waiting.remove(call) if call in shown.waiting else None
+        self._want(shown)
+
+    async def _describe(self, shown: Shown) -> ServiceDescription | str:
+        remote = self.imports.get(shown.peer, shown.service)
+        if remote is not None and remote.about is not None:
+            return _description(remote.about)
+        answer: asyncio.Future[ServiceDescription | str] = self._loop.create_future()
+        shown.asking.append(answer)
+        self._want(shown)
+        return await answer
+
+    def _want(self, shown: Shown) -> None:
+        """Open a service; if its peer has no link at this moment, its next link or its end will go on from here."""
+        remote = self.imports.get(shown.peer, shown.service)
+        if remote is None or not remote.shown:
+            self._fail_waiting(shown, f"service [{shown.service}] of {self._name(shown)} has just gone")
+        elif remote.state is SessionState.IDLE and not self.imports.is_away(shown.peer):
+            self._act(self.imports.want(shown.peer, shown.service, self._loop.time()))
+
+    def _opened(self, action: OpenedService) -> None:
+        shown = self._shown.get((action.peer, action.service))
+        attached = self._attached.get(action.peer)
+        if shown is None or attached is None or attached.away is not None:
+            return
+        what = f"service [{shown.service}] of {self._name(shown)}"
+        caller = shown.caller = Caller(attached.link, action.requests, what, self._budgets[action.peer], shown.stats)
+        attached.takers[action.route] = caller
+        self._callers[action.peer, action.route] = shown
+        description = _description(action.about)
+        asking, shown.asking = shown.asking, []
+        for future in asking:
+            if not future.done():
+                future.set_result(description)
+        waiting, shown.waiting = shown.waiting, []
+        for call in waiting:
+            caller.call(call)
+
+    def _ended(self, action: EndedService) -> None:
+        attached = self._attached.get(action.peer)
+        if attached is not None:
+            attached.takers.pop(action.route, None)
+        shown = self._callers.pop((action.peer, action.route), None)
+        if shown is not None and shown.caller is not None:
+            caller, shown.caller = shown.caller, None
+            caller.close(action.reason)
+        shown = self._shown.get((action.peer, action.service))
+        if shown is not None and shown.caller is None:
+            self._fail_waiting(shown, f"service [{shown.service}] of {self._name(shown)}: {action.reason}")
+
+    def _fail_waiting(self, shown: Shown, text: str) -> None:
+        asking, shown.asking = shown.asking, []
+        for future in asking:
+            if not future.done():
+                future.set_result(text)
+        waiting, shown.waiting = shown.waiting, []
+        for call in waiting:
+            shown.stats.calls += 1
+            shown.stats.fail(text)
+            call.fail(text)
+
+    def _name(self, shown: Shown) -> str:
+        return self.imports.peer_name(shown.peer)
+
+    def _mismatched(self, shown: Shown, fields: Mapping[str, str], text: str) -> None:
+        """A client was refused, here and at once; said on both sides."""
+        caller_id = printable(fields.get("callerid", ""))
+        shown.mismatch = text
+        shown.stats.calls += 1
+        shown.stats.fail(text)
+        self._refusals.refuse(self._loop.time(), _MISMATCH, f"{shown.service}{caller_id}", text)
+        attached, remote = self._attached.get(shown.peer), self.imports.get(shown.peer, shown.service)
+        if attached is not None and attached.away is None and remote is not None:
+            args: dict[str, Any] = {"service": remote.wire, "text": text[: limits.CONTROL_TEXT_MAX]}
+            self._bridge.asks.tell(attached, _MISMATCH, args)
+
+    def _told_of_mismatch(self, attached: Attached, args: dict[str, Any]) -> None:
+        text = printable(str(args.get("text", ""))[: limits.CONTROL_TEXT_MAX])
+        self._refusals.refuse(
+            self._loop.time(), "service.mismatch_remote", attached.link.name, f"{attached.link.name}: {text}"
+        )
+
+
+def _description(about: About) -> ServiceDescription:
+    return ServiceDescription(about.type, about.md5, about.request_type, about.response_type)

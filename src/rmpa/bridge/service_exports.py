@@ -1,0 +1,362 @@
+"""Which services of the local graph the peers are told of, and which of them they have open to call.
+
+Sans-I/O, like ``bridge.exports`` for topics: the driver tells what the local graph provides, what peers ask for and
+what a server said of itself; it gets back actions. A peer opens a service once, however many clients it has there::
+
+    open ──server known──► ServiceOpened, ServeRoute ──closed, gone, restarted──► EndRoute
+      │                                                                              ▲
+      └──► Probe ──described──► …      ──refused──► ServiceClosed                    │ link down
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import TYPE_CHECKING
+
+from rmpa.bridge.actions import Send, Warn
+from rmpa.bridge.messages import (
+    AdvertiseServices,
+    CloseService,
+    OpenService,
+    ServiceClosed,
+    ServiceOffer,
+    ServiceOpened,
+    is_crossing_name,
+)
+from rmpa.core import limits
+from rmpa.core.errors import RemoteProtocolError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rmpa.bridge.service_rules import ServiceRules
+
+
+@dataclass(frozen=True, slots=True)
+class LocalService:
+    """Who provides a service in the local graph: the node, and its ``rosrpc://`` address."""
+
+    node: str
+    uri: str
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What a server says of its service, as far as a peer must know it."""
+
+    type: str
+    md5: str
+    request_type: str = ""
+    response_type: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """Ask a local server what its service is; the answer comes by ``described`` or ``refused``."""
+
+    service: str
+    server: LocalService
+
+
+@dataclass(frozen=True, slots=True)
+class ServeRoute:
+    """Calls of a peer come on the route ``requests``; replies go out on ``route``.
+
+    Args:
+        peer: The caller.
+        route: The caller's id.
+        requests: Ours.
+        service: The service's local name.
+        server: Who provides it.
+        timeout: Seconds that the caller waits for each.
+    """
+
+    peer: int
+    route: int
+    requests: int
+    service: str
+    server: LocalService
+    timeout: float
+
+
+@dataclass(frozen=True, slots=True)
+class EndRoute:
+    """No more calls come on a route, and nobody waits for replies."""
+
+    peer: int
+    route: int
+    requests: int
+
+
+@dataclass(frozen=True, slots=True)
+class ServerGone:
+    """A server left, or is another one now: let go of what is connected to it."""
+
+    service: str
+
+
+ExportAction = Send | Warn | Probe | ServeRoute | EndRoute | ServerGone
+
+
+@dataclass(slots=True)
+class _Session:
+    """One peer's wish to call a service.
+
+    Args:
+        service: Its local name.
+        timeout: What the caller allows each call.
+        requests: The route that calls come on; 0 until it is open.
+    """
+
+    service: str
+    timeout: float
+    requests: int = 0
+
+
+@dataclass(slots=True)
+class _Peer:
+    """One link.
+
+    Args:
+        name: The peer's name, for the rules.
+        news: Services that it is to hear of.
+        told: What it knows: local name to the name that it was told and the server.
+        wires: The other way: names that it was told.
+        sessions: What it has open, by its own route.
+        routes: Counts our routes: even ones, the odd ones are for our own calls.
+        beginning: Whether it has not heard everything once yet.
+    """
+
+    name: str
+    news: dict[str, None]
+    told: dict[str, tuple[str, LocalService]] = field(default_factory=dict)
+    wires: dict[str, str] = field(default_factory=dict)
+    sessions: dict[int, _Session] = field(default_factory=dict)
+    routes: int = 0
+    beginning: bool = True
+
+
+class ServiceExports:
+    """The outbound half: our services, called by peers.
+
+    Args:
+        rules: What may cross, and under which names.
+    """
+
+    def __init__(self, rules: ServiceRules) -> None:
+        self._rules = rules
+        self._seen: dict[str, LocalService] = {}
+        self._crossing: dict[str, LocalService] = {}
+        self._about: dict[str, About] = {}
+        self._peers: dict[int, _Peer] = {}
+
+    @property
+    def seen(self) -> Mapping[str, LocalService]:
+        """Every service of the local graph that was told of, whether it crosses or not."""
+        return self._seen
+
+    @property
+    def offered(self) -> Mapping[str, LocalService]:
+        """What peers are told of."""
+        return self._crossing
+
+    def about(self, service: str) -> About | None:
+        """What is known of a service of ours."""
+        return self._about.get(service)
+
+    def callers(self, service: str) -> tuple[int, ...]:
+        """The peers that have it open."""
+        return tuple(
+            number
+            for number, peer in self._peers.items()
+            if any(session.service == service and session.requests for session in peer.sessions.values())
+        )
+
+    @property
+    def untold(self) -> bool:
+        """Whether there is something to ``tell``."""
+        return any(peer.news or peer.beginning for peer in self._peers.values())
+
+    # --- the local graph ---------------------------------------------------------------------------------------
+
+    def graph(self, service: str, server: LocalService | None) -> list[ExportAction]:
+        """Say who provides a service in the local graph now, proxies left out; peers hear it by ``tell``."""
+        if self._seen.get(service) == server:
+            return []
+        if server is None:
+            del self._seen[service]
+        else:
+            self._seen[service] = server
+        return self._judge(service)
+
+    def obey(self, rules: ServiceRules) -> list[ExportAction]:
+        """Other rules hold from now on; what they do not touch goes on."""
+        self._rules = rules
+        actions: list[ExportAction] = []
+        for service in list(self._seen):
+            actions += self._judge(service)
+        for peer in self._peers.values():
+            peer.news |= dict.fromkeys(self._crossing)
+        return actions
+
+    def _judge(self, service: str) -> list[ExportAction]:
+        server, before = self._seen.get(service), self._crossing.get(service)
+        if server is not None and not self._crosses(service, server):
+            server = None
+        if server == before:
+            return []
+        actions: list[ExportAction] = []
+        if server is None:
+            del self._crossing[service]
+            actions = self._end(service, "its server has gone")
+        elif before is None and len(self._crossing) >= limits.SERVICES_PER_PEER_MAX:
+            text = f"more than {limits.SERVICES_PER_PEER_MAX} services would cross; {service} stays home: deny some"
+            return [Warn("services.too_many", "local", text)]
+        else:
+            self._crossing[service] = server
+            if before is not None:
+                actions = self._end(service, "its server has restarted")
+        for peer in self._peers.values():
+            peer.news[service] = None
+        return actions
+
+    def _crosses(self, service: str, server: LocalService) -> bool:
+        named = is_crossing_name(service) and is_crossing_name(server.node)
+        return named and self._rules.judge(service, server.node).allowed
+
+    def _end(self, service: str, reason: str) -> list[ExportAction]:
+        """Its server is no longer what it was: end all routes to it."""
+        self._about.pop(service, None)
+        actions: list[ExportAction] = []
+        for number, peer in self._peers.items():
+            for route, session in list(peer.sessions.items()):
+                if session.service == service:
+                    actions += self._drop(number, peer, route, f"{service}: {reason}")
+        return [*actions, ServerGone(service)]
+
+    # --- telling -----------------------------------------------------------------------------------------------
+
+    def link_up(self, peer: int, name: str) -> list[ExportAction]:
+        """A link is up: ``tell`` begins with all we have."""
+        self._peers[peer] = _Peer(name, dict.fromkeys(self._crossing))
+        return [Send(peer, self._next(self._peers[peer], full=True))]
+
+    def link_down(self, peer: int) -> list[ExportAction]:
+        """A link is gone, and all its routes."""
+        gone = self._peers.pop(peer, None)
+        sessions = gone.sessions.items() if gone is not None else ()
+        return [EndRoute(peer, route, s.requests) for route, s in sessions if s.requests]
+
+    def tell(self) -> list[ExportAction]:
+        """One message for each peer that has not heard everything; call again while ``untold``."""
+        actions: list[ExportAction] = []
+        for number, peer in self._peers.items():
+            if peer.news or peer.beginning:
+                begins = peer.beginning
+                message = self._next(peer)
+                if message.added or message.removed or begins:
+                    actions.append(Send(number, message))
+        return actions
+
+    def _next(self, peer: _Peer, *, full: bool = False) -> AdvertiseServices:
+        added: list[ServiceOffer] = []
+        removed: list[str] = []
+        for service in tuple(islice(peer.news, limits.ADVERTISED_AT_ONCE)):
+            del peer.news[service]
+            server = self._crossing.get(service)
+            wire = self._wire(peer, service) if server is not None else None
+            known = peer.told.get(service)
+            if known is not None and (wire is None or known[0] != wire):
+                removed.append(known[0])
+                del peer.told[service]
+                del peer.wires[known[0]]
+            if wire is not None and server is not None and known != (wire, server):
+                added.append(ServiceOffer(wire, server.node))
+                peer.told[service] = (wire, server)
+                peer.wires[wire] = service
+        peer.beginning = peer.beginning and bool(peer.news)
+        return AdvertiseServices(added=tuple(added), removed=tuple(removed), full=full, more=peer.beginning)
+
+    def _wire(self, peer: _Peer, service: str) -> str | None:
+        """What a peer is to know a service by, if it may at all."""
+        wire = self._rules.wire_name(peer.name, service)
+        if not is_crossing_name(wire) or not self._rules.judge_for(peer.name, service, wire).allowed:
+            return None
+        # Where two of ours would be one over there, the first one stays.
+        return wire if peer.wires.get(wire, service) == service else None
+
+    # --- their calls -------------------------------------------------------------------------------------------
+
+    def opened(self, number: int, message: OpenService) -> list[ExportAction]:
+        """A peer wants to call a service.
+
+        Raises:
+            RemoteProtocolError: Its route is in use.
+        """
+        peer = self._peers[number]
+        if message.route in peer.sessions:
+            raise RemoteProtocolError(f"route {message.route} is opened twice, for {message.service} now")
+        if len(peer.sessions) >= limits.SERVICE_SESSIONS_MAX:
+            text = f"more than {limits.SERVICE_SESSIONS_MAX} services are open on one link"
+            return [Send(number, ServiceClosed(message.route, text))]
+        service = peer.wires.get(message.service)
+        server = self._crossing.get(service) if service is not None else None
+        if service is None or server is None:
+            text = f"{message.service} is not provided here, or policy keeps it home"
+            return [Send(number, ServiceClosed(message.route, text))]
+        waiting = any(
+            s.service == service and not s.requests for p in self._peers.values() for s in p.sessions.values()
+        )
+        peer.sessions[message.route] = _Session(service, message.timeout)
+        if service in self._about:
+            return self._start(service)
+        return [] if waiting else [Probe(service, server)]
+
+    def closed(self, number: int, message: CloseService) -> list[ExportAction]:
+        """A peer will not call it any more; one that is not open is none of our worry (it crossed ours)."""
+        session = self._peers[number].sessions.pop(message.route, None)
+        if session is None or not session.requests:
+            return []
+        return [EndRoute(number, message.route, session.requests)]
+
+    def described(self, service: str, server: LocalService, about: About) -> list[ExportAction]:
+        """A server has said what its service is."""
+        if self._crossing.get(service) != server:
+            return []  # it is another one by now
+        self._about[service] = about
+        return self._start(service)
+
+    def refused(self, service: str, reason: str) -> list[ExportAction]:
+        """A server does not answer, or says no: those who wait for it are told."""
+        actions: list[ExportAction] = []
+        for number, peer in self._peers.items():
+            for route, session in list(peer.sessions.items()):
+                if session.service == service and not session.requests:
+                    actions += self._drop(number, peer, route, reason)
+        return actions
+
+    def _start(self, service: str) -> list[ExportAction]:
+        about, server = self._about[service], self._crossing[service]
+        actions: list[ExportAction] = []
+        for number, peer in self._peers.items():
+            for route, session in peer.sessions.items():
+                if session.service != service or session.requests:
+                    continue
+                peer.routes += 2
+                session.requests = limits.SERVICE_ROUTES + peer.routes
+                actions += [
+                    ServeRoute(number, route, session.requests, service, server, session.timeout),
+                    Send(
+                        number,
+                        ServiceOpened(
+                            route, session.requests, about.type, about.md5, about.request_type, about.response_type
+                        ),
+                    ),
+                ]
+        return actions
+
+    def _drop(self, number: int, peer: _Peer, route: int, reason: str) -> list[ExportAction]:
+        session = peer.sessions.pop(route)
+        closed = Send(number, ServiceClosed(route, reason[: limits.CONTROL_TEXT_MAX]))
+        return [EndRoute(number, route, session.requests), closed] if session.requests else [closed]

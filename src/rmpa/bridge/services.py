@@ -1,0 +1,460 @@
+"""Which services of the peers appear in the local graph, and which of them are open to be called.
+
+Sans-I/O, like ``bridge.imports`` for topics: the driver tells what peers say, what the local graph provides itself
+and what somebody local wants to call; it gets back actions. A graph has one provider for each service, so of several
+one is shown: a local one always, else that of the peer with the lowest GUID; the others are hidden, with the reason,
+and come when it goes. Each service of each peer is in one state of this table::
+
+    idle ──wanted──► opening ──opened──► open
+      ▲                 │ closed, 5 s      │ closed, withdrawn, link down, released
+      └─────────────────┴──────────────────┘
+
+What an opened service said of itself is remembered until it is withdrawn or its server is another one: a probe then
+costs nothing on the way.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from typing import TYPE_CHECKING, Final
+
+from rmpa.bridge.actions import Send, Warn
+from rmpa.bridge.messages import (
+    AdvertiseServices,
+    CloseService,
+    OpenService,
+    ServiceClosed,
+    ServiceOffer,
+    ServiceOpened,
+    is_crossing_name,
+)
+from rmpa.bridge.service_exports import About
+from rmpa.core import limits
+from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from rmpa.bridge.service_rules import ServiceRules
+
+
+class SessionState(Enum):
+    """Where a remote service stands."""
+
+    IDLE = auto()
+    """Nobody calls it."""
+    OPENING = auto()
+    """Asked for, not answered."""
+    OPEN = auto()
+    """It can be called."""
+
+
+_S = SessionState
+TRANSITIONS: Final[Mapping[SessionState, frozenset[SessionState]]] = {
+    _S.IDLE: frozenset({_S.OPENING}),
+    _S.OPENING: frozenset({_S.OPEN, _S.IDLE}),
+    _S.OPEN: frozenset({_S.IDLE}),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Provide:
+    """Let a peer's service appear in the local graph, as one of its node's proxy.
+
+    Args:
+        peer: Whose.
+        service: Its name here.
+        node: Its node, in the peer's graph.
+    """
+
+    peer: int
+    service: str
+    node: str
+
+
+@dataclass(frozen=True, slots=True)
+class Withdraw:
+    """Let it disappear; who is just calling it is told the reason."""
+
+    peer: int
+    service: str
+    node: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class OpenedService:
+    """It can be called: requests go out on ``requests``, replies come on ``route``."""
+
+    peer: int
+    service: str
+    route: int
+    requests: int
+    about: About
+
+
+@dataclass(frozen=True, slots=True)
+class EndedService:
+    """It cannot be called (``route`` is its reply route, if it had one open): whoever waits is told the reason."""
+
+    peer: int
+    service: str
+    route: int
+    requests: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class ForgetAbout:
+    """What was known of a shown service may no longer be true."""
+
+    peer: int
+    service: str
+
+
+ImportAction = Send | Warn | Provide | Withdraw | OpenedService | EndedService | ForgetAbout
+
+
+@dataclass(slots=True)
+class RemoteService:
+    """One service of one peer, as we see it.
+
+    Args:
+        wire: Its name on the way.
+        node: Its node, in the peer's graph.
+        name: Its name here; empty: it must not be here.
+        shown: Whether it is in the local graph.
+        hidden: Why it is not, or empty.
+        state: Whether it can be called now.
+        route: Where its replies come, while it is asked for or open; else 0.
+        requests: Where its requests go, while it is open; else 0.
+        due: While it is asked for: when that has taken too long, monotonic seconds.
+        about: What it is, once known.
+        problem: Why it could not be opened last, or empty.
+    """
+
+    wire: str
+    node: str
+    name: str
+    shown: bool = False
+    hidden: str = ""
+    state: SessionState = SessionState.IDLE
+    route: int = 0
+    requests: int = 0
+    due: float = 0.0
+    about: About | None = None
+    problem: str = ""
+
+
+@dataclass(slots=True)
+class _Peer:
+    """What one run of a peer offers.
+
+    Args:
+        name: The peer's name.
+        rank: The lower one is shown.
+        services: What it offers, by the name on the way.
+        routes: What is asked for or open, by our route.
+        serial: Counts our routes: odd ones, the even ones are for its calls.
+        nodes: How many services each of its nodes has.
+        away: Whether it has no link, and may come back.
+        doubtful: What it offered over its last link and has not offered again since.
+    """
+
+    name: str
+    rank: int
+    services: dict[str, RemoteService] = field(default_factory=dict)
+    routes: dict[int, RemoteService] = field(default_factory=dict)
+    serial: int = -1
+    nodes: Counter[str] = field(default_factory=Counter)
+    away: bool = False
+    doubtful: set[str] = field(default_factory=set)
+
+
+class ServiceImports:
+    """The inbound half: the peers' services, called from here.
+
+    Args:
+        rules: What may cross, and under which names; the receiving side judges too.
+    """
+
+    def __init__(self, rules: ServiceRules) -> None:
+        self._rules = rules
+        self._peers: dict[int, _Peer] = {}
+        self._local: dict[str, str] = {}
+        # By the name here: who offers it.
+        self._claims: dict[str, dict[int, RemoteService]] = {}
+        self._opening: dict[tuple[int, int], RemoteService] = {}
+
+    def __iter__(self) -> Iterator[tuple[int, RemoteService]]:
+        """Each service of each peer."""
+        for number, peer in self._peers.items():
+            for remote in peer.services.values():
+                yield number, remote
+
+    def get(self, peer: int, service: str) -> RemoteService | None:
+        """A peer's service by its name here."""
+        return self._claims.get(service, {}).get(peer)
+
+    def peer_name(self, peer: int) -> str:
+        """How a peer is called, for texts."""
+        found = self._peers.get(peer)
+        return found.name if found is not None else "a peer that is gone"
+
+    def is_away(self, peer: int) -> bool:
+        """Whether a peer has no link at this moment and may come back."""
+        found = self._peers.get(peer)
+        return found is not None and found.away
+
+    # --- links -------------------------------------------------------------------------------------------------
+
+    def link_up(self, peer: int, name: str, rank: int) -> list[ImportAction]:
+        """A link is up, of a new peer or of one that was away."""
+        known = self._peers.get(peer)
+        if known is None:
+            self._peers[peer] = _Peer(name, rank)
+        else:
+            known.away = False
+            known.serial = -1
+            known.rank = rank
+        return []
+
+    def link_down(self, peer: int) -> list[ImportAction]:
+        """A link is gone: nothing can be called; what was offered stays until ``gone``."""
+        known = self._peers.get(peer)
+        if known is None:
+            return []
+        known.away = True
+        actions: list[ImportAction] = []
+        for route in list(known.routes):
+            actions += self._end(peer, route, f"the link to {known.name} was lost")
+        return actions
+
+    def gone(self, peer: int) -> list[ImportAction]:
+        """A peer does not come back, or not soon: its services leave the local graph."""
+        known = self._peers.get(peer)
+        if known is None:
+            return []
+        actions = self.link_down(peer)
+        for wire in list(known.services):
+            actions += self._remove(peer, wire, f"{known.name} is gone")
+        del self._peers[peer]
+        return actions
+
+    # --- what peers offer --------------------------------------------------------------------------------------
+
+    def advertised(self, peer: int, message: AdvertiseServices) -> list[ImportAction]:
+        """A peer says what it provides, all or what changed."""
+        known = self._peers.get(peer)
+        if known is None:
+            return []
+        if message.full:
+            known.doubtful = set(known.services)
+        actions: list[ImportAction] = []
+        for wire in message.removed:
+            actions += self._remove(peer, wire, f"its server at {known.name} has gone")
+        for offer in message.added:
+            actions += self._offer(peer, known, offer)
+        if message.full or known.doubtful:
+            known.doubtful -= {offer.service for offer in message.added}
+            if not message.more:
+                for wire in known.doubtful:
+                    actions += self._remove(peer, wire, f"its server at {known.name} has gone")
+                known.doubtful = set()
+        return actions
+
+    def _offer(self, peer: int, known: _Peer, offer: ServiceOffer) -> list[ImportAction]:
+        before = known.services.get(offer.service)
+        actions: list[ImportAction] = []
+        if before is not None and before.node == offer.node:
+            # The same once more: another server behind it, or a new link; what it is may have changed.
+            before.about = None
+            return [ForgetAbout(peer, before.name)] if before.shown else []
+        if before is not None:
+            actions += self._remove(peer, offer.service, f"another node of {known.name} provides it now")
+        elif len(known.services) >= limits.SERVICES_PER_PEER_MAX:
+            text = f"{known.name} offers more than {limits.SERVICES_PER_PEER_MAX} services; the rest is left out"
+            return [Warn("services.too_many", known.name, text)]
+        name = self._rules.local_name(known.name, offer.service)
+        remote = known.services[offer.service] = RemoteService(offer.service, offer.node, name)
+        known.nodes[offer.node] += 1
+        if not is_crossing_name(name):
+            remote.hidden = f"the rules of names make {name!r} of it"
+            return actions
+        others = self._claims.setdefault(name, {})
+        if peer in others:
+            remote.hidden = f"{others[peer].wire} of the same peer has this name here already"
+            return actions
+        others[peer] = remote
+        return actions + self._choose(name)
+
+    def _remove(self, peer: int, wire: str, reason: str) -> list[ImportAction]:
+        known = self._peers[peer]
+        remote = known.services.pop(wire, None)
+        if remote is None:
+            return []
+        known.nodes[remote.node] -= 1
+        if not known.nodes[remote.node]:
+            del known.nodes[remote.node]
+        actions = self._end(peer, remote.route, reason) if remote.route else []
+        if remote.shown:
+            remote.shown = False
+            actions.append(Withdraw(peer, remote.name, remote.node, reason))
+        claims = self._claims.get(remote.name, {})
+        if claims.get(peer) is remote:
+            del claims[peer]
+            if claims:
+                actions += self._choose(remote.name)
+            else:
+                del self._claims[remote.name]
+        return actions
+
+    # --- who is shown ------------------------------------------------------------------------------------------
+
+    def local(self, service: str, node: str | None) -> list[ImportAction]:
+        """Say which node of this module provides a service now, if any."""
+        if node is None:
+            self._local.pop(service, None)
+        else:
+            self._local[service] = node
+        return self._choose(service) if service in self._claims else []
+
+    def obey(self, rules: ServiceRules) -> list[ImportAction]:
+        """Other rules hold from now on; what they do not touch goes on."""
+        self._rules = rules
+        actions: list[ImportAction] = []
+        for number, known in self._peers.items():
+            for wire, remote in list(known.services.items()):
+                if rules.local_name(known.name, wire) != remote.name:
+                    actions += self._remove(number, wire, "a rule has another name for it now")
+                    actions += self._offer(number, known, ServiceOffer(wire, remote.node))
+        for service in list(self._claims):
+            actions += self._choose(service)
+        return actions
+
+    def _choose(self, service: str) -> list[ImportAction]:
+        """Show one of those who offer a service, and hide the others."""
+        claims = self._claims[service]
+        local = self._local.get(service)
+        seen: str | None = f"{local} of this module provides it itself" if local is not None else None
+        new: tuple[int, RemoteService] | None = None
+        actions: list[ImportAction] = []
+        for number in sorted(claims, key=lambda number: (self._peers[number].rank, number)):
+            remote = claims[number]
+            hidden = seen or self._objection(service, number, remote)
+            if hidden is None:
+                new = (number, remote)
+                seen = f"{self._peers[number].name} provides it too, and is shown: its GUID is lower"
+            elif remote.shown:
+                actions += self._hide(number, remote, hidden)
+            if hidden is not None:
+                remote.hidden = hidden
+        if new is not None and not new[1].shown:
+            number, remote = new
+            remote.shown, remote.hidden = True, ""
+            actions.append(Provide(number, service, remote.node))
+        return actions
+
+    def _objection(self, service: str, number: int, remote: RemoteService) -> str | None:
+        decision = self._rules.judge(service, remote.node)
+        if decision.allowed:
+            decision = self._rules.judge_for(self._peers[number].name, service, remote.wire)
+        if not decision.allowed:
+            return f"policy: {decision.rule}"
+        nodes = self._peers[number].nodes
+        if len(nodes) > limits.NODES_PER_PEER_MAX and remote.node not in list(nodes)[: limits.NODES_PER_PEER_MAX]:
+            return f"more than {limits.NODES_PER_PEER_MAX} nodes of {self._peers[number].name} provide services"
+        return None
+
+    def _hide(self, number: int, remote: RemoteService, reason: str) -> list[ImportAction]:
+        actions = self._release(number, remote, reason)
+        remote.shown = False
+        return [*actions, Withdraw(number, remote.name, remote.node, reason)]
+
+    # --- calling -----------------------------------------------------------------------------------------------
+
+    def want(self, peer: int, service: str, now: float) -> list[ImportAction]:
+        """Somebody local wants to call, or to know what it is: ``OpenedService`` or ``EndedService`` will follow.
+
+        Raises:
+            LocalProtocolError: It is not shown, or its peer has no link: ask before.
+        """
+        known, remote = self._peers.get(peer), self.get(peer, service)
+        if known is None or remote is None or not remote.shown or known.away:
+            raise LocalProtocolError(f"{service} of peer {peer} cannot be opened")
+        if remote.state is not SessionState.IDLE:
+            return []
+        known.serial += 2
+        remote.route = limits.SERVICE_ROUTES + known.serial
+        remote.due = now + limits.ROUTE_OPEN_TIMEOUT
+        known.routes[remote.route] = remote
+        self._opening[peer, remote.route] = remote
+        self._enter(remote, SessionState.OPENING)
+        return [Send(peer, OpenService(remote.route, remote.wire, self._rules.timeout(service)))]
+
+    def opened(self, peer: int, message: ServiceOpened) -> list[ImportAction]:
+        """A peer's service can be called; one that we gave up meanwhile (our words crossed) is ignored.
+
+        Raises:
+            RemoteProtocolError: It was open already.
+        """
+        known = self._peers.get(peer)
+        remote = known.routes.get(message.route) if known is not None else None
+        if remote is None:
+            return []
+        if remote.state is not SessionState.OPENING:
+            raise RemoteProtocolError(f"route {message.route} of {remote.wire} is opened twice")
+        del self._opening[peer, message.route]
+        self._enter(remote, SessionState.OPEN)
+        remote.requests = message.requests
+        remote.problem = ""
+        remote.about = About(message.type, message.md5, message.request_type, message.response_type)
+        return [OpenedService(peer, remote.name, message.route, message.requests, remote.about)]
+
+    def closed(self, peer: int, message: ServiceClosed) -> list[ImportAction]:
+        """A peer's service cannot be called, or no longer."""
+        known = self._peers.get(peer)
+        if known is None or message.route not in known.routes:
+            return []
+        return self._end(peer, message.route, message.reason)
+
+    def release(self, peer: int, service: str, reason: str = "nobody calls it") -> list[ImportAction]:
+        """Nobody here has called it for a while."""
+        remote = self.get(peer, service)
+        return self._release(peer, remote, reason) if remote is not None else []
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is due, monotonic seconds."""
+        return min((remote.due for remote in self._opening.values()), default=None)
+
+    def handle_timer(self, now: float) -> list[ImportAction]:
+        """Give up what was not answered in time."""
+        actions: list[ImportAction] = []
+        for (peer, _), remote in list(self._opening.items()):
+            if remote.due <= now:
+                text = f"the agent of {self.peer_name(peer)} does not answer"
+                actions += self._release(peer, remote, text)
+                remote.problem = text
+        return actions
+
+    def _release(self, peer: int, remote: RemoteService, reason: str) -> list[ImportAction]:
+        if not remote.route:
+            return []
+        route, known = remote.route, self._peers[peer]
+        actions = self._end(peer, route, reason)
+        return actions if known.away else [Send(peer, CloseService(route)), *actions]
+
+    def _end(self, peer: int, route: int, reason: str) -> list[ImportAction]:
+        remote = self._peers[peer].routes.pop(route)
+        self._opening.pop((peer, route), None)
+        self._enter(remote, SessionState.IDLE)
+        requests, remote.route, remote.requests = remote.requests, 0, 0
+        remote.problem = reason
+        return [EndedService(peer, remote.name, route, requests, reason)]
+
+    def _enter(self, remote: RemoteService, state: SessionState) -> None:
+        if state not in TRANSITIONS[remote.state]:
+            raise LocalProtocolError(f"{remote.wire}: {remote.state.name} does not lead to {state.name}")
+        remote.state = state
