@@ -1,0 +1,229 @@
+"""Relays between networks: whole maps of modules, each with its exports and imports, in any order of events."""
+
+from __future__ import annotations
+
+import random
+from collections import deque
+from dataclasses import dataclass, field
+
+import pytest
+
+from rmpa.bridge.actions import Action, Publish, Retract, Send
+from rmpa.bridge.exports import Exports, LocalSource
+from rmpa.bridge.imports import Imports
+from rmpa.bridge.messages import Advertise, Origin, Source, decode, encode
+from rmpa.bridge.policy import Policy
+from rmpa.bridge.relay import Linked, Relay, Ways, may_have
+from rmpa.core import limits
+from rmpa.core.config import PolicySettings
+from rmpa.core.guid import Guid
+
+TYPE = "std_msgs/String"
+
+
+def instance(number: int) -> str:
+    return f"{number:032x}"
+
+
+def origin(number: int, *path: int) -> Origin:
+    return Origin(f"m{number}", f"10.0.0.{number}:4000#0", instance(number), "/n", tuple(map(instance, path)))
+
+
+@dataclass
+class Module:
+    """One module: what it publishes, its links, and what stands in its graph for others."""
+
+    number: int
+    relays: bool
+    exports: Exports = field(init=False)
+    imports: Imports = field(init=False)
+    relay: Relay = field(init=False)
+    links: dict[int, int] = field(default_factory=dict)
+    """Peer number here by module."""
+    numbers: int = 0
+    shown: dict[tuple[int, Source], tuple[str, str]] = field(default_factory=dict)
+    """What a driver would register: topic and proxy's name, by peer and source."""
+    dirty: set[str] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        policy = Policy(PolicySettings())
+        self.exports, self.imports = Exports(policy), Imports(policy, rng=lambda: 0.5)
+        self.relay = Relay(enabled=self.relays)
+        self.relay.instance = self.imports.ways.instance = instance(self.number)
+        self.look()
+
+    @property
+    def topic(self) -> str:
+        return f"/t{self.number}"
+
+    def look(self) -> list[Action]:
+        """The local graph as the agent's driver reads it."""
+        topics = {self.topic, *self.dirty, *(place[0] for place in self.shown.values())}
+        self.dirty = set()
+        actions: list[Action] = []
+        for topic in topics:
+            nodes = {place[1] for place in self.shown.values() if place[0] == topic}
+            graph = {n: LocalSource(TYPE, "uri", o) for n in nodes if (o := self.relay.origin((topic, n)))}
+            if topic == self.topic:
+                graph["/n"] = LocalSource(TYPE, "uri")
+            actions += self.exports.graph(topic, graph)
+        return actions
+
+    def visible(self) -> list[tuple[str, str]]:
+        return sorted(self.shown.values())
+
+
+class Map:
+    """Modules and the links between them; what is on its way on each, in order."""
+
+    def __init__(self, count: int, relays: set[int], seed: int) -> None:
+        self.rng = random.Random(seed)
+        self.modules = {n: Module(n, n in relays) for n in range(1, count + 1)}
+        self.wires: dict[tuple[int, int], deque[bytes]] = {}
+
+    def link(self, one: int, other: int) -> None:
+        for here, there in ((one, other), (other, one)):
+            self.wires[here, there] = deque()
+        for here, there in ((one, other), (other, one)):
+            module = self.modules[here]
+            module.numbers += 1
+            number = module.links[there] = module.numbers
+            who = Linked(f"m{there}", instance(there), Guid(there))
+            self.act(here, module.imports.link_up(number, f"m{there}", who))
+            self.act(here, module.exports.link_up(number, f"m{there}", instance(there)))
+
+    def unlink(self, one: int, other: int) -> None:
+        for here, there in ((one, other), (other, one)):
+            del self.wires[here, there]
+            module = self.modules[here]
+            number = module.links.pop(there)
+            self.act(here, module.exports.link_down(number))
+            self.act(here, list(module.imports.link_down(number)))
+            module.relay.peer_gone(number)
+            self.act(here, module.imports.unlinked(number))
+
+    def act(self, here: int, actions: list[Action]) -> None:
+        module = self.modules[here]
+        for action in actions:
+            match action:
+                case Send(peer, message):
+                    there = next((m for m, number in module.links.items() if number == peer), None)
+                    if there is not None:
+                        self.wires[here, there].append(encode(message))
+                case Publish(peer, source, _, topic, whose):
+                    there = next(m for m, number in module.links.items() if number == peer)
+                    whose = whose or Origin(f"m{there}", f"10.0.0.{there}:4000#0", instance(there), source.node)
+                    place = (topic or source.topic, f"/rmpa/{whose.name}{whose.node}")
+                    module.relay.shown(peer, source, place, whose)
+                    module.shown[peer, source] = place
+                case Retract(peer, source):
+                    module.relay.gone(peer, source)
+                    module.dirty.add(module.shown.pop((peer, source))[0])
+        if actions:
+            self.act(here, module.look())
+
+    def settle(self) -> None:
+        for _ in range(20_000):
+            for here, module in self.modules.items():
+                while module.exports.untold:
+                    self.act(here, module.exports.tell())
+            full = [wire for wire, waiting in self.wires.items() if waiting]
+            if not full:
+                return
+            there, here = self.rng.choice(full)
+            message = decode(self.wires[there, here].popleft())
+            assert isinstance(message, Advertise)
+            module = self.modules[here]
+            for portion in module.imports.portions(module.links[there], message):
+                self.act(here, module.imports.advertised(module.links[there], portion))
+        raise AssertionError("it never settles")
+
+    def reachable(self, start: int) -> set[int]:
+        """Who ought to be visible: linked, or behind relays that are, as far as the hop limit allows."""
+        found, ring = {start}, [start]
+        for hop in range(limits.RELAY_HOPS_MAX + 1):
+            onward = [m for m in ring if hop == 0 or self.modules[m].relays]
+            ring = [other for m in onward for other in self.modules[m].links if other not in found]
+            found.update(ring)
+        return found - {start}
+
+    def check(self) -> None:
+        for here, module in self.modules.items():
+            expected = sorted((f"/t{m}", f"/rmpa/m{m}/n") for m in self.reachable(here))
+            assert module.visible() == expected, f"module {here}"
+
+
+def test_two_networks_and_two_relays_of_which_one_is_used() -> None:
+    world = Map(4, {3, 4}, 1)
+    for pair in ((1, 3), (1, 4), (2, 3), (2, 4), (3, 4)):
+        world.link(*pair)
+    world.settle()
+    world.check()
+    b = world.modules[2]
+    assert [(whose.name, via) for whose, via in b.imports.ways] == [("m1", "m3")]
+    hidden = [entry.hidden for _, source, entry in b.imports if source.topic == "/t1" and not entry.shown]
+    assert hidden == ["m1 is reached by way of m3"]
+    world.unlink(2, 3)
+    world.settle()
+    world.check()
+    assert [via for _, via in b.imports.ways] == ["m4", "m4"], "m1 and, now, m3"
+    world.link(1, 2)
+    world.settle()
+    world.check()
+    assert [whose.name for whose, _ in b.imports.ways] == ["m3"], "a link of its own goes first"
+
+
+def test_who_does_not_relay_passes_nothing_on() -> None:
+    world = Map(3, set(), 1)
+    world.link(1, 2)
+    world.link(2, 3)
+    world.settle()
+    world.check()
+    assert world.modules[3].visible() == [("/t2", "/rmpa/m2/n")]
+
+
+def test_a_long_row_ends_at_the_hop_limit() -> None:
+    world = Map(limits.RELAY_HOPS_MAX + 3, set(range(1, 10)), 1)
+    for number in range(1, limits.RELAY_HOPS_MAX + 3):
+        world.link(number, number + 1)
+    world.settle()
+    world.check()
+    assert ("/t1", "/rmpa/m1/n") not in world.modules[limits.RELAY_HOPS_MAX + 3].visible()
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_any_map_settles_with_each_source_once_everywhere(seed: int) -> None:
+    rng = random.Random(seed)
+    count = rng.randint(3, 6)
+    world = Map(count, set(rng.sample(range(1, count + 1), rng.randint(0, count))), seed)
+    pairs = [(one, other) for one in range(1, count + 1) for other in range(one + 1, count + 1)]
+    linked: set[tuple[int, int]] = set()
+    for _ in range(12):
+        pair = rng.choice(pairs)
+        (world.unlink if pair in linked else world.link)(*pair)
+        linked ^= {pair}
+        if rng.random() < 0.6:
+            world.settle()
+            world.check()
+    world.settle()
+    world.check()
+
+
+def test_nothing_goes_back_where_it_came_from() -> None:
+    assert not may_have(instance(1), origin(1, 2))
+    assert not may_have(instance(2), origin(1, 2))
+    assert may_have(instance(3), origin(1, 2))
+
+
+def test_the_way_is_told_and_what_came_round_is_not_shown() -> None:
+    ways = Ways()
+    ways.instance = instance(9)
+    ways.linked(1, Linked("r", instance(2), Guid(2)))
+    assert not ways.learn(1, origin(9, 2))
+    assert ways.why_not(1, origin(9, 2)) == "it is ours, and came back by a relay"
+    assert not ways.learn(1, origin(1, 9, 2))
+    assert ways.why_not(1, origin(1, 9, 2)) == "we passed it on ourselves"
+    assert ways.learn(1, origin(1, 2))
+    assert not ways.why_not(1, origin(1, 2))
+    assert ways.forget(1, origin(1, 2))
+    assert list(ways) == []
