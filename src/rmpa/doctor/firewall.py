@@ -71,7 +71,7 @@ def read_nft(text: str, ports: frozenset[int]) -> Rules:
         elif (hook := _HOOK.match(line)) is not None:
             if hook[1] == "drop":
                 rules.closed.append(f"{table} {chain}".strip())
-        elif line and line != "}" and chain:
+        elif line and line != "}" and chain and not line.startswith("type "):
             rules.take(line, ports)
     return rules
 

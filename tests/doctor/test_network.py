@@ -1,0 +1,120 @@
+"""What ``rmpa doctor`` says of interfaces, multicast, routes, filters and ports."""
+
+from __future__ import annotations
+
+from ipaddress import IPv4Interface
+
+import pytest
+
+from rmpa.doctor.finding import Finding, Level, exit_code
+from rmpa.doctor.network import (
+    Card,
+    Echo,
+    Port,
+    judge_cards,
+    judge_multicast,
+    judge_ports,
+    judge_routes,
+    judge_rp_filter,
+)
+
+LO = Card("lo", (IPv4Interface("127.0.0.1/8"),), loopback=True)
+WLAN = Card("wlan0", (IPv4Interface("192.168.1.5/24"),))
+ETH = Card("eth0", (IPv4Interface("10.0.0.5/24"),))
+
+
+def only(found: list[Finding], level: Level) -> Finding:
+    (one,) = [finding for finding in found if finding.level is level]
+    if level in (Level.WARN, Level.FAIL):
+        assert one.remedy, "who is told of trouble is told what to do"
+    return one
+
+
+def test_two_ordinary_interfaces_are_fine() -> None:
+    found = judge_cards((LO, WLAN, ETH), ())
+    assert {finding.level for finding in found} == {Level.OK}
+    assert [finding.subject for finding in found] == ["wlan0", "eth0"]
+    assert exit_code(found) == 0
+
+
+def test_no_network_at_all() -> None:
+    warned = only(judge_cards((LO, Card("eth0", up=False, used=False)), ()), Level.WARN)
+    assert "none but loopback" in warned.text
+    assert "eth0" in warned.remedy
+    assert only(judge_cards((LO,), ()), Level.WARN).remedy == "plug in a network"
+
+
+def test_an_interface_that_the_settings_name_and_that_is_not_there() -> None:
+    warned = only(judge_cards((LO, WLAN), ("wlan0", "eth7")), Level.WARN)
+    assert warned.subject == "eth7"
+    assert "there are lo, wlan0" in warned.text
+
+
+@pytest.mark.parametrize("name", ["tun0", "wg0", "tailscale0", "ztabc"])
+def test_a_tunnel_carries_no_multicast(name: str) -> None:
+    warned = only(judge_cards((LO, WLAN, Card(name, (IPv4Interface("10.8.0.2/32"),))), ()), Level.WARN)
+    assert warned.subject == name
+    assert "--seed" in warned.remedy
+
+
+def test_interfaces_of_containers_are_named_but_no_trouble() -> None:
+    found = judge_cards((LO, WLAN, Card("docker0", (IPv4Interface("172.17.0.1/16"),))), ())
+    assert exit_code(found) == 0
+    assert "containers" in next(finding.text for finding in found if finding.subject == "docker0")
+
+
+def test_an_address_that_no_dhcp_gave() -> None:
+    warned = only(judge_cards((LO, Card("eth0", (IPv4Interface("169.254.3.4/16"),))), ()), Level.WARN)
+    assert "DHCP" in warned.text
+
+
+def test_two_interfaces_in_one_network() -> None:
+    warned = only(judge_cards((LO, WLAN, Card("eth0", (IPv4Interface("192.168.1.6/24"),))), ()), Level.WARN)
+    assert warned.subject == "wlan0+eth0"
+    assert "192.168.1.0/24" in warned.text
+
+
+def test_a_container_with_a_network_of_its_own() -> None:
+    warned = only(judge_cards((LO, ETH), (), container=True), Level.WARN)
+    assert "--network host" in warned.remedy
+
+
+def test_multicast_by_interface() -> None:
+    echoes = (Echo("lo", after=0.0002), Echo("eth0"), Echo("wlan0", "Operation not permitted"))
+    lo, eth, wlan = judge_multicast(echoes, "239.255.82.77", 11411)
+    assert (lo.level, eth.level, wlan.level) == (Level.OK, Level.FAIL, Level.FAIL)
+    assert "heard 0.2 ms later" in lo.text
+    assert "not heard" in eth.text
+    assert "11411" in eth.remedy
+    assert "Operation not permitted" in wlan.text
+    assert exit_code([lo, eth]) == 1
+
+
+def test_strict_filters_matter_where_there_are_two_ways() -> None:
+    strict = {"all": 1, "wlan0": 0, "eth0": 0}
+    warned = only(judge_rp_filter(strict, (LO, WLAN, ETH)), Level.WARN)
+    assert "rp_filter=2" in warned.remedy
+    assert judge_rp_filter(strict, (LO, WLAN))[0].level is Level.OK
+    # The greater of both counts: 2 is loose.
+    assert judge_rp_filter({"all": 2, "wlan0": 1, "eth0": 1}, (LO, WLAN, ETH))[0].level is Level.OK
+    assert judge_rp_filter({}, (LO, WLAN, ETH))[0].level is Level.SKIPPED
+
+
+def test_routes() -> None:
+    found = judge_routes({"10.1.0.2 (arm)": "Network is unreachable", "10.0.0.2 (base)": ""})
+    assert only(found, Level.FAIL).subject == "10.1.0.2 (arm)"
+    assert only(found, Level.OK).subject == "10.0.0.2 (base)"
+    assert judge_routes({})[0].level is Level.SKIPPED
+
+
+def test_ports() -> None:
+    ports = (
+        Port("the ROS core", 11311, "Address already in use", "roscore (pid 7)"),
+        Port("the mesh (TCP)", 40001, "Address already in use", "agent base", ours=True),
+        Port("beacons (UDP)", 11411),
+    )
+    core, mesh, beacons = judge_ports(ports)
+    assert (core.level, mesh.level, beacons.level) == (Level.FAIL, Level.OK, Level.OK)
+    assert "roscore (pid 7)" in core.text
+    assert "11311" in core.remedy
+    assert "agent base" in mesh.text

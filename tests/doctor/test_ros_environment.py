@@ -1,0 +1,125 @@
+"""Variables that would mislead nodes; each of these has cost somebody an afternoon."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from rmpa.doctor.finding import Finding, Level
+from rmpa.doctor.ros_environment import Shell, judge_shell, names_of
+
+SHELL = Shell(
+    environ={},
+    host_name="base",
+    addresses=frozenset({"127.0.0.1", "10.0.0.1"}),
+    resolved={"base": ("127.0.1.1",), "robot2": ("10.0.0.2",), "base.local": ("10.0.0.1",)},
+    cores={"base": "http://127.0.0.1:11311/"},
+    domains={"base": 0},
+)
+
+
+def judged(shell: Shell = SHELL, /, **environ: str) -> dict[str, Finding]:
+    found = {finding.subject: finding for finding in judge_shell(replace(shell, environ=environ))}
+    for finding in found.values():
+        assert bool(finding.remedy) is (finding.level is not Level.OK), finding
+    return found
+
+
+def test_a_clean_shell() -> None:
+    assert {finding.level for finding in judged().values()} == {Level.OK}
+
+
+@pytest.mark.parametrize(
+    ("uri", "level", "part"),
+    [
+        ("http://localhost:11311", Level.OK, "is the core of base"),
+        ("http://127.0.0.1:11311/", Level.OK, "is the core of base"),
+        ("http://10.0.0.1:11311", Level.OK, "is the core of base"),
+        ("http://robot2:11311", Level.FAIL, "is another machine (10.0.0.2)"),
+        ("http://10.0.0.7:11311", Level.FAIL, "is another machine"),
+        ("http://nobody:11311", Level.FAIL, "nobody knows the name nobody"),
+        (
+            "http://localhost:11312",
+            Level.WARN,
+            "is not the core of an agent here (base's is http://127.0.0.1:11311/)",
+        ),
+        ("localhost:11311", Level.FAIL, "is not a master's URI"),
+        ("http://localhost", Level.FAIL, "is not a master's URI"),
+    ],
+)
+def test_ros_master_uri(uri: str, level: Level, part: str) -> None:
+    found = judged(ROS_MASTER_URI=uri)["ROS_MASTER_URI"]
+    assert found.level is level
+    assert part in found.text
+
+
+def test_ros_master_uri_without_an_agent() -> None:
+    alone = replace(SHELL, cores={}, domains={})
+    assert judged(alone)["ROS_MASTER_URI"].level is Level.OK
+    found = judged(replace(alone, answers=True))["ROS_MASTER_URI"]
+    assert found.level is Level.WARN
+    assert "no agent of ours" in found.text
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "level", "part"),
+    [
+        ("ROS_IP", "127.0.0.1", Level.OK, "is this machine"),
+        ("ROS_IP", "10.0.0.1", Level.OK, "is this machine"),
+        ("ROS_IP", "10.0.0.9", Level.FAIL, "is not an address of this machine"),
+        ("ROS_IP", "base", Level.FAIL, "no IPv4 address"),
+        ("ROS_HOSTNAME", "base.local", Level.OK, "is this machine"),
+        ("ROS_HOSTNAME", "localhost", Level.OK, "is this machine"),
+        ("ROS_HOSTNAME", "robot2", Level.FAIL, "is not an address of this machine"),
+        ("ROS_HOSTNAME", "nobody", Level.FAIL, "nobody knows the name nobody"),
+        ("ROS_HOSTNAME", "http://base:11311", Level.FAIL, "is a URI"),
+    ],
+)
+def test_under_which_name_nodes_are_reached(variable: str, value: str, level: Level, part: str) -> None:
+    found = judged(**{variable: value})[variable]
+    assert found.level is level
+    assert part in found.text
+
+
+def test_both_names_at_once() -> None:
+    found = judged(ROS_IP="10.0.0.1", ROS_HOSTNAME="base.local")
+    assert found["ROS_IP"].level is Level.WARN
+    assert found["ROS_HOSTNAME"].level is Level.OK
+
+
+@pytest.mark.parametrize(
+    ("addresses", "level"), [(("127.0.1.1",), Level.OK), (("10.0.0.9",), Level.FAIL), ((), Level.FAIL)]
+)
+def test_the_host_name_counts_where_no_variable_does(addresses: tuple[str, ...], level: Level) -> None:
+    shell = replace(SHELL, resolved={"base": addresses})
+    assert judged(shell)["host name"].level is level
+    assert "host name" not in judged(shell, ROS_IP="127.0.0.1")
+
+
+@pytest.mark.parametrize(
+    ("value", "level"), [("0", Level.OK), ("7", Level.WARN), ("233", Level.FAIL), ("x", Level.FAIL)]
+)
+def test_domain(value: str, level: Level) -> None:
+    assert judged(ROS_DOMAIN_ID=value)["ROS_DOMAIN_ID"].level is level
+
+
+@pytest.mark.parametrize(
+    ("variable", "value"),
+    [
+        ("ROS_LOCALHOST_ONLY", "1"),
+        ("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF"),
+        ("ROS_AUTOMATIC_DISCOVERY_RANGE", "localhost"),
+        ("ROS_NAMESPACE", "/robot"),
+    ],
+)
+def test_what_else_misleads(variable: str, value: str) -> None:
+    assert judged(**{variable: value})[variable].level is Level.WARN
+
+
+def test_names_that_have_to_be_looked_up() -> None:
+    assert names_of({"ROS_MASTER_URI": "http://robot2:11311", "ROS_HOSTNAME": "10.0.0.1"}, "base") == (
+        "robot2",
+        "base",
+    )
+    assert names_of({"ROS_MASTER_URI": "nonsense"}, "base") == ("base",)
