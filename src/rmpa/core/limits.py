@@ -562,6 +562,10 @@ DOCTOR_CLOCK_APART: Final = 0.02
 # --- resources ------------------------------------------------------------------------------------------------
 DESCRIPTOR_MAX: Final = 1 * MIB
 """Characters of a resource's descriptor: one with a hundred profiles of twenty attributes has some 100 KB."""
+REQUIREMENT_TEXT_MAX: Final = 1024
+"""Characters in what is asked of one attribute."""
+REQUIREMENT_BOUNDS_MAX: Final = 256
+"""Attributes that one client asks for."""
 
 # --- logging --------------------------------------------------------------------------------------------------
 LOG_WAITING: Final = 10_000
