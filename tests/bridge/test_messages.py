@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from typing import get_args
 
 import pytest
@@ -24,6 +25,7 @@ from rmpa.bridge.messages import (
     Open,
     Opened,
     OpenService,
+    Origin,
     ServiceClosed,
     ServiceOffer,
     ServiceOpened,
@@ -53,13 +55,40 @@ STRICT = Contract(
     priority=Priority.HIGH,
     max_rate=30.0,
 )
+PAD, R = "0" * 31 + "1", "f" * 32
 ADD_MD5 = "6a2e34150c00229791cc89ff309fff21"
+
+
+def relayed(**changed: object) -> bytes:
+    """An offer whose origin is not as it should be."""
+    origin = {"name": "pad", "guid": "10.0.0.1:4000#7", "instance": PAD, "node": "/joy", "path": [R], **changed}
+    offer = {"topic": "/a", "node": "/b", "type": "a/B", "origin": origin}
+    return json.dumps({"op": "advertise", "added": [offer]}).encode()
+
+
 GOLDEN: list[tuple[Message, bytes]] = [
     (
         Advertise(added=(Offer("/cmd", "/joy", "sensor_msgs/Joy"),), full=True),
         (
             b'{"op":"advertise","added":[{"topic":"/cmd","node":"/joy","type":"sensor_msgs/Joy"}],'
             b'"removed":[],"full":true,"more":false}'
+        ),
+    ),
+    (
+        Advertise(
+            added=(
+                Offer(
+                    "/cmd", "/rmpa/pad/joy", "sensor_msgs/Joy", Origin("pad", "10.0.0.1:4000#7", PAD, "/joy", (R,))
+                ),
+            )
+        ),
+        (
+            b'{"op":"advertise","added":[{"topic":"/cmd","node":"/rmpa/pad/joy","type":"sensor_msgs/Joy","origin":'
+            b'{"name":"pad","guid":"10.0.0.1:4000#7","instance":"'
+            + PAD.encode()
+            + b'","node":"/joy","path":["'
+            + R.encode()
+            + b'"]}}],"removed":[],"full":false,"more":false}'
         ),
     ),
     (
@@ -155,6 +184,17 @@ def test_golden_bytes(message: Message, wire: bytes) -> None:
         b'{"op":"advertise","added":[{"topic":"/a","node":"/b","type":"String"}]}',
         b'{"op":"advertise","added":[{"topic":"","node":"/b","type":"a/B"}]}',
         b'{"op":"advertise","removed":[{"topic":"/a","node":""}]}',
+        relayed(name="a b"),
+        relayed(name=""),
+        relayed(guid="10.0.0.1"),
+        relayed(guid=1),
+        relayed(instance="0" * 31),
+        relayed(instance="G" * 32),
+        relayed(node="joy"),
+        relayed(path=[]),
+        relayed(path=["f" * 32] * 5),
+        relayed(path=["f" * 31]),
+        relayed(path="f" * 32),
         b'{"op":"opened","route":1,"description":{"type":"*","md5":"*","definition":"","latching":false}}',
         (
             b'{"op":"opened","route":1,"description":{"type":"a/B","md5":"5a9ea5f83505693b71e785041e67a8bb",'

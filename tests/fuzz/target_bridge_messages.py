@@ -7,6 +7,11 @@ from rmpa.core.errors import RemoteProtocolError
 
 SEEDS: list[bytes] = [
     b'{"op":"advertise","added":[{"topic":"/cmd","node":"/joy","type":"sensor_msgs/Joy"}],"removed":[],"full":true}',
+    (
+        b'{"op":"advertise","added":[{"topic":"/cmd","node":"/rmpa/pad/joy","type":"sensor_msgs/Joy","origin":'
+        b'{"name":"pad","guid":"10.0.0.1:4000#7","instance":"00000000000000000000000000000001","node":"/joy",'
+        b'"path":["ffffffffffffffffffffffffffffffff"]}}]}'
+    ),
     b'{"op":"open","route":7,"topic":"/cmd","node":"/joy"}',
     b'{"op":"opened","route":7,"description":{"type":"a/B","md5":"5a9ea5f83505693b71e785041e67a8bb","definition":"x","latching":true}}',
     (
