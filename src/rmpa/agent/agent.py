@@ -91,7 +91,7 @@ class Agent:
         self.core: Core = make_core(settings)
         self.bridge = Bridge(
             self.core,
-            Policy(settings.policy, settings.peers),
+            Policy(settings.policy, settings.peers, settings.time),
             rng=random.random,
             contracts=Contracts(settings.contracts),
             names=Names(settings.peers),
@@ -114,7 +114,9 @@ class Agent:
         )
         self.params = Params(self.core, self.bridge, settings.name, settings.params, settings.time)
         self.bridge.add(self.params)
-        rules = ServiceRules(settings.services, Policy(settings.policy, settings.peers), Names(settings.peers))
+        rules = ServiceRules(
+            settings.services, Policy(settings.policy, settings.peers, settings.time), Names(settings.peers)
+        )
         self.services = Services(self.core, self.bridge, rules)
         self.bridge.add(self.services)
         self._param_ops = ParamOps(self.params, self.bridge.asks, self._attached)

@@ -51,7 +51,7 @@ class TopicsView:
 
     def reload(self, settings: Settings) -> None:
         """Other settings hold from now on."""
-        self._policy = Policy(settings.policy, settings.peers)
+        self._policy = Policy(settings.policy, settings.peers, settings.time)
         self._contracts = Contracts(settings.contracts)
 
     def infos(self, wanted: Collection[str] | None = None) -> tuple[TopicInfo, ...]:

@@ -52,7 +52,7 @@ class Why:
 
     def reload(self, settings: Settings) -> None:
         """Other settings hold from now on."""
-        self._policy = Policy(settings.policy, settings.peers)
+        self._policy = Policy(settings.policy, settings.peers, settings.time)
 
     async def answer(self, args: dict[str, object]) -> tuple[Diagnosis, ...]:
         """The control socket's op ``why``.

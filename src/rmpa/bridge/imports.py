@@ -30,6 +30,7 @@ from rmpa.bridge.naming import Names, PeerNames
 from rmpa.bridge.relay import Linked, Ways
 from rmpa.core import limits
 from rmpa.core.backoff import Backoff
+from rmpa.core.config_param import CLOCK
 from rmpa.core.contract import Contract, Contracts, Reliability
 from rmpa.core.errors import LocalProtocolError
 
@@ -75,7 +76,8 @@ class Import:
         backoff: Delays between attempts.
         shown: Whether it is in the local graph.
         hidden: Why it is not, or empty.
-        conflict: Whether that is because a local node publishes the topic with another type.
+        conflict: Whether that is because a local node publishes the topic with another type, or time has come from
+            elsewhere before.
         state: Where its route stands.
         route: The route's id while it is asked for or open, else 0.
         timer: When the state is looked at again, monotonic seconds.
@@ -527,6 +529,10 @@ class Imports:
         """A source has left the local graph: another one may have stood behind it."""
         known = self._peers[peer]
         del known.places[entry.topic, source.node]
+        if entry.topic == CLOCK:
+            entry.shown = False
+            waiting = [(p, s) for p, k in self._peers.items() for s in k.topics.get(CLOCK, ()) if s != source]
+            return [a for p, s in waiting for a in self._show_or_hide(p, s, self._peers[p].sources[s])]
         if self._names_of(known, entry.origin).plain:
             return []
         behind = [s for s in known.topics.get(entry.topic, ()) if s.node == source.node and s != source]
@@ -552,6 +558,8 @@ class Imports:
         origin = entry.origin
         if origin is not None and (why := self.ways.why_not(peer, origin)):
             return why, False
+        if topic == CLOCK:
+            return self._why_no_time(peer, source, entry)
         decision = self._policy.judge(topic, type_name, source.node if origin is None else origin.node)
         for name in (known.name,) if origin is None else (known.name, origin.name):
             if decision.allowed:
@@ -567,6 +575,21 @@ class Imports:
             return "", False
         why = f"its type is {type_name}, but a local node publishes {topic} as {local}; "
         return why + "rename one of the topics or use one type", True
+
+    def _why_no_time(self, peer: int, source: Source, entry: Import) -> tuple[str, bool]:
+        """Time has one source: one node of the peer that is followed, or one of this module."""
+        if entry.origin is not None:
+            return "time does not come by a relay", False
+        decision = self._policy.judge_clock(self._peers[peer].name)
+        if not decision.allowed:
+            return decision.rule, False
+        if CLOCK in self._local_types:
+            return "a node of this module publishes /clock, and time has one source: end that one", True
+        for other, known in self._peers.items():
+            for one in known.topics.get(CLOCK, ()):
+                if known.sources[one].shown and (other, one) != (peer, source):
+                    return f"time comes from {one.node} of {known.name} already, and has one source", True
+        return "", False
 
     def _forget(self, peer: int, source: Source) -> list[Action]:
         entry = self._peers[peer].sources.get(source)

@@ -15,6 +15,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
+from rmpa.core.config_param import CLOCK
 from rmpa.core.config_peer import PEER
 from rmpa.core.names import matches
 
@@ -67,12 +68,16 @@ class PeerNames:
         return self._outgoing(local, type_name)[1]
 
     def _incoming(self, name: str, type_name: str) -> tuple[str, str]:
+        if name == CLOCK:
+            return name, ""  # nodes look for time nowhere else
         for remap, source, target in self._in:
             if (new := _renamed(name, type_name, remap, source, target)) is not None:
                 return new, f'remap_in has "{remap.source}" = "{remap.target}"'
         return (self.prefix + name, f'prefix = "{self.prefix}"') if self.prefix else (name, "")
 
     def _outgoing(self, name: str, type_name: str) -> tuple[str, str]:
+        if name == CLOCK:
+            return name, ""
         for remap, source, target in self._out:
             if (new := _renamed(name, type_name, remap, source, target)) is not None:
                 return new, f'remap_out has "{remap.source}" = "{remap.target}"'

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
+from rmpa.core.config import TimeSettings
+from rmpa.core.config_param import CLOCK
 from rmpa.core.config_peer import PEER
 from rmpa.core.names import NEVER_CROSSING, matches
 
@@ -17,6 +19,9 @@ OWN_NODE: Final = "/rmpa"
 
 BUILT_IN_DENY: Final = NEVER_CROSSING
 """Topics that never cross, and why."""
+
+
+_NO_TIME: Final = TimeSettings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,20 +43,34 @@ class Policy:
     Args:
         settings: The user's globs for all peers.
         peers: And those for single ones, on top.
+        time: Whether ``/clock`` crosses, and from whom: nothing else decides about that.
     """
 
-    def __init__(self, settings: PolicySettings, peers: tuple[PeerRule, ...] = ()) -> None:
+    def __init__(
+        self, settings: PolicySettings, peers: tuple[PeerRule, ...] = (), time: TimeSettings = _NO_TIME
+    ) -> None:
         self._settings = settings
         self._peers = peers
+        self._time = time
         self._known: dict[str, list[tuple[str, PolicySettings]]] = {}
 
     def judge(self, topic: str, type_name: str, node: str) -> Decision:
         """Decide about one source; the first "no" wins, in the order of the table below."""
         if is_own(node):
             return Decision(False, f"{node} stands for a node of another module, or is the agent itself")
+        if topic == CLOCK and self._time.share:
+            return Decision(True, "time.share = true: peers may follow this module's time")
         if why := never_crosses(topic):
             return Decision(False, f"built in: {why}")
         return _judge(self._settings, "bridge", topic, type_name)
+
+    def judge_clock(self, peer: str) -> Decision:
+        """Decide whether a peer's ``/clock`` may come here."""
+        if not self._time.follow:
+            return Decision(False, f"built in: {NEVER_CROSSING[CLOCK]}; [time] follow names the peer to follow")
+        if self._time.follow != peer:
+            return Decision(False, f'time.follow = "{self._time.follow}": time comes from there alone')
+        return Decision(True, f'time.follow = "{peer}"')
 
     def has_rules_for(self, peer: str) -> bool:
         """Whether ``judge_for`` has anything to say about a peer."""

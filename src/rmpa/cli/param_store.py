@@ -200,7 +200,7 @@ class PeerStore:
             text = serialize_response(value).decode()
         except LocalProtocolError as error:
             raise RmpaError(f"{key}: {error}") from None
-        return self._drive(transfer.writing(key, text, secrets.randbits(31)))
+        return int(self._drive(transfer.writing(key, text, secrets.randbits(31))))
 
     def delete(self, key: str) -> None:
         """Take a parameter or namespace away."""

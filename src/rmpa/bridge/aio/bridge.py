@@ -158,7 +158,7 @@ class Bridge:
 
         What they leave as it is goes on untouched; the rest follows in a moment.
         """
-        policy, contracts = Policy(settings.policy, settings.peers), Contracts(settings.contracts)
+        policy, contracts = Policy(settings.policy, settings.peers, settings.time), Contracts(settings.contracts)
         self.names = Names(settings.peers)
         self._act(self._exports.rules(policy, contracts, self.names))
         self._rejudging = self._imports.rules(policy, contracts, self.names, self._loop.time())
@@ -496,7 +496,7 @@ class Bridge:
             part.graph_changed(change)
 
     def _param_update(self, key: str, _value: XmlRpcValue) -> bool:
-        return any([part.param_update(key) for part in self._parts])  # each of them, not up to the first
+        return sum(part.param_update(key) for part in self._parts) > 0  # each of them hears it
 
     def _schedule(self) -> None:
         if self._rescan is None and not self._closed:

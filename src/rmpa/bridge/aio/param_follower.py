@@ -207,12 +207,13 @@ class ParamFollower:
         if attached is None:
             return
         steps = transfer.reading(transfer.GET, {"key": entry.rule.key})
+        text = ""
         try:
             question = next(steps)
             while True:
                 question = steps.send(await self._asks.ask(attached, *question))
         except StopIteration as done:
-            text: str = done.value
+            text = done.value
         except RmpaError:
             entry.ask = entry.peer is not None  # its owner may have deleted it meanwhile, and tells that next
             raise

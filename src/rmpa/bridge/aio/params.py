@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.aio.bridge import Attached, Bridge
     from rmpa.bridge.params import Followed
-    from rmpa.core.config import ParamSettings, TimeSettings
+    from rmpa.core.config import ParamSettings, Settings, TimeSettings
     from rmpa.ros.aio.core_api import Core
     from rmpa.ros.xmlrpc import XmlRpcValue
 
@@ -52,8 +52,9 @@ class Params(Part):
         """What is followed, and how that goes."""
         return self._follower.following
 
-    def change(self, params: ParamSettings, time: TimeSettings) -> None:
+    def reload(self, settings: Settings) -> None:
         """Other rules hold from now on; what they do not concern goes on untouched."""
+        params, time = settings.params, settings.time
         self._desk.policy = ParamPolicy(params, time)
         self._desk.judge_again()
         self._follower.change(follow_rules(params, time))

@@ -140,7 +140,7 @@ class Services(Part):
 
     def reload(self, settings: Settings) -> None:
         """Other settings hold from now on."""
-        policy, names = Policy(settings.policy, settings.peers), Names(settings.peers)
+        policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.peers)
         self.obey(ServiceRules(settings.services, policy, names))
 
     def obey(self, rules: ServiceRules) -> None:
