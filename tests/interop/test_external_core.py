@@ -81,7 +81,7 @@ def test_nodes_of_a_roscore_and_of_an_embedded_core_hear_each_other_and_it_is_le
 
 def test_a_new_node_is_seen_within_a_second_and_a_dead_one_crosses_no_more(joined: Callable[[], Joined]) -> None:
     a, b, _ = joined()
-    talker = a.ros.roscpp("talker", topic="/chatter", rate=10)
+    talker = a.ros.roscpp("talker", topic="/chatter", rate=100)
     a.wait_topic("/chatter")
     begin = time.monotonic()
     eventually(lambda: "/chatter" in b.topics(), what="/chatter at b", every=0.01)
