@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rmpa.bridge.naming import Names, PeerNames
+from rmpa.core.config import PeerRule, Remap
+
+ROBOT = PeerRule(
+    "robot*",
+    "/{peer}",
+    (
+        Remap("/scan", "/laser", ("sensor_msgs/LaserScan", "sensor_msgs/Multi*")),
+        Remap("/tf", "/tf"),
+        Remap("/arm/gripper", "/hand"),
+        Remap("/arm/**", "/{peer}/left/**"),
+    ),
+    (Remap("/goals/{peer}", "/goal"), Remap("/shared/**", "/**")),
+)
+NAMES = st.from_regex(r"(/[a-c]{1,2}){1,4}", fullmatch=True)
+
+
+@pytest.mark.parametrize(
+    ("wire", "type_name", "local"),
+    [
+        ("/odom", "", "/robot1/odom"),
+        ("/tf", "", "/tf"),
+        ("/tf_static", "", "/robot1/tf_static"),
+        ("/arm/gripper", "", "/hand"),
+        ("/arm/gripper/state", "", "/robot1/left/gripper/state"),
+        ("/arm", "", "/robot1/left"),
+        ("/army", "", "/robot1/army"),
+        ("/scan", "sensor_msgs/LaserScan", "/laser"),
+        ("/scan", "sensor_msgs/MultiEchoLaserScan", "/laser"),
+        ("/scan", "sensor_msgs/Image", "/robot1/scan"),
+        ("/scan", "", "/robot1/scan"),
+    ],
+)
+def test_their_names_here(wire: str, type_name: str, local: str) -> None:
+    assert Names((ROBOT,)).local_name("robot1", wire, type_name) == local
+
+
+@pytest.mark.parametrize(
+    ("local", "wire"),
+    [
+        ("/robot1/cmd_vel", "/cmd_vel"),
+        ("/robot1", "/robot1"),
+        ("/robot12/cmd_vel", "/robot12/cmd_vel"),
+        ("/map", "/map"),
+        ("/goals/robot1", "/goal"),
+        ("/goals/robot2", "/goals/robot2"),
+        ("/shared/a/b", "/a/b"),
+        ("/shared", "/shared"),
+    ],
+)
+def test_our_names_there(local: str, wire: str) -> None:
+    assert Names((ROBOT,)).wire_name("robot1", local) == wire
+
+
+def test_a_name_is_renamed_once() -> None:
+    names = PeerNames("p", (PeerRule("p", "", (Remap("/a", "/b"), Remap("/b", "/c"))),))
+    assert (names.local_name("/a"), names.local_name("/b"), names.local_name("/c")) == ("/b", "/c", "/c")
+
+
+def test_rules_of_several_tables_apply_in_order_and_others_not_at_all() -> None:
+    rules = (
+        PeerRule("p*", "", (Remap("/a", "/x"),)),
+        PeerRule("q", "/q", (Remap("/a", "/y"),)),
+        PeerRule("*", "/{peer}", (Remap("/a", "/z"), Remap("/b", "/z2"))),
+    )
+    names = Names(rules)
+    assert [names.local_name("p1", name) for name in ("/a", "/b", "/c")] == ["/x", "/z2", "/p1/c"]
+    assert [names.local_name("q", name) for name in ("/a", "/b", "/c")] == ["/y", "/z2", "/q/c"]
+
+
+def test_without_rules_for_it_a_peer_is_plain() -> None:
+    names = Names((ROBOT, PeerRule("base")))
+    assert names.of("base").plain
+    assert names.of("nobody").plain
+    assert not names.of("robot2").plain
+
+
+def test_the_rule_that_decided_is_named() -> None:
+    names = Names((ROBOT,)).of("robot1")
+    assert names.explain_in("/arm/x") == 'remap_in has "/arm/**" = "/{peer}/left/**"'
+    assert names.explain_in("/odom") == names.explain_out("/robot1/odom") == 'prefix = "/robot1"'
+    assert names.explain_out("/goals/robot1") == 'remap_out has "/goals/{peer}" = "/goal"'
+    assert names.explain_out("/map") == ""
+
+
+@given(NAMES)
+def test_a_prefix_leads_there_and_back(name: str) -> None:
+    names = PeerNames("r", (PeerRule("r", "/{peer}"),))
+    assert names.wire_name(names.local_name(name)) == name
+    assert names.local_name(name) == "/r" + name

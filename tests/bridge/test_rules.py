@@ -1,0 +1,460 @@
+"""Names and policy for single peers, and rules that change while routes are open."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rmpa.bridge.actions import (
+    Action,
+    AddRoute,
+    Connect,
+    Describe,
+    Detach,
+    Disconnect,
+    Publish,
+    RemoveRoute,
+    Retract,
+    Send,
+    Warn,
+)
+from rmpa.bridge.exports import Exports, LocalSource
+from rmpa.bridge.imports import Imports, RouteState
+from rmpa.bridge.messages import (
+    Advertise,
+    Close,
+    Closed,
+    Description,
+    Mismatch,
+    Offer,
+    Open,
+    Opened,
+    Source,
+    decode,
+    encode,
+)
+from rmpa.bridge.naming import Names
+from rmpa.bridge.policy import Policy
+from rmpa.core.config import PeerRule, PolicySettings, Remap
+from rmpa.core.contract import Contract, Contracts, Priority, Reliability, Rule
+
+TYPE = "a/B"
+ABOUT = Description(TYPE, "5a9ea5f83505693b71e785041e67a8bb", "", False)
+ROBOT = PeerRule("robot*", "/{peer}")
+EVERYTHING = PolicySettings()
+
+
+class Side:
+    """The rules of one module."""
+
+    def __init__(
+        self, *peers: PeerRule, policy: PolicySettings = EVERYTHING, contracts: tuple[Rule, ...] = ()
+    ) -> None:
+        self.policy = Policy(policy, peers)
+        self.contracts = Contracts(contracts)
+        self.names = Names(peers)
+
+    def exports(self) -> Exports:
+        return Exports(self.policy, self.contracts, self.names)
+
+    def imports(self) -> Imports:
+        return Imports(self.policy, lambda: 0.5, self.contracts, names=self.names)
+
+
+def offered(actions: list[Action]) -> list[tuple[str, ...]]:
+    """What peers were told: ``(+ or -, topic)``."""
+    found: list[tuple[str, ...]] = []
+    for action in actions:
+        if isinstance(action, Send) and isinstance(action.message, Advertise):
+            found += [("-", source.topic) for source in action.message.removed]
+            found += [("+", offer.topic) for offer in action.message.added]
+    return found
+
+
+def say(exports: Exports, *names: str, node: str = "/n") -> list[Action]:
+    """Let one node publish these topics, and no others; what peers are told of it."""
+    actions: list[Action] = []
+    for topic in (*exports.topics, *names):
+        actions += exports.graph(topic, {node: LocalSource(TYPE, "http://127.0.0.1:4000/")} if topic in names else {})
+    while exports.untold:
+        actions += exports.tell()
+    return actions
+
+
+def learn(imports: Imports, *names: str, peer: int = 1, node: str = "/n") -> list[Action]:
+    return imports.advertised(peer, Advertise(added=tuple(Offer(name, node, TYPE) for name in names)))
+
+
+def changed(imports: Imports, side: Side) -> list[Action]:
+    return [a for actions in imports.rules(side.policy, side.contracts, side.names, 0.0) for a in actions]
+
+
+# --- outbound ----------------------------------------------------------------------------------------------------------
+
+
+def test_what_we_publish_under_a_robots_prefix_is_offered_to_it_without() -> None:
+    exports = Side(ROBOT).exports()
+    say(exports, "/robot1/cmd_vel", "/robot2/cmd_vel", "/map")
+    assert offered(exports.link_up(1, "robot1")) == [("+", "/cmd_vel"), ("+", "/robot2/cmd_vel"), ("+", "/map")]
+    assert offered(exports.link_up(2, "base")) == [("+", "/robot1/cmd_vel"), ("+", "/robot2/cmd_vel"), ("+", "/map")]
+    cmd = Source("/robot1/cmd_vel", "/n")
+    assert exports.opened(1, Open(1, "/cmd_vel", "/n")) == [Connect(cmd, TYPE, "http://127.0.0.1:4000/")]
+    assert exports.local(1, Source("/cmd_vel", "/n")) == cmd
+    assert exports.local(1, cmd) is None
+    [closed] = exports.opened(1, Open(2, "/robot1/cmd_vel", "/n"))
+    assert isinstance(closed, Send)
+    assert isinstance(closed.message, Closed)
+
+
+def test_a_peer_gets_no_more_than_its_rules_allow() -> None:
+    rules = PeerRule("guest", policy=PolicySettings(allow=("/{peer}/**", "/pose"), deny_types=("x/*",)))
+    exports = Side(rules, policy=PolicySettings(deny=("/guest/private",))).exports()
+    say(exports, "/guest/a", "/guest/private", "/pose", "/secret")
+    assert offered(exports.link_up(1, "guest")) == [("+", "/guest/a"), ("+", "/pose")]
+    assert offered(exports.link_up(2, "friend")) == [("+", "/guest/a"), ("+", "/pose"), ("+", "/secret")]
+    [closed] = exports.opened(1, Open(1, "/secret", "/n"))
+    assert closed == Send(1, Closed(1, "/secret from /n: not published here, or policy keeps it home"))
+
+
+def test_no_name_over_there_is_one_that_never_crosses() -> None:
+    exports = Side(ROBOT).exports()
+    say(exports, "/robot1/rosout", "/robot1/clock", "/robot1/rmpa/x", "/robot1/ok")
+    assert offered(exports.link_up(1, "robot1")) == [("+", "/ok")]
+
+
+def test_of_two_topics_that_would_be_one_over_there_the_first_is_offered_until_it_goes() -> None:
+    exports = Side(ROBOT).exports()
+    exports.link_up(1, "robot1")
+    actions = say(exports, "/robot1/cmd", "/cmd")
+    assert offered(actions) == [("+", "/cmd")]
+    [warning] = [action for action in actions if isinstance(action, Warn)]
+    assert warning.text == "/cmd from /n would be /cmd at robot1, as /robot1/cmd is already: rename one"
+    assert offered(say(exports, "/cmd")) == [("-", "/cmd"), ("+", "/cmd")]
+    assert exports.local(1, Source("/cmd", "/n")) == Source("/cmd", "/n")
+
+
+def test_a_contract_is_that_of_the_name_here() -> None:
+    urgent = Rule(("/robot1/cmd",), (), {"priority": Priority.HIGH})
+    exports = Side(ROBOT, contracts=(urgent,)).exports()
+    exports.link_up(1, "robot1")
+    say(exports, "/robot1/cmd")
+    exports.opened(1, Open(1, "/cmd", "/n"))
+    [opened, route] = exports.described(Source("/robot1/cmd", "/n"), ABOUT)
+    assert opened == Send(1, Opened(1, ABOUT, Contract(priority=Priority.HIGH)))
+    assert isinstance(route, AddRoute)
+
+
+def test_new_rules_end_and_begin_what_they_are_about_and_nothing_else() -> None:
+    exports = Side().exports()
+    exports.link_up(1, "robot1")
+    exports.link_up(2, "base")
+    say(exports, "/a", "/b", "/c")
+    for peer in (1, 2):
+        for route, topic in enumerate(("/a", "/b", "/c"), 1):
+            exports.opened(peer, Open(route, topic, "/n"))
+    for topic in ("/a", "/b", "/c"):
+        exports.described(Source(topic, "/n"), ABOUT)
+    rule = PeerRule("robot*", "", (), (Remap("/b", "/bee"),), PolicySettings(deny=("/c",)))
+    new = Side(rule)
+    actions = exports.rules(new.policy, new.contracts, new.names) + say(exports, "/a", "/b", "/c")
+    assert [(a.peer, a.source.topic) for a in actions if isinstance(a, RemoveRoute)] == [(1, "/b"), (1, "/c")]
+    assert [a.peer for a in actions if isinstance(a, Send)] == [1, 1, 1]
+    assert sorted(offered(actions)) == [("+", "/bee"), ("-", "/b"), ("-", "/c")]
+    assert not any(isinstance(action, Disconnect) for action in actions)
+    assert exports.flowing(Source("/a", "/n")) == (1, 2)
+    back = Side()
+    actions = exports.rules(back.policy, back.contracts, back.names) + say(exports, "/a", "/b", "/c")
+    assert sorted(offered(actions)) == [("+", "/b"), ("+", "/c"), ("-", "/bee")]
+
+
+def test_the_policy_for_all_can_change_too() -> None:
+    exports = Side().exports()
+    exports.link_up(1, "base")
+    say(exports, "/a", "/b")
+    new = Side(policy=PolicySettings(deny=("/b",)))
+    assert exports.rules(new.policy, new.contracts, new.names) == []
+    assert offered(say(exports, "/a", "/b")) == [("-", "/b")]
+
+
+@pytest.mark.parametrize("asked", [Contract(), Contract(reliability=Reliability.RELIABLE)])
+def test_a_route_whose_contract_changes_here_is_closed_so_that_its_peer_asks_again(asked: Contract) -> None:
+    exports = Side().exports()
+    exports.link_up(1, "base")
+    say(exports, "/a", "/b")
+    for route, topic in enumerate(("/a", "/b"), 1):
+        exports.opened(1, Open(route, topic, "/n", asked))
+        exports.described(Source(topic, "/n"), ABOUT)
+    new = Side(contracts=(Rule(("/b",), (), {"depth": 7}),))
+    actions = exports.rules(new.policy, new.contracts, new.names)
+    assert actions == [
+        RemoveRoute(Source("/b", "/n"), 1, 2),
+        Disconnect(Source("/b", "/n")),
+        Send(1, Closed(2, "its contract has changed here")),
+    ]
+    exports.opened(1, Open(3, "/b", "/n", asked))
+    assert exports.contract(Source("/b", "/n"), 1) == replace(asked, depth=7)
+    assert exports.rules(new.policy, new.contracts, new.names) == []
+
+
+# --- inbound -----------------------------------------------------------------------------------------------------------
+
+
+def test_robots_that_are_all_alike_have_each_its_namespace_here() -> None:
+    imports = Side(ROBOT).imports()
+    for peer, name in ((1, "robot1"), (2, "robot2"), (3, "base")):
+        imports.link_up(peer, name)
+    odom = Source("/odom", "/n")
+    assert learn(imports, "/odom", peer=1) == [Publish(1, odom, TYPE, "/robot1/odom")]
+    assert learn(imports, "/odom", peer=2) == [Publish(2, odom, TYPE, "/robot2/odom")]
+    assert learn(imports, "/odom", peer=3) == [Publish(3, odom, TYPE)]
+    assert imports.demand(2, odom, 0.0, wanted=True) == [Send(2, Open(1, "/odom", "/n"))]
+    assert list(imports.offered_by(1)) == ["/robot1/odom"]
+
+
+def test_policy_types_and_contracts_go_by_the_name_here() -> None:
+    rule = replace(ROBOT, policy=PolicySettings(deny=("/{peer}/camera/**",)))
+    urgent = Rule(("/robot1/odom",), (), {"priority": Priority.HIGH})
+    side = Side(rule, policy=PolicySettings(deny=("/robot1/private",)), contracts=(urgent,))
+    imports = side.imports()
+    imports.link_up(1, "robot1")
+    learn(imports, "/odom", "/camera/image", "/private", "/clock")
+    hidden = {source.topic: entry.hidden for _, source, entry in imports}
+    assert hidden.pop("/clock").startswith("built in: time stays home")
+    assert hidden == {
+        "/odom": "",
+        "/camera/image": "peer \"robot*\".deny has '/robot1/camera/**'",
+        "/private": "bridge.deny has '/robot1/private'",
+    }
+    [opened] = imports.demand(1, Source("/odom", "/n"), 0.0, wanted=True)
+    assert opened == Send(1, Open(1, "/odom", "/n", Contract(priority=Priority.HIGH)))
+    actions = imports.local_type("/robot1/odom", "x/Y")
+    assert Retract(1, Source("/odom", "/n")) in actions
+    assert Mismatch("/odom", "/n", "", imports.get(1, Source("/odom", "/n")).hidden) in [  # type: ignore[union-attr]
+        action.message for action in actions if isinstance(action, Send)
+    ]
+
+
+def test_of_two_topics_that_would_be_one_here_the_first_is_shown_until_it_goes() -> None:
+    imports = Side(PeerRule("p", "/p", (Remap("/x", "/p/y"),))).imports()
+    imports.link_up(1, "p")
+    assert learn(imports, "/x", "/y") == [Publish(1, Source("/x", "/n"), TYPE, "/p/y")]
+    entry = imports.get(1, Source("/y", "/n"))
+    assert entry is not None
+    assert entry.hidden == "it would be /p/y here, as /x of this node is already; rename one"
+    assert learn(imports, "/y", node="/other") == [Publish(1, Source("/y", "/other"), TYPE, "/p/y")]
+    assert imports.advertised(1, Advertise(removed=(Source("/x", "/n"),))) == [
+        Retract(1, Source("/x", "/n")),
+        Publish(1, Source("/y", "/n"), TYPE, "/p/y"),
+    ]
+
+
+def test_new_names_and_policy_here_leave_all_else_alone() -> None:
+    imports = Side().imports()
+    imports.link_up(1, "p")
+    learn(imports, "/a", "/b", "/c")
+    for route, topic in enumerate(("/a", "/b", "/c"), 1):
+        imports.demand(1, Source(topic, "/n"), 0.0, wanted=True)
+        imports.opened(1, Opened(route, ABOUT), 0.0)
+    b, c = Source("/b", "/n"), Source("/c", "/n")
+    new = Side(PeerRule("p", "", (Remap("/b", "/bee"),)), policy=PolicySettings(deny=("/c",)))
+    assert changed(imports, new) == [
+        Send(1, Close(2)),
+        Detach(1, b, 2),
+        Retract(1, b),
+        Publish(1, b, TYPE, "/bee"),
+        Send(1, Close(3)),
+        Detach(1, c, 3),
+        Retract(1, c),
+    ]
+    assert changed(imports, new) == []
+    entry = imports.get(1, Source("/a", "/n"))
+    assert entry is not None
+    assert (entry.state, entry.route) == (RouteState.OPEN, 1)
+    assert changed(imports, Side()) == [Retract(1, b), Publish(1, b, TYPE), Publish(1, c, TYPE)]
+
+
+def test_a_route_whose_contract_changes_here_is_opened_anew() -> None:
+    imports = Side().imports()
+    imports.link_up(1, "p")
+    learn(imports, "/a", "/b")
+    for route, topic in enumerate(("/a", "/b"), 1):
+        imports.demand(1, Source(topic, "/n"), 0.0, wanted=True)
+        imports.opened(1, Opened(route, ABOUT), 0.0)
+    new = Side(contracts=(Rule(("/b",), (), {"depth": 7}),))
+    b = Source("/b", "/n")
+    assert changed(imports, new) == [
+        Send(1, Close(2)),
+        Detach(1, b, 2),
+        Send(1, Open(3, "/b", "/n", Contract(depth=7))),
+    ]
+    assert changed(imports, new) == []
+
+
+# --- both, in every order ----------------------------------------------------------------------------------------------
+
+TOPICS = ("/a", "/b", "/p/a")
+NODES = ("/n", "/m")
+SIDES = (
+    (),
+    (PeerRule("p", "/p"),),
+    (PeerRule("p", "", (Remap("/a", "/b"),), (Remap("/b", "/a"),)),),
+    (PeerRule("*", "/q", (Remap("/p/**", "/**"),), (), PolicySettings(deny=("/b",))),),
+)
+
+
+class World:
+    """An exporting and an importing bridge whose rules change, and the wires between them."""
+
+    def __init__(self) -> None:
+        self.rules: list[tuple[PeerRule, ...]] = [(), ()]
+        self.exports, self.imports = Side().exports(), Side().imports()
+        self.now = 0.0
+        self.to_importer: deque[bytes] = deque()
+        self.to_exporter: deque[bytes] = deque()
+        self.connected: set[Source] = set()
+        self.sending: set[tuple[Source, int]] = set()
+        self.receiving: dict[int, Source] = {}
+        self.here: dict[Source, tuple[str, str]] = {}
+        self.local: set[Source] = set()
+        self.wanted: set[tuple[str, str]] = set()
+        self.act(self.exports.link_up(1, "p"))
+        self.act(self.imports.link_up(1, "p"))
+
+    def act(self, actions: list[Action]) -> None:
+        for action in actions:
+            match action:
+                case Send(_, Advertise() | Opened() | Closed() as message):
+                    self.to_importer.append(encode(message))
+                case Send(_, message):
+                    self.to_exporter.append(encode(message))
+                case Connect(source):
+                    assert source not in self.connected
+                    self.connected.add(source)
+                case Disconnect(source):
+                    self.connected.discard(source)
+                case AddRoute(source, _, route):
+                    assert (source, route) not in self.sending
+                    self.sending.add((source, route))
+                case RemoveRoute(source, _, route):
+                    self.sending.remove((source, route))
+                case Publish(_, source, _, topic):
+                    place = (topic or source.topic, source.node)
+                    assert place not in self.here.values()
+                    self.here[source] = place
+                    if place in self.wanted:
+                        self.act(self.imports.demand(1, source, self.now, wanted=True))
+                case Retract(_, source):
+                    assert source not in self.receiving.values()
+                    del self.here[source]
+                case Describe(_, source, route):
+                    assert source in self.here
+                    self.receiving[route] = source
+                case Detach(_, _, route):
+                    self.receiving.pop(route, None)
+                case Warn():
+                    pass
+                case _:
+                    raise AssertionError(action)
+
+    def graph(self, topic: str) -> None:
+        at = {s.node: LocalSource(TYPE, "http://127.0.0.1:4000/") for s in self.local if s.topic == topic}
+        self.act(self.exports.graph(topic, at))
+
+    def change(self, side: int, rules: tuple[PeerRule, ...]) -> None:
+        self.rules[side] = rules
+        new = Side(*rules)
+        if side == 0:
+            self.act(self.exports.rules(new.policy, new.contracts, new.names))
+            for topic in TOPICS:
+                self.graph(topic)
+        else:
+            for actions in self.imports.rules(new.policy, new.contracts, new.names, self.now):
+                self.act(actions)
+
+    def deliver(self) -> bool:
+        if self.to_importer:
+            message = decode(self.to_importer.popleft())
+            if isinstance(message, Advertise):
+                self.act(self.imports.advertised(1, message))
+            elif isinstance(message, Opened):
+                self.act(self.imports.opened(1, message, self.now))
+            else:
+                assert isinstance(message, Closed)
+                self.act(self.imports.closed(1, message, self.now))
+        elif self.to_exporter:
+            message = decode(self.to_exporter.popleft())
+            if isinstance(message, Open):
+                self.act(self.exports.opened(1, message))
+            elif isinstance(message, Close):
+                self.act(self.exports.closed(1, message))
+        else:
+            return False
+        return True
+
+    def settle(self) -> None:
+        for _ in range(200):
+            while self.deliver() or self.exports.untold:
+                self.act(self.exports.tell())
+            for source in list(self.connected):
+                self.act(self.exports.described(source, ABOUT))
+            if not self.to_importer and not self.to_exporter:
+                timer = self.imports.next_timer()
+                if timer is None:
+                    return
+                self.now = timer
+                self.act(self.imports.handle_timer(self.now))
+        raise AssertionError("it never settles")
+
+    def step(self, what: str, number: int) -> None:
+        if what == "deliver":
+            for _ in range(number):
+                self.deliver()
+        elif what == "tell":
+            self.act(self.exports.tell())
+        elif what == "describe":
+            for source in list(self.connected):
+                self.act(self.exports.described(source, ABOUT))
+        elif what in {"far rules", "near rules"}:
+            self.change(what == "near rules", SIDES[number % len(SIDES)])
+        elif what == "publish":
+            topic = TOPICS[number % len(TOPICS)]
+            self.local ^= {Source(topic, NODES[number % 2])}
+            self.graph(topic)
+        else:
+            place = (("/a", "/b", "/p/a", "/p/b", "/q/a")[number % 5], NODES[number % 2])
+            self.wanted ^= {place}
+            for source in [source for source, at in self.here.items() if at == place]:
+                self.act(self.imports.demand(1, source, self.now, wanted=place in self.wanted))
+
+    def expected(self) -> set[tuple[str, str]]:
+        """Where what is published stands at the importer."""
+        far, near = (Side(*rules) for rules in self.rules)
+        found = set()
+        for source in self.local:
+            wire = far.names.wire_name("p", source.topic, TYPE)
+            if far.policy.judge_for("p", source.topic, TYPE, wire).allowed:
+                topic = near.names.local_name("p", wire, TYPE)
+                if near.policy.judge_for("p", topic, TYPE, wire).allowed:
+                    found.add((topic, source.node))
+        return found
+
+
+_WHAT = ("publish", "publish", "want", "far rules", "near rules", "tell", "describe", "deliver", "deliver")
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from(_WHAT), st.integers(0, 11)), max_size=50))
+def test_after_it_settles_exactly_what_the_last_rules_say_is_there_and_flows(steps: list[tuple[str, int]]) -> None:
+    world = World()
+    for what, number in steps:
+        world.step(what, number)
+    world.settle()
+    assert set(world.here.values()) == world.expected()
+    flowing = {source for source, place in world.here.items() if place in world.wanted}
+    assert set(world.receiving.values()) == flowing
+    assert {route for _, route in world.sending} == set(world.receiving)
+    assert {world.exports.local(1, wire) for wire in flowing} == {source for source, _ in world.sending}
