@@ -108,6 +108,7 @@ SNAPSHOT = Snapshot(
                         error=0.000216,
                     ),
                     latched=True,
+                    wire="/stick/cmd",
                     lane="express",
                     contract={"reliability": "reliable", "deadline": 0.2},
                     events={"deadline_missed": 3, "messages_lost": 3},

@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from rmpa.bridge.imports import RouteState
+from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Policy, is_own
 from rmpa.core.aio.clock import SystemClock
 from rmpa.core.aio.loop import breathe, breathing_sorted
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.aio.bridge import Attached, Bridge
     from rmpa.bridge.exports import LocalSource
     from rmpa.bridge.imports import Import
-    from rmpa.bridge.messages import Source
     from rmpa.bridge.peer_clock import PeerClock
     from rmpa.bridge.quality import QualitySummary
     from rmpa.core.config import Settings
@@ -106,13 +106,13 @@ class TopicsView:
         self._clocks.follow(self._clock.now())
         clocks = {peer: self._clocks[peer] for peer in attached}
         for peer, source, entry in list(self._bridge.imports):
-            if wanted is not None and source.topic not in wanted:
+            if wanted is not None and entry.topic not in wanted:
                 continue
             breathe()
             at = attached[peer]
             texts = [f"{at.link.name}: {entry.hidden}"] if entry.conflict else []
             texts += self._bridge.mismatches(source)
-            yield source, self._import(at, source, entry, clocks[peer]), texts
+            yield Source(entry.topic, source.node), self._import(at, source, entry, clocks[peer]), texts
 
     def _import(self, at: Attached, source: Source, entry: Import, clock: PeerClock) -> RouteInfo:
         flow = at.inbound.flow(source, entry.route)
@@ -124,6 +124,7 @@ class TopicsView:
             peer=at.link.name,
             node=source.node,
             direction="in",
+            wire=source.topic if source.topic != entry.topic else "",
             state="hidden" if not entry.shown else entry.state.name.lower(),
             type=entry.type,
             md5=entry.description.md5 if entry.description else "",

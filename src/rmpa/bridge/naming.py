@@ -67,6 +67,20 @@ class PeerNames:
         """The rule that ``wire_name`` goes by."""
         return self._outgoing(local, type_name)[1]
 
+    def wires_of(self, local: str) -> tuple[str, ...]:
+        """The names of theirs that are this name here, best first, whatever rules with ``types`` make of them."""
+        names = [old for _, source, target in self._in if (old := _undone(local, source, target)) is not None]
+        names.append(local if not self.prefix else local.removeprefix(self.prefix))
+        typed = any(remap.types for remap, _, _ in self._in)
+        return tuple(n for n in dict.fromkeys(names) if n and (typed or self.local_name(n) == local))
+
+    def locals_of(self, wire: str) -> tuple[str, ...]:
+        """The names of ours that are this name over there, best first, likewise."""
+        names = [old for _, source, target in self._out if (old := _undone(wire, source, target)) is not None]
+        names += [self.prefix + wire, wire]
+        typed = any(remap.types for remap, _, _ in self._out)
+        return tuple(n for n in dict.fromkeys(names) if typed or self.wire_name(n) == wire)
+
     def _incoming(self, name: str, type_name: str) -> tuple[str, str]:
         if name == CLOCK:
             return name, ""  # nodes look for time nowhere else
@@ -113,6 +127,16 @@ class Names:
     def wire_name(self, peer: str, local: str, type_name: str = "") -> str:
         """What a name of ours is at a peer (``PeerNames.wire_name``)."""
         return self.of(peer).wire_name(local, type_name)
+
+
+def _undone(name: str, source: str, target: str) -> str | None:
+    """The name that a rule makes ``name`` of, or ``None`` where it makes no such name."""
+    if not target.endswith("/**"):
+        return source if name == target and not source.endswith("/**") else None
+    stem = target[:-3]
+    if name != stem and not name.startswith(stem + "/"):
+        return None
+    return source[:-3] + name[len(stem) :] or None
 
 
 def _ends(remap: Remap, peer: str) -> tuple[str, str]:

@@ -208,6 +208,7 @@ class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
         events: What happened to the contract, counted by kind.
         recent: The last of these, oldest first.
         problem: Why it does not flow, ready to read; empty if nothing is wrong.
+        wire: The topic's name over there, where that is another one than here.
     """
 
     peer: str
@@ -234,6 +235,7 @@ class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
     events: dict[str, int] = {}
     recent: tuple[EventInfo, ...] = ()
     problem: str = ""
+    wire: str = ""
 
 
 class TopicInfo(msgspec.Struct, kw_only=True, frozen=True):
