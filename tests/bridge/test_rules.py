@@ -93,7 +93,7 @@ def changed(imports: Imports, side: Side) -> list[Action]:
     return [a for actions in imports.rules(side.policy, side.contracts, side.names, 0.0) for a in actions]
 
 
-# --- outbound ----------------------------------------------------------------------------------------------------------
+# --- outbound -------------------------------------------------------------------------------------------------------
 
 
 def test_what_we_publish_under_a_robots_prefix_is_offered_to_it_without() -> None:
@@ -200,7 +200,7 @@ def test_a_route_whose_contract_changes_here_is_closed_so_that_its_peer_asks_aga
     assert exports.rules(new.policy, new.contracts, new.names) == []
 
 
-# --- inbound -----------------------------------------------------------------------------------------------------------
+# --- inbound --------------------------------------------------------------------------------------------------------
 
 
 def test_robots_that_are_all_alike_have_each_its_namespace_here() -> None:
@@ -294,7 +294,7 @@ def test_a_route_whose_contract_changes_here_is_opened_anew() -> None:
     assert changed(imports, new) == []
 
 
-# --- both, in every order ----------------------------------------------------------------------------------------------
+# --- both, in every order -------------------------------------------------------------------------------------------
 
 TOPICS = ("/a", "/b", "/p/a")
 NODES = ("/n", "/m")
@@ -331,6 +331,8 @@ class World:
                     self.to_importer.append(encode(message))
                 case Send(_, message):
                     self.to_exporter.append(encode(message))
+                case Publish() | Retract() | Describe() | Detach():
+                    self.act_here(action)
                 case Connect(source):
                     assert source not in self.connected
                     self.connected.add(source)
@@ -341,24 +343,25 @@ class World:
                     self.sending.add((source, route))
                 case RemoveRoute(source, _, route):
                     self.sending.remove((source, route))
-                case Publish(_, source, _, topic):
-                    place = (topic or source.topic, source.node)
-                    assert place not in self.here.values()
-                    self.here[source] = place
-                    if place in self.wanted:
-                        self.act(self.imports.demand(1, source, self.now, wanted=True))
-                case Retract(_, source):
-                    assert source not in self.receiving.values()
-                    del self.here[source]
-                case Describe(_, source, route):
-                    assert source in self.here
-                    self.receiving[route] = source
-                case Detach(_, _, route):
-                    self.receiving.pop(route, None)
-                case Warn():
-                    pass
                 case _:
-                    raise AssertionError(action)
+                    assert isinstance(action, Warn)
+
+    def act_here(self, action: Publish | Retract | Describe | Detach) -> None:
+        match action:
+            case Publish(_, source, _, topic):
+                place = (topic or source.topic, source.node)
+                assert place not in self.here.values()
+                self.here[source] = place
+                if place in self.wanted:
+                    self.act(self.imports.demand(1, source, self.now, wanted=True))
+            case Retract(_, source):
+                assert source not in self.receiving.values()
+                del self.here[source]
+            case Describe(_, source, route):
+                assert source in self.here
+                self.receiving[route] = source
+            case Detach(_, _, route):
+                self.receiving.pop(route, None)
 
     def graph(self, topic: str) -> None:
         at = {s.node: LocalSource(TYPE, "http://127.0.0.1:4000/") for s in self.local if s.topic == topic}
