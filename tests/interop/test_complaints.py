@@ -1,0 +1,148 @@
+"""What users of other bridges complain about does not happen here: cases that no other test has.
+
+docs/design/complaints.md has the rows, by the numbers of the marks, and the tests of each, here and elsewhere.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import time
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from tests.interop.modules import Module, flows
+from tests.interop.processes import eventually
+from tests.interop.ros import PYTHON
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
+    from tests.interop.namespaces import Host, Lab
+
+pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
+
+ROBOTS: Final = 7
+REST: Final = 4.0
+"""Seconds over which the processor time of agents at rest is counted."""
+
+
+@contextmanager
+def names_known_at_home_only(hosts: Sequence[Host]) -> Iterator[None]:
+    """Let each host, and only itself, know its own name (``ip netns exec`` lays such files over /etc)."""
+    folders = [Path("/etc/netns") / host.namespace for host in hosts]
+    made = not folders[0].parent.exists()
+    try:
+        for host, folder in zip(hosts, folders, strict=True):
+            folder.mkdir(parents=True)
+            (folder / "hosts").write_text(f"127.0.0.1 localhost\n{host.address} {host.name}-robot\n")
+        yield
+    finally:
+        for folder in folders:
+            shutil.rmtree(folder, ignore_errors=True)
+        if made:
+            folders[0].parent.rmdir()
+
+
+READ_BAG = """
+import sys, rosbag
+from std_msgs.msg import UInt8MultiArray
+with rosbag.Bag(sys.argv[1]) as bag:
+    (connection,) = bag._get_connections()
+    print("definition", connection.msg_def == UInt8MultiArray._full_text, connection.datatype, connection.md5sum)
+    print("sequences", [int.from_bytes(message.data[4:8], "little") for _, message, _ in bag.read_messages()])
+"""
+
+
+@pytest.mark.complaint(1, 19, 20)
+def test_names_that_only_their_own_machine_knows_and_a_bag_from_the_first_message_on(
+    lab: Lab, agent: AgentFactory, shell: ShellFactory
+) -> None:
+    hosts = lab.hosts("a", "b")
+    with names_known_at_home_only(hosts):
+        a, b = (Module(host, agent(host, name=host.name), shell(host)) for host in hosts)
+        for module in (a, b):  # as Debian's users have it: no ROS_IP, but the machine's own name
+            del module.ros.env["ROS_IP"]
+            module.ros.env["ROS_HOSTNAME"] = f"{module.host.name}-robot"
+        a.agent.wait_peer("b")
+        with pytest.raises(AssertionError):
+            b.ros.tool("getent", "hosts", "a-robot")
+        bag = b.ros.home / "it.bag"
+        record = b.ros.start("rosbag", "record", "-O", bag, "-l", "30", "/chatter", name="record")
+        b.wait_topic("/chatter")  # the recorder listens
+        a.ros.rospy("talker", topic="/chatter", rate=100, wait=1)
+        assert record.wait(30.0) == 0, record.output
+        said = b.ros.tool(PYTHON, "-c", READ_BAG, str(bag))
+    assert "definition True std_msgs/UInt8MultiArray 82373f1612381bb6ee473b5cd6f5d89c" in said
+    assert f"sequences {list(range(1, 31))}" in said
+
+
+@pytest.mark.complaint(7)
+def test_a_bad_link_moves_no_peer_and_after_a_lost_one_it_is_back_by_itself(modules: ModuleFactory) -> None:
+    a, b = modules("a", "b")
+    a.ros.roscpp("talker", topic="/chatter", rate=100)
+    heard = b.ros.rospy("listener", topic="/chatter")
+    flows(heard)
+    for _ in range(5):
+        b.host.shape("8bit", burst="100", latency="1ms")  # nothing that b sends arrives
+        time.sleep(0.4)
+        b.host.unshape()
+        flows(heard, 30)
+    assert b.agent.peers()["a"]["state"] == "linked"
+    assert "= - publisher /chatter" not in b.agent.process.output, "it came and went"
+    for _ in range(2):
+        b.host.outage(3.0)
+        flows(heard, 30)  # by the same listener: nobody started anything again
+    assert "= - publisher /chatter" in b.agent.process.output
+    assert list(b.agent.peers()) == ["a"]
+
+
+@pytest.mark.complaint(10, 13, 14)
+def test_seven_robots_of_the_same_nodes_all_hear_each_other_and_cost_nothing_at_rest(modules: ModuleFactory) -> None:
+    robots = modules(*(f"r{number}" for number in range(1, ROBOTS + 1)), linked=False, log_level="info")
+    for robot in robots:
+        eventually(
+            lambda robot=robot: sum(row["state"] == "linked" for row in robot.agent.peers().values()) == ROBOTS - 1,
+            what=f"{robot.name} linked with all",
+        )
+    # At rest: with nothing to do, an agent does nothing.
+    before = [_cpu(robot) for robot in robots]
+    time.sleep(REST)
+    used = [(_cpu(robot) - earlier) / REST for robot, earlier in zip(robots, before, strict=True)]
+    assert max(used) < 0.05, used
+
+    # Every robot has the same two nodes, and all speak on one topic.
+    ears = [robot.ros.roscpp("listener", "__name:=ears", topic="/tf") for robot in robots]
+    mouths = [
+        robot.ros.roscpp("talker", "__name:=mouth", topic="/tf", rate=20, source=number)
+        for number, robot in enumerate(robots, start=1)
+    ]
+    everybody = {str(number) for number in range(1, ROBOTS + 1)}
+    for ear in ears:
+        report = ear.wait_event("report", where=lambda event: _least(event["sources"], everybody) >= 20)
+        assert (report["bad"], report["gaps"], report["doubled"]) == (0, 0, 0)
+    assert all(node.returncode is None for node in (*ears, *mouths)), "nodes of one name pushed each other out"
+    nodes = robots[0].ros.tool("rosnode", "list").split()
+    assert {"/mouth", *(f"/rmpa/{robot.name}/mouth" for robot in robots[1:])} <= set(nodes)
+    # One copy for each peer: a second listener on a robot changes nothing for the speaker.
+    more = robots[1].ros.roscpp("listener", "__name:=more", topic="/tf")
+    more.wait_event("report", where=lambda event: _least(event["sources"], everybody) >= 20)
+    speaker = robots[0].ros.tool("rosnode", "info", "/mouth")
+    assert len(re.findall(r"topic: /tf\n\s+\* to: ", speaker)) == 2, "its own robot's listener, and its agent"
+
+
+def _cpu(robot: Module) -> float:
+    """Seconds of processor time that a robot's agent has used."""
+    fields = Path(f"/proc/{robot.agent.pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _least(sources: object, wanted: set[str]) -> int:
+    """The fewest messages that came of any of these."""
+    assert isinstance(sources, dict)
+    return min((int(sources[one]["count"]) if one in sources else 0) for one in wanted)
