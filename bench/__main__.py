@@ -11,7 +11,21 @@ from typing import TYPE_CHECKING, Final
 
 from rich.console import Console
 
-from bench import bed, crosstraffic, idle, load, path, peers, period, profile, scale, startup, storm, throughput
+from bench import (
+    bed,
+    crosstraffic,
+    idle,
+    joining,
+    load,
+    path,
+    peers,
+    period,
+    profile,
+    scale,
+    startup,
+    storm,
+    throughput,
+)
 from tests.interop import namespaces
 
 if TYPE_CHECKING:
@@ -58,6 +72,9 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     "profile": Measurement("what a relayed message costs an agent, and where that goes", profile.measure),
     "throughput": Measurement("how much goes through", throughput.measure),
     "startup": Measurement("how soon the first message arrives", startup.measure),
+    "joining": Measurement(
+        "how soon modules and their graphs are joined, and what a mesh costs while nothing happens", joining.measure
+    ),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),
 }
 

@@ -1,8 +1,9 @@
 """A large graph at little cost: registers publishers that never send, as many as it is told to.
 
-Reads lines with a number: registers publishers until there are so many, ``--per-node`` on each node. All nodes share
-one slave API and one TCPROS server, which answers a subscriber's header and keeps quiet. Needs nothing but Python.
-Options: --per-node. Events: up; registered with the count.
+Reads lines with a number: registers publishers until there are so many, ``--per-node`` on each node, and for each
+node ``--services`` services. All nodes share one slave API and one TCPROS server, which answers a subscriber's header
+and keeps quiet. Needs nothing but Python.
+Options: --per-node, --services. Events: up; registered with the count.
 """
 
 from __future__ import annotations
@@ -76,7 +77,9 @@ def say(event: str, **fields: object) -> None:
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("--per-node", type=int, default=20)
-    per_node = options.parse_args().per_node
+    options.add_argument("--services", type=int, default=0)
+    given = options.parse_args()
+    per_node = given.per_node
     publications = Publications((_HOST, 0), Silent)
     slave = SlaveApi(publications.server_address[1])
     serve(publications)
@@ -91,6 +94,10 @@ def main() -> None:
             answer = master.registerPublisher(node, topic, TYPE, api)
             if not isinstance(answer, list) or answer[0] != 1:
                 sys.exit(f"the master refused {topic}: {answer!r}")
+            if not registered % per_node:
+                for number in range(given.services):
+                    service, port = f"{node}/service{number}", publications.server_address[1]
+                    master.registerService(node, service, f"rosrpc://{_HOST}:{port}", api)
             registered += 1
         say("registered", count=registered)
 

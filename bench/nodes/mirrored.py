@@ -1,0 +1,43 @@
+"""Says when a graph holds what was expected: asks its master again and again. Needs nothing but Python.
+
+Options: --topics and --services: how many below /crowd, --every: seconds between two looks. Events: up; topics,
+services: each with ``at``, the monotonic time in seconds when all of them were seen, and their count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+import xmlrpc.client
+
+
+def say(event: str, **fields: object) -> None:
+    print("@ " + json.dumps({"event": event, **fields}), flush=True)
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("--topics", type=int, required=True)
+    options.add_argument("--services", type=int, default=0)
+    options.add_argument("--every", type=float, default=0.02)
+    wanted = options.parse_args()
+    left = {"topics": (0, wanted.topics), "services": (2, wanted.services)}
+    say("up")
+    while left:
+        time.sleep(wanted.every)
+        try:
+            _, _, state = xmlrpc.client.ServerProxy(os.environ["ROS_MASTER_URI"]).getSystemState("/mirrored")
+        except OSError:
+            continue  # not there yet
+        now = time.monotonic()
+        for kind, (place, count) in list(left.items()):
+            found = sum(entry[0].startswith("/crowd") for entry in state[place])
+            if found >= count:
+                say(kind, at=now, count=found)
+                del left[kind]
+
+
+if __name__ == "__main__":
+    main()
