@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -14,6 +14,7 @@ from rmpa.ros.aio.node import Node
 from rmpa.ros.definitions import DefinitionError
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.messages import MessageType
+from rmpa.ros.service_types import ServiceType
 from tests.ros.aio.peers import DEADLINE, STRING, until
 
 if TYPE_CHECKING:
@@ -27,6 +28,9 @@ def _warm() -> None:
     """Import numpy and rosbags outside of any loop: that takes a while, and a test's time is not for it."""
     kind = MessageType("std_msgs/String")
     kind.deserialize(kind.serialize(kind.make()))
+    for service in ("rospy_tutorials/AddTwoInts", "roscpp/GetLoggers", "roscpp/SetLoggerLevel", "std_srvs/SetBool"):
+        for half in (ServiceType(service).request, ServiceType(service).response):
+            half.deserialize(half.serialize(half.make()))
 
 
 @pytest.fixture
@@ -263,3 +267,87 @@ async def test_closing_twice_is_closing_once(core: RosCore) -> None:
     await one.close()
     assert one.stopped.is_set()
     assert limits.NODE_MASTER_CHECK < 1
+
+
+async def test_a_service_is_served_and_called(core: RosCore) -> None:
+    async def slowly(request: Any) -> dict[str, int]:
+        await asyncio.sleep(0)
+        return {"sum": request.a + request.b}
+
+    async with node(core, "server") as server, node(core, "client") as client:
+        service = await server.advertise_service("~add", "rospy_tutorials/AddTwoInts", slowly)
+        assert service.name == "/server/add"
+        assert core.call("lookupService", "/x", "/server/add").value == server.slave.service_uri
+        assert await client.lookup_service("/server/add") == server.slave.service_uri
+        response = await client.call_service("/server/add", "rospy_tutorials/AddTwoInts", [20, 22])
+        assert response.sum == 42
+        calls = await client.connect_service("/server/add", service.kind)
+        assert [(await calls.call({"a": n})).sum for n in range(5)] == list(range(5))
+        with pytest.raises(ValueError, match="/server serves /server/add already"):
+            await server.advertise_service("~add", "std_srvs/Empty", slowly)
+        with pytest.raises(PeerRefused, match="to have md5sum"):
+            await client.call_service("/server/add", "std_srvs/Trigger")
+        await service.close()
+        await until(lambda: calls.closed)
+        with pytest.raises(UnreachableError, match="no server of service /server/add answers at the ROS master"):
+            await client.call_service("/server/add", "rospy_tutorials/AddTwoInts")
+    assert not [name for name, _ in services(core) if name == "/server/add"]
+
+
+def services(core: RosCore) -> list[tuple[str, object]]:
+    """All services and their nodes."""
+    value = core.call("getSystemState", "/x").value
+    assert isinstance(value, list)
+    assert isinstance(value[2], list)
+    return [(str(pair[0]), pair[1]) for pair in value[2] if isinstance(pair, list)]
+
+
+async def test_what_a_handler_raises_is_the_clients_error(core: RosCore, caplog: pytest.LogCaptureFixture) -> None:
+    def fails(request: Any) -> object:
+        if request.data:
+            raise PeerRefused("the gripper", "it is jammed")
+        return {"succes": True}
+
+    async with node(core, "server") as server:
+        await server.advertise_service("/grip", "std_srvs/SetBool", fails)
+        with pytest.raises(PeerRefused, match="service /grip refused: the gripper refused: it is jammed"):
+            await server.call_service("/grip", "std_srvs/SetBool", True)
+        with pytest.raises(PeerRefused, match="std_srvs/SetBoolResponse has no field 'succes'"):
+            await server.call_service("/grip", "std_srvs/SetBool", False)
+        assert not caplog.records
+        client = await server.connect_service("/grip", "std_srvs/SetBool")
+        ok, text = await client.connection.call(b"too long")
+        assert not ok
+        assert b"8 bytes are not a std_srvs/SetBoolRequest" in bytes(text)
+        client.close()
+
+
+async def test_the_core_and_its_loggers(core: RosCore) -> None:
+    found = dict(services(core))
+    assert found == {"/rosout/get_loggers": ["/rosout"], "/rosout/set_logger_level": ["/rosout"]}
+    async with node(core, "rqt") as client:
+        response = await client.call_service("/rosout/get_loggers", "roscpp/GetLoggers")
+        assert [logger.name for logger in response.loggers] == ["ros", "ros.rosout"]
+        try:
+            await client.call_service("/rosout/set_logger_level", "roscpp/SetLoggerLevel", ["ros", "DEBUG"])
+            assert logging.getLogger("rmpa.ros").level == logging.DEBUG
+            response = await client.call_service("/rosout/get_loggers", "roscpp/GetLoggers")
+            assert [logger.level for logger in response.loggers] == ["debug", "debug"]
+        finally:
+            logging.getLogger("rmpa.ros").setLevel(logging.NOTSET)
+        with pytest.raises(PeerRefused, match=r"/rosout has no logger 'nobody'; it has ros, ros\.rosout"):
+            await client.call_service("/rosout/set_logger_level", "roscpp/SetLoggerLevel", ["nobody", "info"])
+        with pytest.raises(PeerRefused, match="'loud' is not a level; there are debug, info, warn, error, fatal"):
+            await client.call_service("/rosout/set_logger_level", "roscpp/SetLoggerLevel", ["ros", "loud"])
+        raw = await client.connect_service("/rosout/set_logger_level", "roscpp/SetLoggerLevel")
+        for junk in (b"", b"\x01", b"\x03\x00\x00\x00ros", b"\xff\xff\xff\xff", bytes(9)):
+            ok, text = await raw.connection.call(junk)
+            assert (ok, b"are not a roscpp/SetLoggerLevelRequest" in bytes(text)) == (False, True)
+        raw.close()
+
+
+async def test_a_core_that_was_started_anew_has_the_services_again(core: RosCore) -> None:
+    async with node(core, "server") as server:
+        await server.advertise_service("/empty", "std_srvs/Empty", lambda _request: None)
+        core.call("unregisterService", "/server", "/empty", server.slave.service_uri)
+        await until(lambda: ("/empty", ["/server"]) in services(core))
