@@ -22,6 +22,7 @@ pytestmark = [
 ]
 
 CLIENTS = ["rospy", "roscpp"]
+ROBOTS = [("rospy", "r1"), ("roscpp", "r2")]
 SURE = """
 [[contract]]
 types = ["*/*ActionGoal", "*/*ActionResult", "actionlib_msgs/GoalID"]
@@ -122,6 +123,17 @@ def test_clients_of_several_modules_share_one_server_and_each_hears_its_own(modu
     # The stock tools say who listens to a client's goals, and whose node it stands for.
     assert "/rmpa/a/client" in b.ros.tool("rostopic", "info", "/count/goal")
     assert "/rmpa/c/client" in b.ros.tool("rostopic", "info", "/count/goal")
+
+
+def test_one_computer_gives_goals_to_two_robots_that_are_alike(modules: ModuleFactory) -> None:
+    pc, *robots = modules("pc", "r1", "r2", config='[[peer]]\nname = "r*"\nprefix = "/{peer}"\n')
+    servers = [robot.ros.roscpp("action_server", name="server") for robot in robots]
+    clients = [pc.ros.node(k, "action_client", name=n, action=f"/{n}/count", commands=True) for k, n in ROBOTS]
+    for goal, (client, server) in enumerate(zip(clients, servers, strict=True), start=4):
+        finds(client)
+        client.tell(f"send {goal}")
+        assert ends(client, since=0) == ("SUCCEEDED", goal)
+        assert [event["goal"] for event in server.events("goal")] == [goal]
 
 
 @pytest.mark.parametrize("client_kind", CLIENTS)
