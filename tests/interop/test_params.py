@@ -1,0 +1,215 @@
+"""Parameters and time across modules, with real ROS: rosparam beside rmpa param, followed keys, a clock."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.interop.agents import RMPA
+from tests.interop.modules import Module
+from tests.interop.processes import Process, eventually
+from tests.interop.ros import free_port
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
+    from tests.interop.namespaces import Lab
+    from tests.interop.ros import Ros
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(150)]
+
+Configured = Callable[..., list[Module]]
+URDF = (
+    "<?xml version='1.0'?>\n<robot name=\"one\">\n  <link name='base'/>  <!-- it's \"here\" & <there> -->\n</robot>\n"
+)
+PARAMETERS = """
+speed: 1.5
+count: -3
+tiny: 1.0e-07
+enabled: true
+names: [a, 'on', "1.5", [], {}]
+gains: {p: 1, i: 0.5, nested: {deep: 'x: y'}}
+words: "it's a text: with # and 'quotes'"
+lines: "one\\n two\\n\\nthree\\n"
+unicode: "\\u00e9\\u2603"
+angle: deg(90)
+half: rad(pi/2)
+octal: 010
+exponent: 1e3
+"""
+
+
+def rmpa(ros: Ros, *words: str) -> str:
+    """An ``rmpa param`` beside a user's shell; must succeed."""
+    with Process([RMPA, "param", *words, "--master", ros.uri], env=ros.env) as process:
+        assert process.wait() == 0, process.output
+        return process.output
+
+
+def test_what_rosparam_writes_and_reads(shell: ShellFactory, tmp_path: Path) -> None:
+    files = {name: tmp_path / f"{name}.yaml" for name in ("in", "theirs", "ours")}
+    files["in"].write_text(PARAMETERS)
+    with shell(port=free_port()) as ros:
+        ros.master()
+        ros.tool("rosparam", "load", str(files["in"]), "/theirs")
+        assert rmpa(ros, "load", str(files["in"]), "/ours") == ""
+        rmpa(ros, "set", "/ours/more", "{a: -5, b: {c: ''}}")
+        ros.tool("rosparam", "set", "/theirs/more", "{a: -5, b: {c: ''}}")
+        ros.tool("rosparam", "dump", str(files["theirs"]), "/theirs")
+        rmpa(ros, "dump", str(files["ours"]), "/theirs")
+        assert files["ours"].read_text() == files["theirs"].read_text()
+        # What we loaded is, type by type, what they did.
+        ros.tool("rosparam", "dump", str(files["ours"]), "/ours")
+        assert files["ours"].read_text() == files["theirs"].read_text()
+        for key in ("/theirs/speed", "/theirs/names", "/theirs/gains", "/theirs/lines", "/theirs/tiny"):
+            assert rmpa(ros, "get", key) == ros.tool("rosparam", "get", key).rstrip("\n"), key
+        # A long text is folded elsewhere, and comes back as it was.
+        (tmp_path / "urdf").write_text(URDF)
+        rmpa(ros, "set", "/urdf/text", "-t", str(tmp_path / "urdf"))
+        assert rmpa(ros, "get", "-p", "/urdf/text").split("\n") == URDF.split("\n")
+        rmpa(ros, "dump", str(files["ours"]), "/urdf")
+        ros.tool("rosparam", "load", str(files["ours"]), "/again")
+        assert rmpa(ros, "get", "/again") == rmpa(ros, "get", "/urdf")
+        assert rmpa(ros, "list").split() == ros.tool("rosparam", "list").split()
+        rmpa(ros, "delete", "/ours/gains")
+        assert "/ours/gains/p" not in ros.tool("rosparam", "list").split()
+
+
+def param(module: Module, *words: str, code: int = 0) -> str:
+    """``rmpa param`` on a module."""
+    status, output = module.agent.rmpa("param", *words)
+    assert status == code, output
+    return output
+
+
+def has(module: Module, key: str, value: str | None) -> None:
+    """Wait until the stock rosparam says so; ``None``: there is no such parameter."""
+
+    def there() -> bool:
+        if value is None:
+            return key not in module.ros.tool("rosparam", "list").split()
+        return (
+            key in module.ros.tool("rosparam", "list").split()
+            and module.ros.tool("rosparam", "get", key).strip() == value
+        )
+
+    eventually(there, what=f"{key} {value} at {module.name}")
+
+
+@pytest.mark.netns
+def test_a_peers_parameters_are_read_and_set(modules: ModuleFactory, tmp_path: Path) -> None:
+    a, b = modules("a", "b", config='[params]\nremote_set = ["/open/**", "/run_id", "/big"]\nremote_get = ["/**"]\n')
+    (tmp_path / "all.yaml").write_text(PARAMETERS)
+    a.ros.tool("rosparam", "load", str(tmp_path / "all.yaml"), "/open")
+    theirs = a.ros.tool("rosparam", "get", "/open")
+    assert param(b, "get", "--peer", "a", "/open").strip() == theirs.strip(), "every type survives"
+    assert "/open/gains/nested/deep" in param(b, "list", "--peer", "a", "/open").split()
+    param(b, "load", "--peer", "a", str(tmp_path / "all.yaml"), "/open/again")
+    assert a.ros.tool("rosparam", "get", "/open/again").strip() == theirs.strip()
+    # Binary data, which rosparam itself cannot print with Python 3.
+    (tmp_path / "blob").write_bytes(bytes(range(256)))
+    param(b, "set", "--peer", "a", "/open/blob", "-b", str(tmp_path / "blob"))
+    assert param(b, "get", "--peer", "a", "/open/blob") == param(a, "get", "/open/blob")
+    assert "!!binary" in param(a, "get", "/open/blob")
+    (tmp_path / "big").write_text("<x a='1'/>\n" * 300_000)
+    param(b, "set", "--peer", "a", "/big", "-t", str(tmp_path / "big"))
+    assert json.loads(param(b, "get", "--peer", "a", "/big", "--json")) == (tmp_path / "big").read_text()
+    param(b, "delete", "--peer", "a", "/big")
+    has(a, "/big", None)
+    for words, error in (
+        (("get", "--peer", "a", "/nothing"), "there is no parameter /nothing"),
+        (("set", "--peer", "a", "/run_id", "1"), "/run_id is never set from another module"),
+        (("set", "--peer", "a", "/roslaunch", "1"), "never set from another module"),
+        (("set", "--peer", "a", "/use_sim_time", "true"), "time is followed by [time] alone"),
+        (("set", "--peer", "a", "/closed", "1"), "no glob of params.remote_set fits"),
+        (("set", "--peer", "a", "/", "{open: {x: 1}, closed: 1}"), "no glob of params.remote_set fits"),
+        (("set", "--peer", "a", "/open/x", "[1,"), "not YAML"),
+        (("set", "--peer", "a", "/open/x", "{a: null}"), "/a: null is no value of a parameter"),
+        (("get", "--peer", "nobody", "/x"), "nobody"),
+    ):
+        assert error in param(b, *words, code=1), words
+    assert "/open/x" not in a.ros.tool("rosparam", "list").split(), "what cannot be set as a whole is not set in part"
+
+
+@pytest.fixture
+def configured(lab: Lab, shell: ShellFactory, agent: AgentFactory) -> Configured:
+    """Linked modules on one network, by name each with a configuration of its own."""
+
+    def make(**configs: str) -> list[Module]:
+        made = [
+            Module(host, agent(host, name=host.name, config=configs[host.name]), shell(host))
+            for host in lab.hosts(*configs)
+        ]
+        for first, one in enumerate(made):
+            for other in made[first + 1 :]:
+                one.agent.wait_peer(other.name)
+        return made
+
+    return make
+
+
+@pytest.mark.netns
+def test_followed_parameters(configured: Configured, tmp_path: Path) -> None:
+    description = "/a/robot_description"
+    rules = f'[[param]]\nkey = "/robot_description"\nfrom = "a"\nto = "{description}"\n'
+    rules += "".join(f'[[param]]\nkey = "{key}"\nfrom = "a"\n' for key in ("/arm", "/big"))
+    a, b = configured(a="", b=rules)
+    a.ros.tool("rosparam", "set", "/robot_description", "one")
+    a.ros.tool("rosparam", "set", "/arm", "{p: 1, q: {r: 2.5}}")
+    has(b, description, "one")
+    has(b, "/arm/q/r", "2.5")
+    a.ros.tool("rosparam", "set", "/arm/q/r", "3.5")
+    a.ros.tool("rosparam", "delete", "/arm/p")
+    has(b, "/arm/q/r", "3.5")
+    has(b, "/arm/p", None)
+    (tmp_path / "big").write_text("<x a='1'/>\n" * 300_000)
+    a.ros.tool("rosparam", "set", "/big", "-t", str(tmp_path / "big"))
+    eventually(lambda: "/big" in b.ros.tool("rosparam", "list").split(), what="the large one")
+    # One owner: what is set here is put back, and said; nobody else sets it either.
+    b.ros.tool("rosparam", "set", description, "mine")
+    b.agent.process.wait_for(f"{description} was changed here, and is put back: it belongs to a")
+    has(b, description, "one")
+    assert "it is followed from a:/robot_description" in param(a, "set", "--peer", "b", description, "x", code=1)
+    rows = json.loads(param(b, "followed", "--json"))
+    states = {description: "followed", "/arm": "followed", "/big": "followed"}
+    assert {row["key"]: row["state"] for row in rows} == states
+    # The owner goes: the value stays. It comes back with a core of its own, and without most of them.
+    a.agent.kill()
+    b.agent.wait_no_peer("a")
+    assert b.ros.tool("rosparam", "get", description).strip() == "one"
+    a.agent.restart()
+    b.agent.wait_peer("a")
+    a.ros.tool("rosparam", "set", "/robot_description", "two")
+    has(b, description, "two")
+    assert b.ros.tool("rosparam", "get", "/arm/q/r").strip() == "3.5"
+
+
+@pytest.mark.netns
+def test_time_comes_from_one_simulator(configured: Configured) -> None:
+    sim, robot, other = configured(
+        sim="[time]\nshare = true\n", robot='[time]\nfollow = "sim"\n', other='[time]\nfollow = "robot"\n'
+    )
+    sim.ros.rospy("clock", "__name:=simulator", start=1000, speed=4).wait_event("up")
+    sim.ros.tool("rosparam", "set", "/use_sim_time", "true")
+    has(robot, "/use_sim_time", "true")
+    robot.wait_topic("/clock")
+    sleeper = robot.ros.rospy("sleeper")
+    told = sleeper.wait_event("time", where=lambda e: float(str(e["now"])) > 1000)
+    assert float(str(told["now"])) < 2000, "the simulator's time, not the wall's"
+    # Half a second of it is an eighth of one here.
+    sleeper.wait_event("time", where=lambda e: float(str(e["took"])) < 0.4)
+    # Nobody else has it: not who asks one that does not share, whatever that one has itself.
+    assert "/clock" not in other.topics()
+    assert "time comes from sim here" in json.loads(param(other, "followed", "--json"))[0]["problem"]
+    # A second source is refused, and that is said, on both sides.
+    sim.ros.rospy("clock", "__name:=second", start=9000).wait_event("up")
+    robot.agent.process.wait_for("time comes from /simulator of sim already, and has one source")
+    code, output = robot.agent.rmpa("topic", "info", "/clock", "--json")
+    assert code == 0, output
+    assert [end["remote_node"] for end in json.loads(output)["publishers"]] == ["/simulator"]
+    now = sleeper.wait_event("time", since=sleeper.mark_events())
+    assert float(str(now["now"])) < 9000
