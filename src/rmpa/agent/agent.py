@@ -19,6 +19,7 @@ from rmpa.agent.params import ParamOps
 from rmpa.agent.reload import Hangups, Reloader
 from rmpa.agent.station import Station
 from rmpa.agent.view import View
+from rmpa.agent.view_services import ServicesView
 from rmpa.agent.why import Why
 from rmpa.bridge.aio.bridge import Bridge
 from rmpa.bridge.aio.params import Params
@@ -119,6 +120,7 @@ class Agent:
         )
         self.services = Services(self.core, self.bridge, rules)
         self.bridge.add(self.services)
+        self._view.services = ServicesView(self.services)
         self._param_ops = ParamOps(self.params, self.bridge.asks, self._attached)
         self.reloader = Reloader(settings, load, self._take)
         self._view.waiting = lambda: self.reloader.waiting

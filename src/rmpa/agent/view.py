@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from rmpa.agent.clocks import Clocks
     from rmpa.agent.station import Station
+    from rmpa.agent.view_services import ServicesView
     from rmpa.bridge.aio.bridge import Bridge
     from rmpa.core.aio.realtime import Wish
     from rmpa.core.config import Settings
@@ -65,6 +66,7 @@ class View:
         self._peers = PeersView(bridge)
         self._topics = TopicsView(settings, core, bridge, clocks)
         self.station: Station | None = None
+        self.services: ServicesView | None = None
         self.waiting: Callable[[], tuple[str, ...]] = tuple
         """What the settings say and only a restart brings."""
 
@@ -77,7 +79,7 @@ class View:
         """Everything at this moment; data goes on in between.
 
         Args:
-            topics: The only topics that are wanted, or ``None`` for all.
+            topics: The only topics that are wanted, without services, or ``None`` for all.
         """
         rooms = [self._bridge.counters, self._core.counters, *self._counters]
         if self.station is not None:
@@ -91,6 +93,7 @@ class View:
             taken=time.time(),
             peers=self._peers.infos(self.station) if self.station is not None else (),
             topics=self._topics.infos(topics),
+            services=self.services.infos() if self.services is not None and topics is None else (),
             counters=dict(sorted(counters.items())),
             notes=self._notes(),
         )

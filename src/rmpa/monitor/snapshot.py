@@ -269,6 +269,50 @@ class TopicInfo(msgspec.Struct, kw_only=True, frozen=True):
         return tuple(sorted({route.peer for route in self.routes if route.direction == "in"}))
 
 
+class ServiceInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """One service: of the local graph, or of a peer.
+
+    Attributes:
+        name: Its global name here.
+        node: The node that provides it, by its name in its own graph.
+        direction: ``out`` (of this module; peers may call it) or ``in`` (a peer's).
+        peer: Whose it is; empty for ``out``.
+        state: ``in``: ``hidden`` (not in the local graph: see ``hidden``), ``idle`` (nobody calls it), ``opening`` or
+            ``open``. ``out``: ``home`` (policy keeps it here), ``idle``, or ``open`` (some peer has it open).
+        wire: Its name on the way, and in the peer's own graph, where that differs.
+        type: ``package/Name``; empty before anybody asked for it.
+        md5: Of that type, likewise.
+        callers: ``out``: the peers that have it open.
+        calls: Calls made across the mesh so far.
+        failed: Of these, those that ended with an error.
+        active: Calls under way.
+        latency: ``in``: from a client's request to its reply; ``out``: the server's part of it. Seconds, of the last
+            calls that went well.
+        crosses: Whether policy lets it cross.
+        policy: The rule that says so, ready to read.
+        hidden: Why a peer's service is not in the local graph, ready to read; empty where it is.
+        problem: Why the last call, or the last attempt to open it, failed; empty if none did.
+    """
+
+    name: str
+    node: str
+    direction: str
+    peer: str = ""
+    state: str = "idle"
+    wire: str = ""
+    type: str = ""
+    md5: str = ""
+    callers: tuple[str, ...] = ()
+    calls: int = 0
+    failed: int = 0
+    active: int = 0
+    latency: Spread | None = None
+    crosses: bool = True
+    policy: str = ""
+    hidden: str = ""
+    problem: str = ""
+
+
 class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
     """Everything at one moment.
 
@@ -277,6 +321,7 @@ class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
         taken: When, seconds since the epoch.
         peers: The roster, by name.
         topics: The graph's topics, by name.
+        services: The graph's services and the peers', by name; of one name first the local one.
         counters: What was refused or dropped, by name: ``beacon.malformed`` …
         notes: What the user should know (a port taken, no multicast), each ready to read.
     """
@@ -285,6 +330,7 @@ class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
     taken: float
     peers: tuple[PeerInfo, ...] = ()
     topics: tuple[TopicInfo, ...] = ()
+    services: tuple[ServiceInfo, ...] = ()
     counters: dict[str, int] = {}
     notes: tuple[str, ...] = ()
 

@@ -104,7 +104,8 @@ class Services(Part):
     def __init__(self, core: Core, bridge: Bridge, rules: ServiceRules) -> None:
         self._core = core
         self._bridge = bridge
-        self._rules = rules
+        self.rules = rules
+        """What may cross, for the monitor too."""
         self.exports = ServiceExports(rules)
         """The outbound plan, for the monitor."""
         self.imports = ServiceImports(rules)
@@ -145,7 +146,7 @@ class Services(Part):
 
     def obey(self, rules: ServiceRules) -> None:
         """Other rules hold from now on; what they do not touch goes on."""
-        self._rules = rules
+        self.rules = rules
         self._act(self.exports.obey(rules))
         self._act(self.imports.obey(rules))
         for shown in self._shown.values():
@@ -372,7 +373,7 @@ class Services(Part):
             proxy.name,
             lambda call: self._call(shown, call),
             lambda: self._describe(shown),
-            timeout=self._rules.timeout(shown.service),
+            timeout=self.rules.timeout(shown.service),
             on_mismatch=lambda fields, text: self._mismatched(shown, fields, text),
         )
         proxy.add_service(shown.endpoint)
