@@ -11,6 +11,7 @@ import json
 import os
 import time
 import xmlrpc.client
+from typing import Any
 
 
 def say(event: str, **fields: object) -> None:
@@ -28,12 +29,12 @@ def main() -> None:
     while left:
         time.sleep(wanted.every)
         try:
-            _, _, state = xmlrpc.client.ServerProxy(os.environ["ROS_MASTER_URI"]).getSystemState("/mirrored")
+            answer: Any = xmlrpc.client.ServerProxy(os.environ["ROS_MASTER_URI"]).getSystemState("/mirrored")
         except OSError:
             continue  # not there yet
         now = time.monotonic()
         for kind, (place, count) in list(left.items()):
-            found = sum(entry[0].startswith("/crowd") for entry in state[place])
+            found = sum(entry[0].startswith("/crowd") for entry in answer[2][place])
             if found >= count:
                 say(kind, at=now, count=found)
                 del left[kind]
