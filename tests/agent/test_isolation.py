@@ -16,8 +16,10 @@ import time
 import xmlrpc.client
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from ipaddress import IPv4Address
 from typing import TYPE_CHECKING, Final
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -26,10 +28,13 @@ from rmpa.core import limits
 from rmpa.core.aio import loop as loop_module
 from rmpa.core.aio.loop import AgentLoop, DirectSelector, breathe
 from rmpa.core.config import Settings
+from rmpa.core.errors import UnreachableError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.monitor.aio.control_client import ControlClient
+from rmpa.ros.aio.core import RosCore
+from rmpa.ros.aio.external_core import ExternalCore
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
@@ -148,12 +153,10 @@ class World:
 
 
 @asynccontextmanager
-async def worlds(tmp_path: Path) -> AsyncIterator[World]:
+async def worlds(tmp_path: Path, **near: str) -> AsyncIterator[World]:
     group = (limits.MULTICAST_GROUP, 20000 + (os.getpid() + 7919) % 20000)
-    agents = [
-        Agent(Settings(name=name, core_port=0, interfaces=("lo",), group_port=group[1], runtime_dir=str(tmp_path)))
-        for name in ("near", "far")
-    ]
+    settings = Settings(core_port=0, interfaces=("lo",), group_port=group[1], runtime_dir=str(tmp_path))
+    agents = [Agent(replace(settings, name="near", **near)), Agent(replace(settings, name="far"))]
     with socket.create_server(("127.0.0.1", 0)) as listening, ThreadPoolExecutor(16) as threads:
         api = f"http://127.0.0.1:{listening.getsockname()[1]}/"
         started: list[Agent] = []
@@ -173,7 +176,7 @@ def calls(agent: Agent, bodies: Iterable[bytes]) -> Callable[[], None]:
     """Calls of a node or tool on one connection, one after the other; made there, not in the loop."""
 
     def work() -> None:
-        connection = http.client.HTTPConnection("127.0.0.1", agent.core.port, timeout=DEADLINE)
+        connection = http.client.HTTPConnection(urlsplit(agent.core.uri).netloc, timeout=DEADLINE)
         for body in bodies:
             connection.request("POST", "/RPC2", body, {"Content-Type": "text/xml"})
             answer = connection.getresponse()
@@ -295,6 +298,56 @@ def test_no_work_of_a_thousand_topics_goes_on_without_a_look_at_the_data(tmp_pat
                 await phase(world)
                 if len(Watched.holds) > STRAYS:
                     found[phase.__name__] = sorted(Watched.holds, reverse=True)[:8]
+
+    with asyncio.Runner(loop_factory=AgentLoop) as runner:
+        runner.run(main())
+    told = [f"{name}: {1e3 * hold:.1f} ms: {who}" for name, holds in found.items() for hold, who in holds]
+    assert not found, "\n".join(told)
+    assert Watched.looks > 10_000
+
+
+async def an_external_graph_is_followed(world: World) -> None:
+    """A fleet of its own comes and goes at the master, which the agent finds by looking."""
+    for turn in range(2):
+        nodes = [fleet("registerPublisher", node, TYPE, world.api) for node in range(NODES)]
+        await world.beside(*(calls(world.near, bodies) for bodies in nodes))
+        await world.until(lambda: world.shown() == TOPICS)
+        if turn == 0:
+            nodes = [fleet("unregisterPublisher", node, world.api) for node in range(NODES)]
+            await world.beside(*(calls(world.near, bodies) for bodies in nodes))
+            await world.until(lambda: world.shown() == 0)
+
+
+async def its_master_is_started_anew(world: World) -> None:
+    assert isinstance(world.near.core, ExternalCore)
+    for _ in range(4):
+        world.near.core._drop_writes(UnreachableError("master", "there"))
+        world.near.core._look_soon()
+        looks = world.near.core.counters.as_dict()["master.looks"]
+        await world.until(lambda looks=looks: world.near.core.counters.as_dict()["master.looks"] > looks)  # type: ignore[misc]
+
+
+def test_no_look_at_an_external_core_goes_on_without_one_at_the_data(tmp_path: Path) -> None:
+    found: dict[str, list[tuple[float, str]]] = {}
+
+    async def main() -> None:
+        master = RosCore(port=0, rosout=False)
+        await master.start()
+        try:
+            async with worlds(tmp_path, core_mode="external", core_master=master.uri) as world:
+                for phase in (
+                    a_fleet_registers,
+                    the_fleet_leaves,
+                    an_external_graph_is_followed,
+                    its_master_is_started_anew,
+                    plans_are_reconciled,
+                ):
+                    Watched.holds.clear()
+                    await phase(world)
+                    if len(Watched.holds) > STRAYS:
+                        found[phase.__name__] = sorted(Watched.holds, reverse=True)[:8]
+        finally:
+            await master.close()
 
     with asyncio.Runner(loop_factory=AgentLoop) as runner:
         runner.run(main())

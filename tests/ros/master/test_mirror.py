@@ -206,6 +206,18 @@ def test_a_dead_node_counts_no_more_until_it_is_somewhere_else_or_lives_after_al
     assert (pair.mirror.publishers("/t"), dict(pair.mirror.dead)) == ({"/p": MOVED}, {})
 
 
+def test_what_the_master_did_not_hear_is_told_again(pair: Pair) -> None:
+    pair.call("registerPublisher", "/rmpa", "/t", STRING, OURS)
+    pair.call("registerPublisher", "/rmpa", "/u", STRING, OURS)
+    pair.flush()
+    pair.call("unregisterPublisher", "/rmpa", "/t", OURS)
+    pair.writes.clear()
+    assert pair.look() == [("unregisterPublisher", ("/rmpa", "/t", OURS))]
+    pair.flush()
+    assert pair.look() == []
+    assert pair.mirror.state() == pair.master.registrations.state()
+
+
 def test_a_local_provider_takes_a_service_from_us_and_it_is_not_taken_back(pair: Pair) -> None:
     pair.call("registerService", "/rmpa/b/n", "/srv", "rosrpc://h:9", OURS)
     pair.flush()
@@ -227,7 +239,7 @@ def test_names_of_an_agent_that_are_not_ours_are_strangers_and_leave_nothing(pai
     assert strangers == {"/rmpa": THEIRS, "/rmpa/b/n": MOVED}
     assert pair.mirror.learn(survey, 0, strangers) == []
     assert set(pair.mirror.state().nodes) == {"/rmpaint"}
-    for method, params in leftovers(survey, strangers):
+    for (method, params), _ in leftovers(survey, strangers):
         pair.theirs(method, *map(str, params))
     assert set(pair.master.registrations.nodes()) == {"/rmpaint"}
 
@@ -261,7 +273,8 @@ STEPS: Final = st.lists(
     st.one_of(
         st.tuples(st.just("theirs"), METHODS, st.sampled_from(["/x", "/y"]), NAMES, APIS),
         st.tuples(st.just("ours"), METHODS, st.sampled_from(["/rmpa", "/rmpa/b/n"]), NAMES, st.just(OURS)),
-        st.tuples(st.just("look"), st.integers(0, 3)),
+        st.tuples(st.just("look")),
+        st.tuples(st.just("lose")),
     ),
     max_size=30,
 )
@@ -269,17 +282,25 @@ STEPS: Final = st.lists(
 
 @given(STEPS)
 def test_whatever_happened_the_next_look_shows_what_the_master_has(steps: list[tuple[str, ...]]) -> None:
-    """Our calls leave in portions, and before each look, as those of the external core do."""
+    """Our calls leave before each look, as those of the external core do; some do not arrive."""
     pair = Pair()
     for step in steps:
         if step[0] == "look":
             pair.flush()
             pair.look()
             continue
+        if step[0] == "lose":
+            pair.writes.clear()
+            continue
         who, method, node, topic, api = step
         kind = [STRING] if method.startswith("register") else []
         (pair.theirs if who == "theirs" else pair.call)(method, node, topic, *kind, api)
     pair.flush()
+    pair.look()
+    pair.flush()
+    strangers = pair.mirror.strangers(pair.survey(), "/rmpa", pair.mirror.asked)
+    for (method, params), _ in leftovers(pair.survey(), strangers):
+        pair.theirs(method, *map(str, params))
     assert pair.look() == []
     mirror, master = pair.mirror.state(), pair.master.registrations.state()
     assert (mirror.publishers, mirror.subscribers, mirror.nodes) == (

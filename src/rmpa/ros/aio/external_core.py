@@ -254,13 +254,17 @@ class ExternalCore:
         """Queue a call. While the master is gone nothing waits: what is missing there is seen when it is back."""
         if not self._usable:
             return
-        self._writes.append(write)
-        self._written.clear()
-        self._wake.set()
+        self._queue(write)
         if len(self._writes) > limits.MASTER_WRITES_MAX:
             # The next look finds what is missing; it costs less than to know what could be left out.
             _log.warning("! the roscore at %s is slow: %d changes are told anew", self._uri, len(self._writes))
             self._drop_writes(UnreachableError("ROS master", self._uri, "it is too slow"))
+            self._look_soon()
+
+    def _queue(self, write: _Write) -> None:
+        self._writes.append(write)
+        self._written.clear()
+        self._wake.set()
 
     def _drop_writes(self, error: Exception) -> None:
         self._seen = b""
@@ -379,16 +383,16 @@ class ExternalCore:
         self._tell()
         if self._rival:
             return
-        rests = list(leftovers(survey, strangers))
+        rests = [write for write, _ in leftovers(survey, strangers)]
         if rests:
             self.counters.add("master.leftovers", len(rests))
             _log.warning(
                 "= %d registrations of an agent that was killed are taken away from %s", len(rests), self._uri
             )
-        for method, params in (*rests, *again):
-            self._write(_Write(method, params))
         if again:
-            _log.info("= %d registrations are made anew at %s", len(again), self._uri)
+            _log.info("= %d registrations are made, or ended, anew at %s", len(again), self._uri)
+        for method, params in (*rests, *again):
+            self._queue(_Write(method, params))
 
     async def _find_rival(self, strangers: Mapping[str, str]) -> str:
         """Whether another agent is alive at the master: what to call it, or nothing."""

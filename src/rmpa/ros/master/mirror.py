@@ -212,7 +212,7 @@ class Mirror:
             ignored: Nodes that are passed over.
 
         Returns:
-            What has to be registered again, because the master does not have it of ours.
+            What has to be registered again, because the master does not have it of ours, or unregistered again.
         """
         if self._run and survey.run != self._run:
             # Its nodes are not in the new master's graph, and never will be before they restart. In a graph without
@@ -230,6 +230,7 @@ class Mirror:
             self._add_new(kind, table, passed, survey, seen)
         self._learn_types(survey, passed)
         again += self._missing(survey, seen, ignored)
+        again += self._surplus(survey, seen)
         self._touched = {entry: asked for entry, asked in self._touched.items() if asked > seen}
         return again
 
@@ -302,26 +303,38 @@ class Mirror:
                 again.append(own.call)
         return again
 
+    def _surplus(self, survey: Survey, seen: int) -> list[Call]:
+        """What the master has of our nodes and we do not: it did not hear that it went."""
+        ours = {node: own.api for (_, _, node), own in self._own.items()}
+        nodes = {node: api for node, api in ours.items() if survey.uris.get(node) == api}
+        again = []
+        for call, entry in leftovers(survey, nodes, self._breathing):
+            if entry not in self._own and self._touched.get(entry, 0) <= seen:
+                again.append(call)
+        return again
 
-def leftovers(survey: Survey, nodes: Mapping[str, str]) -> Iterator[Call]:
-    """What takes the registrations of these nodes away, which nobody will do any more.
+
+def leftovers(survey: Survey, nodes: Mapping[str, str], breathing: Breathing = iter) -> Iterator[tuple[Call, Entry]]:
+    """Everything that a master has of some nodes, and what takes it away.
 
     Args:
         survey: What the master said.
         nodes: The nodes and their slave APIs.
+        breathing: For large graphs.
     """
     for kind, table in survey.holders.items():
-        for key, holders in table.items():
+        for key, holders in breathing(table.items()):
             for node in holders:
                 if node not in nodes:
                     continue
+                entry = kind, key, node
                 match kind:
                     case Kind.PUBLISHER:
-                        yield "unregisterPublisher", (node, key, nodes[node])
+                        yield ("unregisterPublisher", (node, key, nodes[node])), entry
                     case Kind.SUBSCRIBER:
-                        yield "unregisterSubscriber", (node, key, nodes[node])
+                        yield ("unregisterSubscriber", (node, key, nodes[node])), entry
                     case _:
-                        yield "unregisterService", (node, key, survey.services.get(key, ""))
+                        yield ("unregisterService", (node, key, survey.services.get(key, ""))), entry
 
 
 _ARITY: Final = {
