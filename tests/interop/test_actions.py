@@ -123,6 +123,7 @@ def test_clients_of_several_modules_share_one_server_and_each_hears_its_own(modu
     # The stock tools say who listens to a client's goals, and whose node it stands for.
     assert "/rmpa/a/client" in b.ros.tool("rostopic", "info", "/count/goal")
     assert "/rmpa/c/client" in b.ros.tool("rostopic", "info", "/count/goal")
+    assert "to: /rmpa/b/server" in a.ros.tool("rosnode", "info", "/client")
 
 
 def test_one_computer_gives_goals_to_two_robots_that_are_alike(modules: ModuleFactory) -> None:

@@ -106,10 +106,7 @@ def test_a_bad_link_moves_no_peer_and_after_a_lost_one_it_is_back_by_itself(modu
 def test_seven_robots_of_the_same_nodes_all_hear_each_other_and_cost_nothing_at_rest(modules: ModuleFactory) -> None:
     robots = modules(*(f"r{number}" for number in range(1, ROBOTS + 1)), linked=False, log_level="info")
     for robot in robots:
-        eventually(
-            lambda robot=robot: sum(row["state"] == "linked" for row in robot.agent.peers().values()) == ROBOTS - 1,
-            what=f"{robot.name} linked with all",
-        )
+        _linked_with_all(robot)
     # At rest: with nothing to do, an agent does nothing.
     before = [_cpu(robot) for robot in robots]
     time.sleep(REST)
@@ -134,6 +131,15 @@ def test_seven_robots_of_the_same_nodes_all_hear_each_other_and_cost_nothing_at_
     more.wait_event("report", where=lambda event: _least(event["sources"], everybody) >= 20)
     speaker = robots[0].ros.tool("rosnode", "info", "/mouth")
     assert len(re.findall(r"topic: /tf\n\s+\* to: ", speaker)) == 2, "its own robot's listener, and its agent"
+
+
+def _linked_with_all(robot: Module) -> None:
+    """Wait until a robot has a link to each other one."""
+
+    def linked() -> bool:
+        return sum(row["state"] == "linked" for row in robot.agent.peers().values()) == ROBOTS - 1
+
+    eventually(linked, what=f"{robot.name} linked with all")
 
 
 def _cpu(robot: Module) -> float:

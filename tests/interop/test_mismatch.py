@@ -45,6 +45,11 @@ def mismatches(module: Module) -> list[str]:
     return found
 
 
+def mended(module: Module) -> None:
+    """Wait until nothing is said any more."""
+    eventually(lambda: not mismatches(module), what=f"nothing wrong at {module.name}")
+
+
 def diagnostics(module: Module) -> Process:
     """/diagnostics as the stock tool prints it."""
     return module.ros.start("rostopic", "echo", "/diagnostics", name="diagnostics")
@@ -67,7 +72,7 @@ def test_another_md5_is_refused_at_both_ends_until_it_is_mended(modules: ModuleF
     # The listener leaves: nothing is wrong any more, at either end, and no other topic has noticed.
     heard.interrupt()
     for module in (a, b):
-        eventually(lambda module=module: not mismatches(module), what=f"nothing wrong at {module.name}")
+        mended(module)
     report = flows(steady, 50)
     assert (report["gaps"], report["doubled"], report["bad"]) == (0, 0, 0)
 
@@ -93,6 +98,6 @@ def test_another_type_is_refused_at_both_ends_until_it_is_mended(modules: Module
     eventually(lambda: "/rmpa/a/bytes" in b.ros.tool("rostopic", "info", TOPIC), what="the remote publisher")
     flows(b.ros.roscpp("listener", topic=TOPIC), 5)
     for module in (a, b):
-        eventually(lambda module=module: not mismatches(module), what=f"nothing wrong at {module.name}")
+        mended(module)
     report = flows(steady, 50)
     assert (report["gaps"], report["doubled"], report["bad"]) == (0, 0, 0)
