@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 
 from rmpa.core import limits
-from rmpa.core.config import PolicySettings, Settings
+from rmpa.core.config import PeerRule, PolicySettings, ServiceSettings, Settings
 from rmpa.core.errors import ConfigError
 from rmpa.monitor.diagnosis import Diagnosis, Verdict
 from tests.agent.test_agent import node, running, settings, until  # noqa: F401 - a fixture among them
@@ -109,3 +110,61 @@ async def test_unknown_peers_and_names(settings: Callable[..., Settings]) -> Non
             await ask(b, "x y")
     async with running(settings("lonely")) as (lonely,):
         assert stopped_at(await ask(lonely, "/x"))[0] == "publisher"
+
+
+async def test_names_of_a_peer_with_a_prefix(settings: Callable[..., Settings]) -> None:  # noqa: F811
+    pc = replace(settings("pc"), peers=(PeerRule("robot", prefix="/robot1"),))
+    async with (
+        running(settings("robot"), pc) as (robot, base),
+        node("driver", robot) as driver,
+        node("pilot", base) as pilot,
+    ):
+        odom = await driver.advertise("/odom", "std_msgs/String")
+        heard = await pilot.subscribe("/robot1/odom", "std_msgs/String", lambda _: None)
+        await until(lambda: odom.subscribers and heard.publishers)
+        odom.publish(odom.make({"data": "here"}))
+        for name in ("/robot1/odom", "/odom"):  # as it is called here, and as the robot calls it
+            (found,) = await ask(base, name, "robot")
+            assert (found.name, found.flows) == ("/robot1/odom", True)
+            assert any(stage.text.endswith("as /robot1/odom (its /odom)") for stage in found.stages)
+        command = await pilot.advertise("/robot1/cmd_vel", "std_msgs/String")
+        obeyed = await driver.subscribe("/cmd_vel", "std_msgs/String", lambda _: None)
+        await until(lambda: command.subscribers and obeyed.publishers)
+        command.publish(command.make({"data": "go"}))
+        (there,) = await ask(base, "/robot1/cmd_vel")
+        assert (there.name, there.peer, there.to, there.flows) == ("/cmd_vel", "pc", "robot", True)
+        assert there.stages[2].text == "/pilot on pc publishes /cmd_vel (/robot1/cmd_vel over there)"
+
+
+async def test_policy_for_single_peers(settings: Callable[..., Settings]) -> None:  # noqa: F811
+    rule = PeerRule("b", policy=PolicySettings(deny=("/secret",)))
+    async with running(replace(settings("a"), peers=(rule,)), settings("b")) as (a, b), node("talker", a) as talker:
+        await talker.advertise("/secret", "std_msgs/String")
+        stage, text = stopped_at(await ask(b, "/secret", "a"))
+        assert stage == "policy there"
+        assert "peer \"b\".deny has '/secret'" in text
+
+
+async def test_services(settings: Callable[..., Settings]) -> None:  # noqa: F811
+    deny = ServiceSettings(deny=("/kept",))
+    async with running(replace(settings("a"), services=deny), settings("b")) as (a, b), node("server", a) as server:
+        stage, text = stopped_at(await b._why({"name": "/ask", "peer": "a", "service": True}))
+        assert (stage, text) == ("server", "no node of a provides /ask")
+
+        def answer(_: object) -> dict[str, object]:
+            return {"success": True, "message": "yes"}
+
+        for name in ("/ask", "/kept"):
+            await server.advertise_service(name, "std_srvs/Trigger", answer)
+        await until(lambda: b.core.state().services.get("/ask"))
+        for peer in ("a", None):
+            (found,) = await ask(b, "/ask", peer)
+            assert (found.kind, found.node, found.flows) == ("service", "/server", True), found
+            texts = {stage.name: stage.text for stage in found.stages}
+            assert texts["answer"].startswith("its server answers: std_srvs/Trigger, md5 ")
+        stage, text = stopped_at(await ask(b, "/kept", "a"))
+        assert stage == "policy there"
+        assert "services.deny has '/kept'" in text
+        (own,) = await ask(a, "/ask")
+        assert own.failed is not None
+        assert "of this module provides /ask" in own.failed.text

@@ -80,7 +80,7 @@ def test_what_does_not(place: Place, answers: Callable[[Handler], None]) -> None
     answers(answer)
     code, out, err = place.run("why", "joystick:cmd")
     assert (code, err) == (1, "")
-    assert asked == [{"name": "/cmd", "peer": "joystick"}]
+    assert asked == [{"name": "/cmd", "peer": "joystick", "service": False}]
     assert out.splitlines()[-3:] == [
         "  fail     publisher  no node of joystick\\x1b[2J publishes /cmd",
         "it stops at: publisher",

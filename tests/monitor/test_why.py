@@ -69,6 +69,8 @@ class Case:
     readers: tuple[Reader, ...] = (Reader(number=1, node="/base", messages=100),)
     readers_later: tuple[Reader, ...] | None = (Reader(number=1, node="/base", messages=120),)
     mismatches: tuple[str, ...] = ()
+    only: frozenset[str] | None = None
+    carrier: str = ""
 
     def _sight(self, route: RouteInfo | None, source: FarSource | None, readers: tuple[Reader, ...]) -> Sight:
         topic = TopicInfo(
@@ -85,10 +87,12 @@ class Case:
         near = Near(
             snapshot,
             "/cmd",
-            nodes if self.registered else frozenset(),
-            nodes if self.conflict else frozenset(),
-            {"/joy": readers},
-            {"/joy": self.mismatches},
+            only=self.only,
+            carrier=self.carrier,
+            registered=nodes if self.registered else frozenset(),
+            conflict=nodes if self.conflict else frozenset(),
+            readers={"/joy": readers},
+            mismatches={"/joy": self.mismatches},
         )
         return Sight(near, far, self.refusal)
 
@@ -382,6 +386,26 @@ def test_a_peer_is_found_by_its_guid_and_a_wrong_name_by_the_nearest() -> None:
     found = one(Case(), "joystik")
     assert found.failed is not None
     assert found.failed.remedy.startswith("did you mean joystick?")
+
+
+def test_a_relayed_module_has_no_link_of_its_own() -> None:
+    relayed = msgspec.structs.replace(PEER, name="arm", state="relayed", via="joystick", link=None)
+    found = one(Case(peer=relayed, carrier="joystick", only=frozenset({"/joy"})), "arm")
+    assert found.flows
+    assert found.stages[1].text == "no link of its own; joystick passes on what it publishes"
+    # What the relay brings of other modules is not this one's.
+    nothing = one(Case(peer=relayed, carrier="joystick", only=frozenset(), source=None, source_later=None), "arm")
+    assert nothing.failed is not None
+    assert nothing.failed.name == "publisher"
+
+
+def test_names_of_both_sides_are_told() -> None:
+    renamed = Case(**route(wire="/stick"), source=msgspec.structs.replace(SOURCE, topic="/joy/stick"))
+    first = renamed._sight(renamed.route, renamed.source, renamed.readers)
+    (found,) = walk_topic(first, "joystick", None, "/stick")
+    texts = {stage.name: stage.text for stage in found.stages}
+    assert texts["publisher"] == "/joy on joystick publishes /stick (/joy/stick over there)"
+    assert texts["policy here"] == "this module takes it as /cmd (its /stick)"
 
 
 def test_one_look_alone_is_judged_too() -> None:

@@ -124,7 +124,7 @@ class Agent:
         self._param_ops = ParamOps(self.params, self.bridge.asks, self._attached)
         self.reloader = Reloader(settings, load, self._take)
         self._view.waiting = lambda: self.reloader.waiting
-        self._whys = Why(settings, self.core, self.bridge, self._view)
+        self._whys = Why(settings, self.core, self.bridge, self.services, self._view)
 
     async def start(self) -> None:
         """Start every part; the network last, so that who finds us finds us ready.

@@ -1,4 +1,4 @@
-"""Answers ``rmpa why``: gathers what this side knows, asks the other agent, and has ``monitor.why`` judge it."""
+"""Answers ``rmpa why``: gathers what this side knows, asks the other agent, and has ``monitor`` judge it."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
 
-from rmpa.bridge.messages import Source
-from rmpa.bridge.policy import Policy, is_own
-from rmpa.bridge.proxy_names import proxy_name
+from rmpa.agent.why_services import ServiceFacts
+from rmpa.agent.why_topics import TopicFacts, name_in
 from rmpa.core import limits
 from rmpa.core.config_values import did_you_mean
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
 from rmpa.core.names import is_global_name
-from rmpa.monitor.diagnosis import Diagnosis, FarSource, FarTopic, Near, Reader, Sight, Stage, Verdict
+from rmpa.monitor.diagnosis import Diagnosis, FarTopic, Sight, Stage, Verdict
 from rmpa.monitor.why import find_peer, walk_peer, walk_topic
-from rmpa.ros.tcpros import printable
+from rmpa.monitor.why_services import FarService, walk_service
 
 if TYPE_CHECKING:
     from rmpa.agent.view import View
     from rmpa.bridge.aio.bridge import Attached, Bridge
+    from rmpa.bridge.aio.services import Services
     from rmpa.core.config import Settings
     from rmpa.monitor.snapshot import PeerInfo
     from rmpa.ros.aio.core_api import Core
@@ -28,8 +28,11 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 TOPIC: Final = "why.topic"
 """The question to a publisher's agent: what it knows of a topic (``FarTopic``)."""
+SERVICE: Final = "why.service"
+"""The question to a server's agent: what it knows of a service (``FarService``)."""
 HERE: Final = "why.here"
 """The question to a subscriber's agent: why a topic of the asker does not arrive there (``Diagnosis``, a list)."""
+_MOVING: Final = frozenset({"open", "lingering", "opening"})
 
 
 class Why:
@@ -39,73 +42,94 @@ class Why:
         settings: The agent's.
         core: Its ROS core.
         bridge: Its bridge.
+        services: The bridge's part for services.
         view: Its snapshots.
     """
 
-    def __init__(self, settings: Settings, core: Core, bridge: Bridge, view: View) -> None:
+    def __init__(self, settings: Settings, core: Core, bridge: Bridge, services: Services, view: View) -> None:
         self._core = core
         self._bridge = bridge
         self._view = view
-        self.reload(settings)
-        bridge.asks.on(TOPIC, self._tell_topic)
+        self._topics = TopicFacts(settings, core, bridge, view)
+        self._services = ServiceFacts(settings, core, bridge, services)
+        bridge.asks.on(TOPIC, self._topics.tell)
+        bridge.asks.on(SERVICE, self._services.tell)
         bridge.asks.on(HERE, self._tell_here)
 
     def reload(self, settings: Settings) -> None:
         """Other settings hold from now on."""
-        self._policy = Policy(settings.policy, settings.peers, settings.time)
+        self._topics.reload(settings)
+        self._services.reload(settings)
 
     async def answer(self, args: dict[str, object]) -> tuple[Diagnosis, ...]:
         """The control socket's op ``why``.
 
         Args:
-            args: ``name``: a topic; ``peer``: one peer's name or GUID, or ``None`` for all that have to do with it.
+            args: ``name``: a topic, or a service; ``peer``: one peer's name or GUID, or ``None`` for all that have to
+                do with it; ``service``: whether a service is meant even where a topic has that name.
 
         Raises:
             ConfigError: The name is none.
         """
-        topic, peer = args.get("name"), args.get("peer")
-        if not isinstance(topic, str) or not is_global_name(topic):
-            raise ConfigError("name", f"{topic!r} is not a topic", "write /name, or PEER:/name")
-        if peer is not None:
-            found = await self._arrives(str(peer), topic)
-            failed = found[0].failed
-            if failed is not None and failed.name == "publisher" and self._own(topic):
-                return await self._leaves(topic, str(peer))
-            return found
-        return await self._everywhere(topic)
+        name, peer = args.get("name"), args.get("peer")
+        if not isinstance(name, str) or not is_global_name(name):
+            raise ConfigError("name", f"{name!r} is not a topic, nor a service", "write /name, or PEER:/name")
+        wanted = str(peer) if peer is not None else None
+        if args.get("service") is True or self._is_service(name):
+            return await self._service(name, wanted)
+        found = await (self._everywhere(name) if wanted is None else self._one(wanted, name))
+        failed = found[0].failed
+        if failed is not None and failed.name == "publisher":
+            # No topic has this name anywhere: perhaps a service that does not cross has.
+            service = await self._service(name, wanted)
+            if any(diagnosis.node for diagnosis in service):
+                return service
+        return found
 
-    # --- this side --------------------------------------------------------------------------------------------
+    def _is_service(self, name: str) -> bool:
+        state = self._core.state()
+        if name in state.publishers or name in state.subscribers or any(self._bridge.imports.at(name)):
+            return False
+        return name in state.services or self._services.known(name)
 
-    def _own(self, topic: str) -> dict[str, str]:
-        """The module's own publishers of a topic, and their addresses."""
-        return {node: uri for node, uri in self._core.publishers(topic).items() if not is_own(node)}
+    # --- topics: this side ------------------------------------------------------------------------------------
 
-    def _attached(self, guid: str) -> Attached | None:
-        return next((at for at in self._bridge.attached() if str(at.link.guid) == guid), None)
+    async def _one(self, peer: str, topic: str) -> tuple[Diagnosis, ...]:
+        """A topic of one peer; or, where that has no publisher and we have, our own topic on its way there."""
+        found = await self._arrives(peer, topic)
+        failed = found[0].failed
+        if failed is not None and failed.name == "publisher" and self._topics.own(topic):
+            return await self._leaves(topic, peer)
+        return found
+
+    def _carrier(self, peer: PeerInfo) -> Attached | None:
+        """Whose link brings what a peer publishes: its own, or that of the relay which passes it on."""
+        for attached in self._bridge.attached():
+            if str(attached.link.guid) == peer.guid or (peer.via and attached.link.name == peer.via):
+                return attached
+        return None
 
     async def _everywhere(self, topic: str) -> tuple[Diagnosis, ...]:
         """Each way that a topic has, in and out; where there is none, what is known of it."""
-        snapshot = self._view.snapshot(frozenset({topic}))
-        linked = [peer for peer in snapshot.peers if peer.state == "linked"]
-        offering = {route.peer for info in snapshot.topics for route in info.routes if route.direction == "in"}
-        found: list[Diagnosis] = []
-        coming = [peer.guid for peer in linked if peer.name in offering]
-        if not coming and not self._own(topic):
+        peers = [peer for peer in self._view.snapshot(frozenset()).peers if peer.state in ("linked", "relayed")]
+        own = self._topics.own(topic)
+        coming = [peer.guid for peer in peers if self._offers(peer, topic)]
+        if not coming and not own:
             # Nobody offers it: perhaps somebody has it and keeps it at home.
-            sights = await asyncio.gather(*(self._sight(peer, topic) for peer in linked))
-            coming = [p.guid for p, s in zip(linked, sights, strict=True) if s.far is not None and s.far.sources]
-        for diagnoses in await asyncio.gather(*(self._arrives(guid, topic) for guid in coming)):
-            found += diagnoses
-        if self._own(topic):
-            for diagnoses in await asyncio.gather(*(self._leaves(topic, peer.guid) for peer in linked)):
-                found += diagnoses
-        if not found:
-            found.append(self._nowhere(topic, [peer.name for peer in linked]))
-        return tuple(found)
+            sights = await asyncio.gather(*(self._sight(peer, topic) for peer in peers))
+            coming = [p.guid for p, s in zip(peers, sights, strict=True) if s.far is not None and s.far.sources]
+        ways = [self._arrives(guid, topic) for guid in coming]
+        ways += [self._leaves(topic, peer.guid) for peer in peers if own and peer.state == "linked"]
+        found = [diagnosis for diagnoses in await asyncio.gather(*ways) for diagnosis in diagnoses]
+        return tuple(found) or (self._nowhere(topic, [peer.name for peer in peers]),)
+
+    def _offers(self, peer: PeerInfo, topic: str) -> bool:
+        attached = self._carrier(peer)
+        return attached is not None and bool(self._topics.near(attached, peer, topic).only)
 
     def _nowhere(self, topic: str, linked: list[str]) -> Diagnosis:
         here = self._view.snapshot(frozenset()).agent.name
-        if self._own(topic):
+        if self._topics.own(topic):
             text, remedy = "no peer is linked that it could go to", "`rmpa peer list` tells of the peers"
             stage = Stage("peer", Verdict.FAIL, text, remedy)
             return Diagnosis(name=topic, peer=here, to="", flows=False, stages=(stage,))
@@ -120,62 +144,30 @@ class Why:
         """Walk the ways from a peer to here."""
         peer = find_peer(self._view.snapshot(frozenset()), name)
         if peer is None:
-            return walk_topic(Sight(self._near(None, topic)), name)
+            return walk_topic(Sight(self._topics.near(None, None, topic)), name)
+        topic, wire = self._topics.there(peer.name, topic)
         sight = await self._sight(peer, topic)
         later = None
-        if any(r.state in ("open", "lingering", "opening") for t in sight.near.snapshot.topics for r in t.routes):
+        if any(r.state in _MOVING for t in sight.near.snapshot.topics for r in t.routes if r.direction == "in"):
             # What moves is told from what stands by looking twice.
             await asyncio.sleep(limits.WHY_WINDOW)
             later = await self._sight(peer, topic)
-        return walk_topic(sight, peer.guid, later)
+        return walk_topic(sight, peer.guid, later, wire)
 
     async def _sight(self, peer: PeerInfo, topic: str) -> Sight:
         """Both sides now."""
-        attached = self._attached(peer.guid)
+        attached = self._carrier(peer)
         if attached is None:
-            return Sight(self._near(None, topic), refusal="it is not linked")
+            return Sight(self._topics.near(None, peer, topic), refusal="it is not linked")
+        _, wire = self._topics.there(peer.name, topic)
+        question = {"topic": wire, "instance": peer.instance if peer.state == "relayed" else ""}
         try:
-            answer = await self._bridge.asks.ask(attached, TOPIC, {"topic": topic})
-            far, refusal = _convert(answer, FarTopic), ""
+            far, refusal = await self._ask(attached, TOPIC, question, FarTopic), ""
         except RmpaError as error:
             far, refusal = None, str(error)
-        return Sight(self._near(attached, topic), far, refusal)
+        return Sight(self._topics.near(attached, peer, topic), far, refusal)
 
-    def _near(self, attached: Attached | None, topic: str) -> Near:
-        snapshot = self._view.snapshot(frozenset({topic}))
-        if attached is None:
-            return Near(snapshot, topic)
-        registered, conflict = set(), set()
-        readers, mismatches = {}, {}
-        publishers = self._core.publishers(topic)
-        proxies = dict(attached.inbound)
-        for route in (route for info in snapshot.topics for route in info.routes if route.direction == "in"):
-            if route.peer != attached.link.name:
-                continue
-            source = Source(topic, route.node)
-            entry = self._bridge.imports.get(attached.peer, source)
-            if entry is not None and entry.conflict:
-                conflict.add(route.node)
-            proxy = proxies.get(route.node)
-            name = proxy_name(attached.inbound.prefix, route.node)
-            if proxy is not None and publishers.get(name) == proxy.node.uri:
-                registered.add(route.node)
-            publication = attached.inbound.publication(source)
-            readers[route.node] = tuple(
-                Reader(
-                    number=link.number,
-                    node=printable(link.other),
-                    held=not link.connected,
-                    messages=link.messages,
-                    waiting=link.waiting,
-                    dropped=link.dropped,
-                )
-                for link in (publication.connections() if publication is not None else ())
-            )
-            mismatches[route.node] = self._bridge.mismatches(source)
-        return Near(snapshot, topic, frozenset(registered), frozenset(conflict), readers, mismatches)
-
-    # --- the other side ---------------------------------------------------------------------------------------
+    # --- topics: the other side -------------------------------------------------------------------------------
 
     async def _leaves(self, topic: str, name: str) -> tuple[Diagnosis, ...]:
         """Let a peer walk the ways from here to it."""
@@ -183,65 +175,65 @@ class Why:
         here = snapshot.agent.name
         begin = walk_peer(snapshot, name)
         peer = find_peer(snapshot, name)
-        attached = self._attached(peer.guid) if peer is not None else None
+        attached = self._carrier(peer) if peer is not None else None
         to = peer.name if peer is not None else name
-        if attached is None:
-            stages = begin if begin[-1].verdict is Verdict.FAIL else (*begin, _gone(to))
+        if attached is None or attached.link.name != to:
+            stages = begin if begin[-1].verdict is Verdict.FAIL else (*begin, _no_link(to))
             return (Diagnosis(name=topic, peer=here, to=to, flows=False, stages=stages),)
+        question = {"topic": self._bridge.names.wire_name(to, topic, self._core.type_of(topic))}
         try:
-            answer = await self._bridge.asks.ask(attached, HERE, {"topic": topic}, limits.WHY_TIMEOUT)
-            return _convert(answer, tuple[Diagnosis, ...])
+            return await self._ask(attached, HERE, question, tuple[Diagnosis, ...], limits.WHY_TIMEOUT)
         except RmpaError as error:
             remedy = f"run `rmpa why {here}:{topic}` there"
             silent = Stage("link", Verdict.FAIL, f"{to} does not tell: {error}", remedy)
             return (Diagnosis(name=topic, peer=here, to=to, flows=False, stages=(*begin, silent)),)
 
     async def _tell_here(self, attached: Attached, args: dict[str, Any]) -> tuple[Diagnosis, ...]:
-        return (await self._arrives(str(attached.link.guid), _topic(args)))[: limits.WHY_SOURCES_MAX]
+        topic = self._bridge.names.local_name(attached.link.name, name_in(args, "topic"))
+        return (await self._arrives(str(attached.link.guid), topic))[: limits.WHY_SOURCES_MAX]
 
-    def _tell_topic(self, attached: Attached, args: dict[str, Any]) -> FarTopic:
-        topic = _topic(args)
-        state = self._core.state()
-        own = list(self._own(topic))
-        names = {name for name, nodes in state.publishers.items() if not all(map(is_own, nodes))}
-        return FarTopic(
-            sources=tuple(self._far(attached, Source(topic, node)) for node in own[: limits.WHY_SOURCES_MAX]),
-            subscribers=tuple(n for n in state.subscribers.get(topic, {}) if not is_own(n))[: limits.WHY_SOURCES_MAX],
-            near="" if own else did_you_mean(topic, names) or "",
-        )
+    # --- services ---------------------------------------------------------------------------------------------
 
-    def _far(self, attached: Attached, source: Source) -> FarSource:
-        exports = self._bridge.exports
-        local = exports.offered.get(source)
-        kind = local.type if local is not None else self._core.type_of(source.topic)
-        decision = self._policy.judge(source.topic, kind, source.node)
-        flow = self._bridge.outbound.flows.get(source)
-        opening = exports.contract(source, attached.peer) is not None
-        return FarSource(
-            node=source.node,
-            type=kind,
-            crosses=decision.allowed,
-            rule=decision.rule,
-            offered=local is not None,
-            route="open" if attached.peer in exports.flowing(source) else "opening" if opening else "",
-            messages=flow.messages if flow is not None else 0,
-            dropped=flow.dropped if flow is not None else 0,
-        )
+    async def _service(self, service: str, name: str | None) -> tuple[Diagnosis, ...]:
+        """Walk the way of a service from each peer, or from one, to here."""
+        peers = [peer for peer in self._view.snapshot(frozenset()).peers if peer.state == "linked"]
+        if name is None:
+            offering = [p.guid for p in peers if (at := self._carrier(p)) and self._services.offers(at, service)]
+            found = await asyncio.gather(
+                *(self._calls(guid, service) for guid in offering or [p.guid for p in peers])
+            )
+            served = tuple(diagnosis for diagnosis in found if diagnosis.node)
+            here = self._view.snapshot(frozenset()).agent.name
+            return served or (self._services.nowhere(here, service, [p.name for p in peers]),)
+        return (await self._calls(name, service),)
+
+    async def _calls(self, name: str, service: str) -> Diagnosis:
+        snapshot = self._view.snapshot(frozenset())
+        peer = find_peer(snapshot, name)
+        attached = self._carrier(peer) if peer is not None else None
+        if peer is None or attached is None or attached.link.name != peer.name:
+            return walk_service(walk_peer(snapshot, name), snapshot.agent.name, name, service)
+        service, wire = self._topics.there(peer.name, service)
+        far: FarService | None = None
+        refusal = ""
+        try:
+            far = await self._ask(attached, SERVICE, {"service": wire}, FarService)
+        except RmpaError as error:
+            refusal = str(error)
+        near = await self._services.near(attached, service, wire)
+        begin = walk_peer(snapshot, name)
+        return walk_service(begin, snapshot.agent.name, peer.name, service, near, far, refusal)
+
+    async def _ask(
+        self, attached: Attached, what: str, args: dict[str, Any], kind: type[_T], limit: float = limits.ASK_TIMEOUT
+    ) -> _T:
+        value = await self._bridge.asks.ask(attached, what, args, limit)
+        try:
+            return msgspec.convert(value, kind)
+        except (msgspec.ValidationError, RecursionError) as error:
+            raise RemoteProtocolError(f"it answers in another way: {error}; is it another version?") from None
 
 
-def _gone(peer: str) -> Stage:
-    return Stage("link", Verdict.FAIL, f"the link to {peer} has just ended", "try again in a moment")
-
-
-def _topic(args: dict[str, Any]) -> str:
-    topic = args.get("topic")
-    if not isinstance(topic, str) or len(topic) > limits.CROSSING_NAME_MAX or not is_global_name(topic):
-        raise RemoteProtocolError("the question names no topic")
-    return topic
-
-
-def _convert(value: object, kind: type[_T]) -> _T:
-    try:
-        return msgspec.convert(value, kind)
-    except (msgspec.ValidationError, RecursionError) as error:
-        raise RemoteProtocolError(f"it answers in another way: {error}; is it another version?") from None
+def _no_link(peer: str) -> Stage:
+    remedy = "ask on its own machine; or try again in a moment"
+    return Stage("link", Verdict.FAIL, f"there is no link to {peer} that could be asked", remedy)

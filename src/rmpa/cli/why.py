@@ -26,24 +26,27 @@ Exit codes: 0 it flows; 1 it does not, and the first stage that fails says why.
 Examples:
   rmpa why joystick:/cmd          why /cmd of joystick does not come here
   rmpa why /odom                  every way of /odom, in and out
+  rmpa why arm:/move              why the service /move of arm cannot be called here
   rmpa why joystick:/cmd --json | jq '.[].stages[-1]'
 """
 
 
 @click.command(epilog=EPILOG)
-@click.argument("name", metavar="[PEER:]TOPIC")
+@click.argument("name", metavar="[PEER:]NAME")
+@click.option("-s", "--service", is_flag=True, help="A service is meant, though a topic has that name.")
 @json_option
 @agent_option
-def why(name: str, as_json: bool, agent: str | None) -> int:
-    """Say why a topic of a peer does not arrive here, and what to do.
+def why(name: str, service: bool, as_json: bool, agent: str | None) -> int:
+    """Say why a topic of a peer does not arrive here, or a service cannot be called, and what to do.
 
-    Both agents are asked, stage by stage from the publisher to the reader; what flows is looked at for a second.
+    Both agents are asked, stage by stage from the publisher to the reader; what flows is looked at for a second, and
+    a service's server is probed.
     PEER is a name or a GUID. Without PEER every module that publishes the topic is looked at, and for one of this
     module's own topics every peer says how it arrives there.
     """
     wanted = read_topic(name)
     with ControlClient(choose_agent(os.environ, agent).path, timeout=limits.CONTROL_HANDLER_TIMEOUT) as client:
-        found = client.call("why", tuple[Diagnosis, ...], name=wanted.topic, peer=wanted.peer)
+        found = client.call("why", tuple[Diagnosis, ...], name=wanted.topic, peer=wanted.peer, service=service)
     if as_json:
         print_json(found)
     else:
@@ -69,7 +72,7 @@ def _lines(diagnosis: Diagnosis) -> list[str]:
     lines += [_line(stage, width) for stage in diagnosis.stages]
     failed = diagnosis.failed
     if failed is None:
-        lines.append(_paint("it flows", Verdict.OK))
+        lines.append(_paint("it can be called" if diagnosis.kind == "service" else "it flows", Verdict.OK))
     else:
         lines.append(_paint(printable(f"it stops at: {failed.name}"), Verdict.FAIL))
         if failed.remedy:

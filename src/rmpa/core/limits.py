@@ -465,6 +465,8 @@ WHY_SILENT: Final = 2.0
 """A topic that was silent for less than this is not called so, whatever its rate."""
 WHY_SILENT_PERIODS: Final = 10.0
 """In its own longest usual periods, likewise."""
+WHY_PROBE: Final = 2.0
+"""For a service's server to answer a probe: it is on the same machine as the agent that asks."""
 WHY_SOURCES_MAX: Final = 64
 """Publishers of one topic in one module that ``rmpa why`` tells of."""
 PARAM_PORTION: Final = 16 * KIB

@@ -74,6 +74,7 @@ class FarSource(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         node: Its name.
+        topic: The topic's name in its own graph.
         type: Its message type; ``*`` where nobody has told it.
         crosses: Whether policy over there lets it cross to the one that asks.
         rule: The rule that says so.
@@ -85,6 +86,7 @@ class FarSource(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     node: str
+    topic: str = ""
     type: str = ""
     crosses: bool = True
     rule: str = ""
@@ -135,6 +137,9 @@ class Near:
     Args:
         snapshot: The agent's, of this topic at least.
         topic: The topic's name here.
+        carrier: The peer whose link brings it; another one where a relay passes it on.
+        only: The carrier's nodes that are the peer's; ``None`` for all.
+        proxies: What stands here for each node.
         registered: Nodes of the peer whose proxies are in the local graph as publishers of it.
         conflict: Nodes of the peer whose type is another one than that of the local publishers.
         readers: Who is connected to the proxy of each node of the peer.
@@ -143,6 +148,9 @@ class Near:
 
     snapshot: Snapshot
     topic: str
+    carrier: str = ""
+    only: frozenset[str] | None = None
+    proxies: Mapping[str, str] = field(default_factory=dict)
     registered: frozenset[str] = frozenset()
     conflict: frozenset[str] = frozenset()
     readers: Mapping[str, tuple[Reader, ...]] = field(default_factory=dict)

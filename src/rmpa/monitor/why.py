@@ -51,6 +51,9 @@ def walk_peer(snapshot: Snapshot, name: str) -> tuple[Stage, ...]:
     if peer.conflicts:
         remedy = "give each module a --name and an address of its own"
         return (Stage("peer", _FAIL, "; ".join(peer.conflicts), remedy),)
+    if peer.state == "relayed":
+        heard = Stage("peer", _OK, f"{peer.name} is known ({peer.guid})")
+        return (heard, Stage("link", _OK, f"no link of its own; {peer.via} passes on what it publishes"))
     found = Stage("peer", _OK, f"{peer.name} is known, by {peer.source or 'its link'} ({peer.guid})")
     if peer.state != "linked" or peer.link is None:
         return (found, _unlinked(peer))
@@ -132,7 +135,8 @@ def _nodes(sight: Sight, peer: str) -> list[str]:
 
 def _routes(near: Near, peer: str) -> list[RouteInfo]:
     topics = [topic for topic in near.snapshot.topics if topic.name == near.topic]
-    return [r for topic in topics for r in topic.routes if r.direction == "in" and r.peer == peer]
+    routes = [r for t in topics for r in t.routes if r.direction == "in" and r.peer == (near.carrier or peer)]
+    return [route for route in routes if near.only is None or route.node in near.only]
 
 
 def _far(sight: Sight | None, node: str) -> FarSource | None:
@@ -156,7 +160,9 @@ def _published(sight: Sight, peer: str, wire: str) -> Stage:
         return Stage("publisher", _FAIL, text, f"ask on {peer} itself: rostopic info {wire}")
     if far.sources:
         nodes = ", ".join(source.node for source in far.sources)
-        return Stage("publisher", _OK, f"{nodes} on {peer} publish{'' if len(far.sources) > 1 else 'es'} {wire}")
+        text = f"{nodes} on {peer} publish{'' if len(far.sources) > 1 else 'es'} {wire}"
+        others = {source.topic for source in far.sources} - {"", wire}
+        return Stage("publisher", _OK, f"{text} ({', '.join(sorted(others))} over there)" if others else text)
     text = f"no node of {peer} publishes {wire}"
     if far.subscribers:
         text += f"; {', '.join(far.subscribers)} there only subscribe to it"
@@ -217,7 +223,8 @@ def _policy_here(near: Near, route: RouteInfo) -> Stage:
     if route.state == "hidden" and route.node not in near.conflict:
         remedy = "change [bridge] in this module's rmpa.toml, and `rmpa reload`"
         return Stage("policy here", _FAIL, f"this module does not take it: {route.problem}", remedy)
-    return Stage("policy here", _OK, f"it is shown as {near.topic}")
+    was = f" (its {route.wire})" if route.wire else ""
+    return Stage("policy here", _OK, f"this module takes it as {near.topic}{was}")
 
 
 def _type(near: Near, route: RouteInfo) -> Stage:
@@ -228,11 +235,12 @@ def _type(near: Near, route: RouteInfo) -> Stage:
 
 
 def _in_graph(near: Near, route: RouteInfo) -> Stage:
+    proxy = near.proxies.get(route.node, f"/rmpa/{route.peer}{route.node}")
     if route.node not in near.registered:
-        text = f"its proxy /rmpa/{route.peer}{route.node} is not in the local graph as a publisher of {near.topic}"
+        text = f"its proxy {proxy} is not in the local graph as a publisher of {near.topic}"
         remedy = f"it is put there again within {limits.RECONCILE_INTERVAL:g} s; if not, the agent's log says why"
         return Stage("graph", _FAIL, text, remedy)
-    return Stage("graph", _OK, f"its proxy /rmpa/{route.peer}{route.node} stands in the local graph")
+    return Stage("graph", _OK, f"its proxy {proxy} stands in the local graph")
 
 
 def _subscriber(near: Near, route: RouteInfo) -> Iterator[Stage]:

@@ -1,0 +1,130 @@
+"""What this agent knows of one service on its way: for its own user, and for the agent at the other end."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rmpa.agent.why_topics import name_in
+from rmpa.bridge.naming import Names
+from rmpa.bridge.policy import OWN_NODE, Policy, is_own
+from rmpa.bridge.service_rules import ServiceRules
+from rmpa.core import limits
+from rmpa.core.config_values import did_you_mean
+from rmpa.core.errors import RmpaError
+from rmpa.monitor.diagnosis import Diagnosis, Stage, Verdict
+from rmpa.monitor.why_services import FarService, NearService
+from rmpa.ros.aio.service_client import ServiceConnection
+
+if TYPE_CHECKING:
+    from rmpa.bridge.aio.bridge import Attached, Bridge
+    from rmpa.bridge.aio.services import Services
+    from rmpa.core.config import Settings
+    from rmpa.ros.aio.core_api import Core
+
+
+class ServiceFacts:
+    """Reads the rooms, and probes servers; changes nothing.
+
+    Args:
+        settings: The agent's.
+        core: Its ROS core.
+        bridge: Its bridge.
+        services: The bridge's part for services.
+    """
+
+    def __init__(self, settings: Settings, core: Core, bridge: Bridge, services: Services) -> None:
+        self._core = core
+        self._bridge = bridge
+        self._services = services
+        self.reload(settings)
+
+    def reload(self, settings: Settings) -> None:
+        """Other settings hold from now on."""
+        policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.peers)
+        self._rules = ServiceRules(settings.services, policy, names)
+
+    def known(self, service: str) -> bool:
+        """Whether some peer offers a service, by its name here."""
+        return any(remote.name == service for _, remote in self._services.imports)
+
+    def offers(self, attached: Attached, service: str) -> bool:
+        """Whether this peer does."""
+        return self._services.imports.get(attached.peer, service) is not None
+
+    def nowhere(self, here: str, service: str, linked: list[str]) -> Diagnosis:
+        """No peer has it."""
+        state = self._core.state()
+        own = [node for node in state.services.get(service, {}) if not is_own(node)]
+        near = did_you_mean(service, {*state.services})
+        text = f"no linked peer ({', '.join(linked) or 'there is none'}) provides {service}"
+        remedy = f"did you mean {near}?" if near else "`rosservice list` shows what there is, `rmpa peer list` who"
+        if own:
+            text = f"{own[0]} of this module provides {service}; clients here call it without us"
+            remedy = f"whether another module may call it: `rmpa why {here}:{service}` over there"
+        stage = Stage("server", Verdict.FAIL, text, remedy)
+        return Diagnosis(kind="service", name=service, peer="", to=here, flows=False, stages=(stage,))
+
+    async def near(self, attached: Attached, service: str, wire: str) -> NearService:
+        """What is known here of a service of a peer; a client's probe is sent to what stands for it."""
+        remote = self._services.imports.get(attached.peer, service)
+        if remote is None:
+            return NearService(wire=wire)
+        shown = self._services.shown(attached.peer, service)
+        if shown is None or shown.proxy is None:
+            return NearService(wire=wire, offered=True, node=remote.node, hidden=remote.hidden)
+        uri = self._core.state().services.get(service, {}).get(shown.proxy.name, "")
+        answer, refusal = await _probe(uri, service) if uri else ("", "")
+        return NearService(
+            wire=wire,
+            offered=True,
+            node=remote.node,
+            hidden=remote.hidden,
+            registered=bool(uri),
+            answer=answer,
+            refusal=refusal,
+            calls=shown.stats.calls,
+            failed=shown.stats.failed,
+            problem=shown.stats.problem,
+            mismatch=shown.mismatch,
+        )
+
+    async def tell(self, attached: Attached, args: dict[str, Any]) -> FarService:
+        """Answer the agent of those who would call a service; ours is asked whether it is alive.
+
+        Args:
+            attached: Who asks.
+            args: ``service``: its name on the way.
+        """
+        wire = name_in(args, "service")
+        peer = attached.link.name
+        seen = self._services.exports.seen
+        for service in self._bridge.names.of(peer).locals_of(wire):
+            server = seen.get(service)
+            if server is None:
+                continue
+            decision = self._rules.judge(service, server.node)
+            if decision.allowed:
+                special = self._rules.judge_for(peer, service, wire)
+                decision = special if special.rule else decision
+            _, refusal = await _probe(server.uri, service)
+            return FarService(
+                node=server.node,
+                service=service,
+                crosses=decision.allowed,
+                rule=decision.rule,
+                refusal=refusal,
+            )
+        known = {self._rules.wire_name(peer, service) for service in seen}
+        return FarService(near=did_you_mean(wire, known) or "")
+
+
+async def _probe(uri: str, service: str) -> tuple[str, str]:
+    """What a server says of its service, and why it does not; as ``rospy.wait_for_service`` asks."""
+    try:
+        found = await ServiceConnection.open(
+            uri, service, OWN_NODE, probe=True, persistent=False, timeout=limits.WHY_PROBE
+        )
+    except RmpaError as error:
+        return "", str(error)
+    found.close()
+    return f"{found.description.type}, md5 {found.description.md5sum}", ""

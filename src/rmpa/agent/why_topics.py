@@ -1,0 +1,187 @@
+"""What this agent knows of one topic on its way: for its own user, and for the agent at the other end."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rmpa.bridge.messages import Source
+from rmpa.bridge.policy import Policy, is_own
+from rmpa.bridge.proxy_names import proxy_name
+from rmpa.core import limits
+from rmpa.core.config_values import did_you_mean
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.names import is_global_name
+from rmpa.monitor.diagnosis import FarSource, FarTopic, Near, Reader
+from rmpa.ros.tcpros import printable
+
+if TYPE_CHECKING:
+    from rmpa.agent.view import View
+    from rmpa.bridge.aio.bridge import Attached, Bridge
+    from rmpa.core.config import Settings
+    from rmpa.monitor.snapshot import PeerInfo
+    from rmpa.ros.aio.core_api import Core
+
+
+class TopicFacts:
+    """Reads the rooms; changes nothing.
+
+    Args:
+        settings: The agent's.
+        core: Its ROS core.
+        bridge: Its bridge.
+        view: Its snapshots.
+    """
+
+    def __init__(self, settings: Settings, core: Core, bridge: Bridge, view: View) -> None:
+        self._core = core
+        self._bridge = bridge
+        self._view = view
+        self.reload(settings)
+
+    def reload(self, settings: Settings) -> None:
+        """Other settings hold from now on."""
+        self._policy = Policy(settings.policy, settings.peers, settings.time)
+
+    def own(self, topic: str) -> dict[str, str]:
+        """The module's own publishers of a topic, and their addresses."""
+        return {node: uri for node, uri in self._core.publishers(topic).items() if not is_own(node)}
+
+    def there(self, peer: str, topic: str) -> tuple[str, str]:
+        """A topic of a peer, as a user names it: its name here, and over there.
+
+        Where the rules for that peer leave nothing that has this name here, it is taken for the peer's own name.
+        """
+        names = self._bridge.names.of(peer)
+        wires = names.wires_of(topic)
+        return (topic, wires[0]) if wires else (names.local_name(topic), topic)
+
+    def near(self, attached: Attached | None, peer: PeerInfo | None, topic: str) -> Near:
+        """What is known here of a topic that a peer publishes.
+
+        Args:
+            attached: Whose link brings it, if one does.
+            peer: Whose it is.
+            topic: Its name here.
+        """
+        snapshot = self._view.snapshot(frozenset({topic}))
+        if attached is None or peer is None:
+            return Near(snapshot, topic)
+        only, registered, conflict = set(), set(), set()
+        readers, mismatches, proxies = {}, {}, {}
+        publishers, standing = self._core.publishers(topic), dict(attached.inbound)
+        for number, source in list(self._bridge.imports.at(topic)):
+            entry = self._bridge.imports.get(number, source)
+            if number != attached.peer or entry is None:
+                continue
+            if (entry.origin.instance if entry.origin else attached.link.identity.instance.hex()) != peer.instance:
+                continue
+            node = source.node
+            only.add(node)
+            if entry.conflict:
+                conflict.add(node)
+            name = attached.inbound.names.get(node) or proxy_name(attached.inbound.prefix, node)
+            proxies[node] = name
+            if node in standing and publishers.get(name) == standing[node].node.uri:
+                registered.add(node)
+            readers[node] = self._readers(attached, source)
+            mismatches[node] = self._bridge.mismatches(source)
+        return Near(
+            snapshot,
+            topic,
+            attached.link.name,
+            frozenset(only),
+            proxies,
+            frozenset(registered),
+            frozenset(conflict),
+            readers,
+            mismatches,
+        )
+
+    @staticmethod
+    def _readers(attached: Attached, source: Source) -> tuple[Reader, ...]:
+        publication = attached.inbound.publication(source)
+        return tuple(
+            Reader(
+                number=link.number,
+                node=printable(link.other),
+                held=not link.connected,
+                messages=link.messages,
+                waiting=link.waiting,
+                dropped=link.dropped,
+            )
+            for link in (publication.connections() if publication is not None else ())
+        )
+
+    def tell(self, attached: Attached, args: dict[str, Any]) -> FarTopic:
+        """Answer the agent that should receive a topic.
+
+        Args:
+            attached: Who asks.
+            args: ``topic``: its name on the way; ``instance``: the module whose it is, if we only relay it.
+        """
+        wire = name_in(args, "topic")
+        instance = args.get("instance") or ""
+        asker = attached.link.name
+        names = self._bridge.names.of(asker)
+        state = self._core.state()
+        sources: list[FarSource] = []
+        subscribers: list[str] = []
+        for topic in names.locals_of(wire):
+            kind = self._core.type_of(topic)
+            nodes = self._relayed(topic, instance) if instance else list(self.own(topic))
+            if names.wire_name(topic, kind) == wire:
+                sources += [self._far(attached, Source(topic, node), wire) for node in nodes]
+                subscribers += [node for node in state.subscribers.get(topic, {}) if not is_own(node)]
+        known = {
+            names.wire_name(topic, state.types.get(topic, ""))
+            for topic, nodes in state.publishers.items()
+            if not all(map(is_own, nodes))
+        }
+        return FarTopic(
+            sources=tuple(sources[: limits.WHY_SOURCES_MAX]),
+            subscribers=tuple(subscribers[: limits.WHY_SOURCES_MAX]),
+            near="" if sources else did_you_mean(wire, known) or "",
+        )
+
+    def _relayed(self, topic: str, instance: object) -> list[str]:
+        """What stands here for the nodes of a module whose topic we pass on."""
+        return [
+            source.node
+            for source, local in self._bridge.exports.offered.items()
+            if source.topic == topic and local.origin is not None and local.origin.instance == instance
+        ]
+
+    def _far(self, attached: Attached, source: Source, wire: str) -> FarSource:
+        exports = self._bridge.exports
+        local = exports.offered.get(source)
+        kind = local.type if local is not None else self._core.type_of(source.topic)
+        node = source.node if local is None or local.origin is None else local.origin.node
+        decision = self._policy.judge(source.topic, kind, node)
+        if decision.allowed:
+            special = self._policy.judge_for(attached.link.name, source.topic, kind, wire)
+            decision = special if special.rule else decision
+        flow = self._bridge.outbound.flows.get(source)
+        opening = exports.contract(source, attached.peer) is not None
+        return FarSource(
+            node=source.node,
+            topic=source.topic,
+            type=kind,
+            crosses=decision.allowed,
+            rule=decision.rule,
+            offered=exports.offer(attached.peer, source) is not None,
+            route="open" if attached.peer in exports.flowing(source) else "opening" if opening else "",
+            messages=flow.messages if flow is not None else 0,
+            dropped=flow.dropped if flow is not None else 0,
+        )
+
+
+def name_in(args: dict[str, Any], key: str) -> str:
+    """A name in a question of another agent.
+
+    Raises:
+        RemoteProtocolError: It is none.
+    """
+    name = args.get(key)
+    if not isinstance(name, str) or len(name) > limits.CROSSING_NAME_MAX or not is_global_name(name):
+        raise RemoteProtocolError(f"the question names no {key}")
+    return name
