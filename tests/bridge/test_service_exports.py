@@ -1,0 +1,200 @@
+"""What peers are told of our services, and what they may open."""
+
+from __future__ import annotations
+
+import pytest
+
+from rmpa.bridge.actions import Send, Warn
+from rmpa.bridge.messages import (
+    AdvertiseServices,
+    CloseService,
+    OpenService,
+    ServiceClosed,
+    ServiceOffer,
+    ServiceOpened,
+)
+from rmpa.bridge.service_exports import (
+    About,
+    EndRoute,
+    LocalService,
+    Probe,
+    ServerGone,
+    ServeRoute,
+    ServiceExports,
+)
+from rmpa.core import limits
+from rmpa.core.config import PeerRule, PolicySettings, ServiceSettings
+from rmpa.core.errors import RemoteProtocolError
+from tests.bridge.test_service_rules import rules
+
+ADD = LocalService("/adder", "rosrpc://127.0.0.1:5")
+ABOUT = About("a/Add", "6a2e34150c00229791cc89ff309fff21")
+ROUTE = limits.SERVICE_ROUTES + 1
+
+
+def told(exports: ServiceExports, peer: int = 1) -> list[AdvertiseServices]:
+    found = []
+    while exports.untold:
+        found += [a.message for a in exports.tell() if isinstance(a, Send) and a.peer == peer]
+    return found
+
+
+def opened(exports: ServiceExports) -> int:
+    """Let peer 1 open /add; our route for its requests."""
+    assert exports.opened(1, OpenService(ROUTE, "/add", 2.0)) == [Probe("/add", ADD)]
+    serve, send = exports.described("/add", ADD, ABOUT)
+    assert isinstance(serve, ServeRoute)
+    assert send == Send(1, ServiceOpened(ROUTE, serve.requests, ABOUT.type, ABOUT.md5))
+    assert serve == ServeRoute(1, ROUTE, serve.requests, "/add", ADD, 2.0)
+    return serve.requests
+
+
+@pytest.fixture
+def exports() -> ServiceExports:
+    made = ServiceExports(rules())
+    made.graph("/add", ADD)
+    made.link_up(1, "base")
+    return made
+
+
+def test_a_link_begins_with_all_of_it_in_portions() -> None:
+    made = ServiceExports(rules())
+    count = 2 * limits.ADVERTISED_AT_ONCE + 1
+    for number in range(count):
+        made.graph(f"/s{number}", LocalService("/n", "rosrpc://127.0.0.1:5"))
+    (first,) = made.link_up(1, "base")
+    assert isinstance(first, Send)
+    messages = [first.message, *told(made)]
+    assert [(m.full, m.more) for m in messages] == [(True, True), (False, True), (False, False)]  # type: ignore[union-attr]
+    assert len({offer.service for m in messages for offer in m.added}) == count  # type: ignore[union-attr]
+
+
+def test_an_empty_graph_is_told_too() -> None:
+    made = ServiceExports(rules())
+    assert made.link_up(1, "base") == [Send(1, AdvertiseServices(full=True))]
+    assert told(made) == []
+
+
+def test_changes_are_told_once(exports: ServiceExports) -> None:
+    exports.graph("/sub", LocalService("/n", "rosrpc://127.0.0.1:6"))
+    exports.graph("/add", None)
+    assert told(exports) == [AdvertiseServices((ServiceOffer("/sub", "/n"),), ("/add",))]
+    exports.graph("/sub", LocalService("/n", "rosrpc://127.0.0.1:6"))
+    exports.graph("/gone", ADD)
+    exports.graph("/gone", None)
+    assert told(exports) == []
+
+
+def test_a_server_at_another_address_is_told_again_and_its_routes_end(exports: ServiceExports) -> None:
+    requests = opened(exports)
+    again = LocalService("/adder", "rosrpc://127.0.0.1:7")
+    assert exports.graph("/add", again) == [
+        EndRoute(1, ROUTE, requests),
+        Send(1, ServiceClosed(ROUTE, "/add: its server has restarted")),
+        ServerGone("/add"),
+    ]
+    assert told(exports) == [AdvertiseServices((ServiceOffer("/add", "/adder"),))]
+    assert exports.opened(1, OpenService(ROUTE, "/add")) == [Probe("/add", again)]
+    assert exports.described("/add", ADD, ABOUT) == [], "the answer of the one before"
+
+
+def test_what_policy_keeps_home_is_not_told_and_not_opened() -> None:
+    made = ServiceExports(rules(ServiceSettings(deny=("/add",))))
+    made.graph("/add", ADD)
+    made.graph("/n/get_loggers", ADD)
+    assert made.link_up(1, "base") == [Send(1, AdvertiseServices(full=True))]
+    (answer,) = made.opened(1, OpenService(ROUTE, "/add"))
+    assert isinstance(answer, Send)
+    assert isinstance(answer.message, ServiceClosed)
+    assert "policy keeps it home" in answer.message.reason
+    assert made.seen == {"/add": ADD, "/n/get_loggers": ADD}
+
+
+def test_a_service_is_opened_at_once_when_its_server_is_known(exports: ServiceExports) -> None:
+    first = opened(exports)
+    exports.link_up(2, "arm")
+    serve, send = exports.opened(2, OpenService(ROUTE, "/add"))
+    assert isinstance(serve, ServeRoute)
+    assert isinstance(send, Send)
+    assert (serve.peer, serve.timeout, send.peer) == (2, limits.SERVICE_TIMEOUT, 2)
+    assert exports.callers("/add") == (1, 2)
+    assert exports.closed(1, CloseService(ROUTE)) == [EndRoute(1, ROUTE, first)]
+    assert exports.closed(1, CloseService(ROUTE)) == [], "words that crossed"
+    assert exports.callers("/add") == (2,)
+
+
+def test_one_probe_answers_all_who_wait(exports: ServiceExports) -> None:
+    exports.link_up(2, "arm")
+    assert exports.opened(1, OpenService(ROUTE, "/add")) == [Probe("/add", ADD)]
+    assert exports.opened(2, OpenService(ROUTE, "/add")) == []
+    assert exports.refused("/add", "no answer") == [
+        Send(1, ServiceClosed(ROUTE, "no answer")),
+        Send(2, ServiceClosed(ROUTE, "no answer")),
+    ]
+    assert exports.opened(1, OpenService(ROUTE, "/add")) == [Probe("/add", ADD)], "whoever asks again has another try"
+
+
+def test_requests_never_share_a_route_and_are_even(exports: ServiceExports) -> None:
+    exports.graph("/sub", ADD)
+    first = opened(exports)
+    exports.opened(1, OpenService(ROUTE + 2, "/sub"))
+    told(exports)
+    exports.opened(1, OpenService(ROUTE + 4, "/sub"))
+    serve = next(a for a in exports.described("/sub", ADD, ABOUT) if isinstance(a, ServeRoute))
+    assert {first % 2, serve.requests % 2} == {0}
+    assert first != serve.requests
+
+
+def test_a_link_that_is_gone_ends_its_routes(exports: ServiceExports) -> None:
+    requests = opened(exports)
+    assert exports.link_down(1) == [EndRoute(1, ROUTE, requests)]
+    assert exports.link_down(1) == []
+    assert exports.described("/add", ADD, ABOUT) == []
+
+
+def test_one_route_for_two_services_breaks_the_protocol(exports: ServiceExports) -> None:
+    exports.opened(1, OpenService(ROUTE, "/add"))
+    with pytest.raises(RemoteProtocolError):
+        exports.opened(1, OpenService(ROUTE, "/add"))
+
+
+def test_too_many_services_stay_home(exports: ServiceExports, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "SERVICES_PER_PEER_MAX", 1)
+    (warning,) = exports.graph("/sub", ADD)
+    assert isinstance(warning, Warn)
+    assert "/sub stays home" in warning.text
+    assert told(exports) == []
+
+
+def test_names_on_the_way_are_each_peers_own() -> None:
+    peers = (PeerRule("robot", prefix="/robot1"), PeerRule("deaf", policy=PolicySettings(deny=("/robot1/**",))))
+    made = ServiceExports(rules(peers=peers))
+    made.graph("/robot1/go", ADD)
+    (robot,), (deaf,), (base,) = (made.link_up(n, name) for n, name in enumerate(("robot", "deaf", "base")))
+    assert robot == Send(0, AdvertiseServices((ServiceOffer("/go", "/adder"),), full=True))
+    assert deaf == Send(1, AdvertiseServices(full=True))
+    assert base == Send(2, AdvertiseServices((ServiceOffer("/robot1/go", "/adder"),), full=True))
+    assert made.opened(0, OpenService(ROUTE, "/go")) == [Probe("/robot1/go", ADD)]
+    (refused,) = made.opened(1, OpenService(ROUTE, "/robot1/go"))
+    assert isinstance(refused, Send)
+
+
+def test_two_names_that_would_be_one_over_there_are_told_once() -> None:
+    made = ServiceExports(rules(peers=(PeerRule("robot", prefix="/robot1"),)))
+    made.graph("/go", ADD)
+    made.graph("/robot1/go", LocalService("/other", "rosrpc://127.0.0.1:6"))
+    made.link_up(0, "robot")
+    assert made.opened(0, OpenService(ROUTE, "/go")) == [Probe("/go", ADD)]
+    assert told(made, 0) == []
+
+
+def test_other_rules_touch_only_what_they_change(exports: ServiceExports) -> None:
+    exports.graph("/sub", ADD)
+    told(exports)
+    requests = opened(exports)
+    assert exports.obey(rules(ServiceSettings(deny=("/sub",)))) == [ServerGone("/sub")]
+    assert told(exports) == [AdvertiseServices(removed=("/sub",))]
+    assert exports.callers("/add") == (1,)
+    gone = exports.obey(rules(ServiceSettings(deny=("/add",))))
+    assert EndRoute(1, ROUTE, requests) in gone
+    assert told(exports) == [AdvertiseServices((ServiceOffer("/sub", "/adder"),), ("/add",))]

@@ -1,0 +1,54 @@
+"""What of services may cross, what it is called, and how long a call may take."""
+
+from __future__ import annotations
+
+import pytest
+
+from rmpa.bridge.naming import Names
+from rmpa.bridge.policy import Policy
+from rmpa.bridge.service_rules import ServiceRules
+from rmpa.core.config import PeerRule, PolicySettings, ServiceRule, ServiceSettings
+
+
+def rules(settings: ServiceSettings | None = None, peers: tuple[PeerRule, ...] = ()) -> ServiceRules:
+    return ServiceRules(settings or ServiceSettings(), Policy(PolicySettings(), peers), Names(peers))
+
+
+@pytest.mark.parametrize(
+    ("settings", "service", "node", "allowed", "rule"),
+    [
+        (ServiceSettings(), "/add", "/adder", True, "services.allow has '/**'"),
+        (ServiceSettings(), "/add", "/rmpa/base/adder", False, "stands for a node of another module"),
+        (ServiceSettings(), "/rmpa/get_loggers", "/adder", False, "the agent's own services"),
+        (ServiceSettings(), "/adder/get_loggers", "/adder", False, "services.loggers = true"),
+        (ServiceSettings(), "/adder/set_logger_level", "/adder", False, "services.loggers = true"),
+        (ServiceSettings(loggers=True), "/adder/get_loggers", "/adder", True, "services.allow"),
+        (ServiceSettings(deny=("/arm/**",)), "/arm/go", "/arm", False, "services.deny has '/arm/**'"),
+        (ServiceSettings(allow=("/arm/**",)), "/add", "/adder", False, "no glob of services.allow fits /add"),
+        (ServiceSettings(allow=("/arm/**",), deny=("/arm/stop",)), "/arm/stop", "/arm", False, "services.deny"),
+        (ServiceSettings(allow=()), "/add", "/adder", False, "no glob of services.allow"),
+    ],
+)
+def test_each_decision_names_its_rule(
+    settings: ServiceSettings, service: str, node: str, allowed: bool, rule: str
+) -> None:
+    decision = rules(settings).judge(service, node)
+    assert decision.allowed is allowed
+    assert rule in decision.rule
+
+
+def test_rules_of_one_peer_come_on_top() -> None:
+    peers = (PeerRule("robot*", prefix="/robot1", policy=PolicySettings(deny=("/robot1/stop",))),)
+    made = rules(peers=peers)
+    assert made.local_name("robot_7", "/stop") == "/robot1/stop"
+    assert made.wire_name("robot_7", "/robot1/go") == "/go"
+    assert made.local_name("base", "/stop") == "/stop"
+    assert not made.judge_for("robot_7", "/robot1/stop", "/stop").allowed
+    assert made.judge_for("base", "/robot1/stop", "/robot1/stop").allowed
+
+
+def test_the_first_rule_that_fits_says_how_long_a_call_may_take() -> None:
+    made = rules(
+        ServiceSettings(timeout=5.0, rules=(ServiceRule(("/plan/**",), 300.0), ServiceRule(("/plan/quick",), 1.0)))
+    )
+    assert [made.timeout(service) for service in ("/add", "/plan/path", "/plan/quick")] == [5.0, 300.0, 300.0]

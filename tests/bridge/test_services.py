@@ -1,0 +1,221 @@
+"""Which of the peers' services are shown, and how one is opened."""
+
+from __future__ import annotations
+
+import pytest
+
+from rmpa.bridge.actions import Send, Warn
+from rmpa.bridge.messages import (
+    AdvertiseServices,
+    CloseService,
+    OpenService,
+    ServiceClosed,
+    ServiceOffer,
+    ServiceOpened,
+)
+from rmpa.bridge.service_exports import About
+from rmpa.bridge.services import (
+    EndedService,
+    ForgetAbout,
+    OpenedService,
+    Provide,
+    ServiceImports,
+    SessionState,
+    Withdraw,
+)
+from rmpa.core import limits
+from rmpa.core.config import PeerRule, PolicySettings, ServiceSettings
+from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
+from tests.bridge.test_service_rules import rules
+
+MD5 = "6a2e34150c00229791cc89ff309fff21"
+ROUTE = limits.SERVICE_ROUTES + 1
+REQUESTS = limits.SERVICE_ROUTES + 2
+
+
+def offer(*services: str, node: str = "/n", full: bool = False, more: bool = False) -> AdvertiseServices:
+    return AdvertiseServices(tuple(ServiceOffer(service, node) for service in services), (), full, more)
+
+
+@pytest.fixture
+def imports() -> ServiceImports:
+    """One peer with one service."""
+    made = ServiceImports(rules())
+    made.link_up(1, "base", 10)
+    assert made.advertised(1, offer("/add", full=True)) == [Provide(1, "/add", "/n")]
+    return made
+
+
+def opened(imports: ServiceImports) -> None:
+    assert imports.want(1, "/add", 0.0) == [Send(1, OpenService(ROUTE, "/add"))]
+    assert imports.opened(1, ServiceOpened(ROUTE, REQUESTS, "a/Add", MD5)) == [
+        OpenedService(1, "/add", ROUTE, REQUESTS, About("a/Add", MD5))
+    ]
+
+
+def hidden(imports: ServiceImports, peer: int, service: str = "/add") -> str:
+    remote = imports.get(peer, service)
+    assert remote is not None
+    assert remote.shown is not bool(remote.hidden)
+    return remote.hidden
+
+
+def test_a_local_service_always_comes_first(imports: ServiceImports) -> None:
+    opened(imports)
+    reason = "/mine of this module provides it itself"
+    assert imports.local("/add", "/mine") == [
+        Send(1, CloseService(ROUTE)),
+        EndedService(1, "/add", ROUTE, REQUESTS, reason),
+        Withdraw(1, "/add", "/n", reason),
+    ]
+    assert hidden(imports, 1) == reason
+    assert imports.local("/add", None) == [Provide(1, "/add", "/n")]
+    assert imports.local("/other", "/mine") == []
+    assert imports.advertised(1, offer("/other")) == []
+    assert "provides it itself" in hidden(imports, 1, "/other")
+
+
+def test_of_several_peers_the_lowest_guid_is_shown(imports: ServiceImports) -> None:
+    imports.link_up(2, "arm", 5)
+    text = "arm provides it too, and is shown: its GUID is lower"
+    assert imports.advertised(2, offer("/add", full=True)) == [
+        Withdraw(1, "/add", "/n", text),
+        Provide(2, "/add", "/n"),
+    ]
+    imports.link_up(3, "leg", 7)
+    assert imports.advertised(3, offer("/add", full=True)) == []
+    assert (hidden(imports, 1), hidden(imports, 3)) == (text, text)
+    assert imports.gone(2) == [Withdraw(2, "/add", "/n", "arm is gone"), Provide(3, "/add", "/n")]
+    assert imports.advertised(3, AdvertiseServices(removed=("/add",)))[-1] == Provide(1, "/add", "/n")
+
+
+def test_policy_hides_here_too() -> None:
+    made = ServiceImports(rules(ServiceSettings(deny=("/add",)), (PeerRule("arm", policy=PolicySettings(allow=())),)))
+    made.link_up(1, "base", 1)
+    made.link_up(2, "arm", 2)
+    assert made.advertised(1, offer("/add", "/sub", full=True)) == [Provide(1, "/sub", "/n")]
+    assert made.advertised(2, offer("/mul", "/n/get_loggers", full=True)) == []
+    assert hidden(made, 1) == "policy: services.deny has '/add'"
+    assert 'peer "arm".allow' in hidden(made, 2, "/mul")
+    assert "loggers" in hidden(made, 2, "/n/get_loggers")
+
+
+def test_an_opened_service_is_known_until_its_server_is_another_one(imports: ServiceImports) -> None:
+    opened(imports)
+    assert imports.want(1, "/add", 1.0) == [], "it is open"
+    closing = imports.release(1, "/add")
+    assert closing[0] == Send(1, CloseService(ROUTE))
+    remote = imports.get(1, "/add")
+    assert remote is not None
+    assert remote.about == About("a/Add", MD5)
+    assert imports.advertised(1, offer("/add")) == [ForgetAbout(1, "/add")]
+    assert remote.about is None
+    assert imports.want(1, "/add", 2.0) == [Send(1, OpenService(ROUTE + 2, "/add"))], "a route is never used again"
+
+
+def test_a_peer_that_does_not_answer_is_given_up(imports: ServiceImports) -> None:
+    imports.want(1, "/add", 3.0)
+    due = imports.next_timer()
+    assert due == 3.0 + limits.ROUTE_OPEN_TIMEOUT
+    assert imports.handle_timer(due - 0.1) == []
+    text = "the agent of base does not answer"
+    assert imports.handle_timer(due) == [Send(1, CloseService(ROUTE)), EndedService(1, "/add", ROUTE, 0, text)]
+    assert imports.next_timer() is None
+    assert imports.opened(1, ServiceOpened(ROUTE, REQUESTS, "a/Add", MD5)) == [], "too late"
+
+
+def test_a_refusal_ends_the_attempt(imports: ServiceImports) -> None:
+    imports.want(1, "/add", 0.0)
+    assert imports.closed(1, ServiceClosed(ROUTE, "no")) == [EndedService(1, "/add", ROUTE, 0, "no")]
+    assert imports.closed(1, ServiceClosed(ROUTE, "no")) == []
+    remote = imports.get(1, "/add")
+    assert remote is not None
+    assert (remote.state, remote.problem) == (SessionState.IDLE, "no")
+
+
+def test_a_link_that_falls_ends_calls_and_keeps_services_until_the_peer_is_gone(imports: ServiceImports) -> None:
+    opened(imports)
+    assert imports.link_down(1) == [EndedService(1, "/add", ROUTE, REQUESTS, "the link to base was lost")]
+    assert imports.is_away(1)
+    assert hidden(imports, 1) == ""
+    with pytest.raises(LocalProtocolError):
+        imports.want(1, "/add", 1.0)
+    assert imports.link_up(1, "base", 10) == []
+    assert imports.advertised(1, offer("/add", full=True)) == [ForgetAbout(1, "/add")]
+    opened(imports)  # routes are counted by link
+    assert imports.gone(1)[-1] == Withdraw(1, "/add", "/n", "base is gone")
+    assert imports.gone(1) == []
+    assert list(imports) == []
+
+
+def test_what_a_returning_peer_no_longer_has_goes_when_it_has_said_all(imports: ServiceImports) -> None:
+    imports.advertised(1, offer("/sub", "/mul"))
+    imports.link_down(1)
+    imports.link_up(1, "base", 10)
+    assert imports.advertised(1, offer("/sub", full=True, more=True)) == [ForgetAbout(1, "/sub")]
+    gone = imports.advertised(1, offer("/div"))
+    assert gone[0] == Provide(1, "/div", "/n")
+    assert {a.service for a in gone[1:] if isinstance(a, Withdraw)} == {"/add", "/mul"}
+
+
+def test_another_node_in_its_place_is_another_service(imports: ServiceImports) -> None:
+    assert imports.advertised(1, offer("/add", node="/m")) == [
+        Withdraw(1, "/add", "/n", "another node of base provides it now"),
+        Provide(1, "/add", "/m"),
+    ]
+
+
+def test_opened_twice_breaks_the_protocol(imports: ServiceImports) -> None:
+    opened(imports)
+    with pytest.raises(RemoteProtocolError):
+        imports.opened(1, ServiceOpened(ROUTE, REQUESTS, "a/Add", MD5))
+
+
+def test_what_is_not_shown_is_not_opened(imports: ServiceImports) -> None:
+    imports.local("/add", "/mine")
+    for service in ("/add", "/nothing"):
+        with pytest.raises(LocalProtocolError):
+            imports.want(1, service, 0.0)
+    assert imports.release(1, "/add") == imports.release(7, "/nothing") == []
+
+
+def test_bounds_of_one_peer(imports: ServiceImports, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "NODES_PER_PEER_MAX", 1)
+    assert imports.advertised(1, offer("/sub", node="/second")) == []
+    assert "more than 1 nodes" in hidden(imports, 1, "/sub")
+    monkeypatch.setattr(limits, "SERVICES_PER_PEER_MAX", 2)
+    (warning,) = imports.advertised(1, offer("/mul"))
+    assert isinstance(warning, Warn)
+
+
+def test_names_here_are_made_by_the_peers_rules() -> None:
+    made = ServiceImports(rules(peers=(PeerRule("robot", prefix="/robot1"),)))
+    made.link_up(1, "robot", 1)
+    assert made.advertised(1, offer("/go", full=True)) == [Provide(1, "/robot1/go", "/n")]
+    assert made.want(1, "/robot1/go", 0.0) == [Send(1, OpenService(ROUTE, "/go"))]
+    made.closed(1, ServiceClosed(ROUTE, "no"))
+    changed = made.obey(rules(peers=(PeerRule("robot", prefix="/r"),)))
+    assert [type(action) for action in changed] == [Withdraw, Provide]
+    assert made.get(1, "/r/go") is not None
+    assert made.get(1, "/robot1/go") is None
+
+
+def test_two_of_one_peer_that_would_have_one_name_here() -> None:
+    from rmpa.core.config import Remap
+
+    made = ServiceImports(rules(peers=(PeerRule("robot", remap_in=(Remap("/a", "/b"),)),)))
+    made.link_up(1, "robot", 1)
+    assert made.advertised(1, offer("/a", "/b", full=True)) == [Provide(1, "/b", "/n")]
+    second = [remote for _, remote in made if not remote.shown]
+    assert "has this name here already" in second[0].hidden
+
+
+def test_other_rules_touch_only_what_they_change(imports: ServiceImports) -> None:
+    imports.advertised(1, offer("/sub"))
+    opened(imports)
+    (gone,) = imports.obey(rules(ServiceSettings(deny=("/sub",))))
+    assert gone == Withdraw(1, "/sub", "/n", "policy: services.deny has '/sub'")
+    remote = imports.get(1, "/add")
+    assert remote is not None
+    assert remote.state is SessionState.OPEN
+    assert imports.obey(rules()) == [Provide(1, "/sub", "/n")]
