@@ -68,8 +68,8 @@ def test_all_latched_sources_reach_each_late_joiner_once(
 
 def test_who_has_a_latched_message_does_not_get_it_again_when_the_link_is_back(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
-    for kind, source in (("rospy", 1), ("roscpp", 2)):
-        a.ros.node(kind, "talker", topic=TF, count=1, latch=True, source=source).wait_event("done")
+    for kind, source, size in (("rospy", 1, 300), ("roscpp", 2, 2_000_000)):
+        a.ros.node(kind, "talker", topic=TF, count=1, latch=True, source=source, size=size).wait_event("done")
     a.ros.roscpp("talker", topic="/beat", rate=50)
     listeners = [hears(b, kind) for kind in ("rospy", "roscpp")]
     beat = b.ros.roscpp("listener", topic="/beat")
