@@ -269,21 +269,24 @@ async def test_a_publisher_that_restarts_is_found_again(settings: Callable[..., 
         assert sink.heard == ["one", "two"]
 
 
+def core_port(agent: Agent) -> int:
+    """The port of an agent's core."""
+    return urlsplit(agent.core.uri).port or 0
+
+
 async def test_a_second_agent_of_one_name_or_core_port_says_so(settings: Callable[..., Settings]) -> None:
     async with running(settings("a")) as (a,):
         with pytest.raises(StartError, match="a"):
             await Agent(settings("a")).start()
-        port = urlsplit(a.core.uri).port
-        assert port
-        with pytest.raises(StartError, match=str(port)):
-            await Agent(settings("b", core_port=port)).start()
+        with pytest.raises(StartError, match=str(core_port(a))):
+            await Agent(settings("b", core_port=core_port(a))).start()
 
 
 async def test_a_start_that_fails_leaves_nothing_open(settings: Callable[..., Settings]) -> None:
     async with running(settings("a")) as (a,):
         for _ in range(3):
             with pytest.raises(StartError):
-                await Agent(settings("b", core_port=a.core.port)).start()
+                await Agent(settings("b", core_port=core_port(a))).start()
         async with running_more(a, settings("b")):
             pass
 

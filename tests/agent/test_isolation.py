@@ -153,10 +153,13 @@ class World:
 
 
 @asynccontextmanager
-async def worlds(tmp_path: Path, **near: str) -> AsyncIterator[World]:
+async def worlds(tmp_path: Path, master: str = "") -> AsyncIterator[World]:
     group = (limits.MULTICAST_GROUP, 20000 + (os.getpid() + 7919) % 20000)
     settings = Settings(core_port=0, interfaces=("lo",), group_port=group[1], runtime_dir=str(tmp_path))
-    agents = [Agent(replace(settings, name="near", **near)), Agent(replace(settings, name="far"))]
+    near = replace(settings, name="near")
+    if master:
+        near = replace(near, core_mode="external", core_master=master)
+    agents = [Agent(near), Agent(replace(settings, name="far"))]
     with socket.create_server(("127.0.0.1", 0)) as listening, ThreadPoolExecutor(16) as threads:
         api = f"http://127.0.0.1:{listening.getsockname()[1]}/"
         started: list[Agent] = []
@@ -334,7 +337,7 @@ def test_no_look_at_an_external_core_goes_on_without_one_at_the_data(tmp_path: P
         master = RosCore(port=0, rosout=False)
         await master.start()
         try:
-            async with worlds(tmp_path, core_mode="external", core_master=master.uri) as world:
+            async with worlds(tmp_path, master.uri) as world:
                 for phase in (
                     a_fleet_registers,
                     the_fleet_leaves,

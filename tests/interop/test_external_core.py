@@ -131,3 +131,19 @@ def test_one_agent_a_roscore_and_what_a_killed_one_left_is_purged(
     b.agent.restart()
     b.ros.roscpp("talker", "__name:=speaker2", topic="/chatter", rate=50)
     flows(a.ros.rospy("listener", topic="/chatter"))
+
+
+def test_a_graph_over_two_machines_is_one_module(lab: Lab, shell: ShellFactory, agent: AgentFactory) -> None:
+    """Its roscore is elsewhere, so our proxies are where that machine's nodes reach them."""
+    arm, base, other = lab.hosts("arm", "base", "other")
+    ros = shell(arm)
+    ros.env.update(ROS_IP=str(arm.address), ROS_MASTER_URI=f"http://{arm.address}:11311/")
+    ros.master()
+    a = agent(base, name="robot", flags=(*EXTERNAL, "--master", ros.uri))
+    b = Module(other, agent(other, name="other"), shell(other))
+    a.wait_peer("other")
+    b.ros.roscpp("talker", topic="/from_other", rate=50)
+    flows(ros.rospy("listener", topic="/from_other"))
+    ros.roscpp("talker", topic="/from_arm", rate=50)
+    flows(b.ros.roscpp("listener", topic="/from_arm"))
+    assert f"http://{base.address}:" in ros.tool("rostopic", "info", "/from_other")

@@ -228,6 +228,21 @@ async def test_what_the_master_refuses_is_said_and_not_tried_for_ever(
     assert core.call("getParam", "/rmpa", "/good").code == -1, "only the master knows"
 
 
+async def test_a_service_of_a_node_that_no_look_has_shown_yet_is_not_pushed_out(
+    master: RosCore, core: ExternalCore
+) -> None:
+    pushed: list[GraphChange] = []
+    async with a_node() as api:
+        master.call("registerService", "/n", "/srv", "rosrpc://127.0.0.1:1", api)
+        master.on_change(pushed.append)
+        core.call("registerService", "/rmpa", "/srv", "rosrpc://127.0.0.1:2", OURS)
+        core.call("registerService", "/rmpa", "/free", "rosrpc://127.0.0.1:2", OURS)
+        await until(lambda: core.state().services.get("/srv") == {"/n": "rosrpc://127.0.0.1:1"})
+        await until(lambda: core.state() == master.state())
+        assert [change.name for change in pushed] == ["/free"]
+        assert core.state().services["/free"] == {"/rmpa": "rosrpc://127.0.0.1:2"}
+
+
 async def test_writes_beyond_the_bound_are_found_by_the_next_look(
     master: RosCore, core: ExternalCore, monkeypatch: pytest.MonkeyPatch
 ) -> None:

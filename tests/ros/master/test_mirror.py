@@ -42,7 +42,7 @@ class Pair:
         """Another program calls the master."""
         self.master.call(method, params)
 
-    def call(self, method: str, *params: str) -> XmlRpcValue:
+    def call(self, method: str, *params: XmlRpcValue) -> XmlRpcValue:
         """We do, by the mirror."""
         self.writes.append((method, params))
         return self.mirror.apply(method, params).value

@@ -37,13 +37,21 @@ _MULTICALL: Final = "system.multicall"
 _LOOPBACK: Final = "127.0.0.1"
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Write:
-    """One call that waits to leave; ``done`` is for who waits for its answer."""
+    """One call that waits to leave.
+
+    Args:
+        method: Its method.
+        params: What it is called with.
+        done: For who waits for its answer.
+        seen: Whether it follows from a look at the master.
+    """
 
     method: str
     params: tuple[XmlRpcValue, ...]
     done: asyncio.Future[Reply] | None = None
+    seen: bool = False
 
     def fail(self, error: Exception) -> None:
         if self.done is not None and not self.done.done():
@@ -277,12 +285,33 @@ class ExternalCore:
             batch = [self._writes.popleft() for _ in range(min(len(self._writes), limits.MASTER_WRITES_AT_ONCE))]
             self._seen = b""  # whether it came to pass is to be seen
             try:
+                if services := [one for one in batch if one.method == "registerService" and not one.seen]:
+                    taken = await self._taken(services)
+                    batch = [one for one in batch if one not in taken]
                 await self._send(batch)
             except UnreachableError as error:
                 for write in batch:
                     write.fail(error)
                 self._lost(error)
         self._written.set()
+
+    async def _taken(self, services: list[_Write]) -> list[_Write]:
+        """Those that would push another provider out, which no look has shown yet: the next one decides."""
+        try:
+            answers = await self._many(
+                [one_call("lookupService", [self._own_node, one.params[1]]) for one in services]
+            )
+        except (LocalProtocolError, RemoteProtocolError, RosFault):
+            return []  # what is wrong with them is said when they are sent
+        found = []
+        for one, answer in zip(services, answers, strict=True):
+            match answer:
+                case [[1, _, str(uri)]] if uri != one.params[2]:
+                    found.append(one)
+                    one.fail(UnreachableError("room", str(one.params[1]), f"{uri} provides that service"))
+        if found:
+            self._next_look = self._loop.time()
+        return found
 
     async def _send(self, batch: list[_Write]) -> None:
         """Send calls as one; if that cannot be said or read, one by one."""
@@ -392,7 +421,7 @@ class ExternalCore:
         if again:
             _log.info("= %d registrations are made, or ended, anew at %s", len(again), self._uri)
         for method, params in (*rests, *again):
-            self._queue(_Write(method, params))
+            self._queue(_Write(method, params, seen=True))
 
     async def _find_rival(self, strangers: Mapping[str, str]) -> str:
         """Whether another agent is alive at the master: what to call it, or nothing."""
