@@ -24,6 +24,7 @@ COMMANDS = {
     "core": ("rmpa.cli.core", "Run the ROS core alone: a drop-in for roscore."),
     "peer": ("rmpa.cli.peer", "See the peers that the agent knows."),
     "topic": ("rmpa.cli.topic", "See topics, listen to them, publish on them."),
+    "service": ("rmpa.cli.service", "See services, and call them."),
     "param": ("rmpa.cli.param", "See and set parameters, here or at a peer."),
     "why": ("rmpa.cli.why", "Say why a topic of a peer does not arrive, and what to do."),
     "doctor": ("rmpa.cli.doctor", "Check this machine: network, clock, rights, ROS environment."),

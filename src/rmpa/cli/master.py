@@ -95,11 +95,13 @@ class Graph:
         publishers: Nodes by topic.
         subscribers: Likewise.
         types: By topic; topics without a known type are not in it.
+        services: Nodes by service.
     """
 
     publishers: dict[str, list[str]] = field(default_factory=dict)
     subscribers: dict[str, list[str]] = field(default_factory=dict)
     types: dict[str, str] = field(default_factory=dict)
+    services: dict[str, list[str]] = field(default_factory=dict)
 
     @property
     def topics(self) -> list[str]:
@@ -139,9 +141,9 @@ async def read_graph(master: Master) -> Graph:
     except UnreachableError:
         raise master.unreachable() from None
     match state, types:
-        case [list(publishers), list(subscribers), *_], list(pairs):
+        case [list(publishers), list(subscribers), list(services), *_], list(pairs):
             known = {str(p[0]): str(p[1]) for p in pairs if isinstance(p, list) and len(p) == 2 and p[1] != "*"}
-            return Graph(_nodes(publishers), _nodes(subscribers), known)
+            return Graph(_nodes(publishers), _nodes(subscribers), known, _nodes(services))
     raise RmpaError(f"{master.uri} answers getSystemState with something else; is it a ROS master?")
 
 
@@ -156,7 +158,7 @@ def _nodes(pairs: list[object]) -> dict[str, list[str]]:
 
 @dataclass(frozen=True, slots=True)
 class TopicName:
-    """A topic as a user names it: ``/cmd``, ``cmd``, or ``joystick:/cmd`` for one peer's sources alone."""
+    """A topic or service as a user names it: ``/cmd``, ``cmd``, or ``joystick:/cmd`` for one peer's alone."""
 
     topic: str
     peer: str | None = None
@@ -171,13 +173,13 @@ class TopicName:
         return self.topic if self.peer is None else f"{self.peer}:{self.topic}"
 
 
-def read_topic(text: str) -> TopicName:
-    """Read ``TOPIC`` or ``PEER:TOPIC``; a relative topic is one of the root.
+def read_topic(text: str, what: str = "topic") -> TopicName:
+    """Read ``TOPIC`` or ``PEER:TOPIC``; a relative topic is one of the root. ``what`` may be a service as well.
 
     Raises:
         ConfigError: It is no topic's name.
     """
     peer, colon, topic = text.rpartition(":")
     if not topic or not is_legal_name(topic) or topic.startswith("~") or (colon and not peer):
-        raise ConfigError("TOPIC", f"{text!r} is not a topic", "write /name, or PEER:/name for one peer's")
+        raise ConfigError(what.upper(), f"{text!r} is not a {what}", "write /name, or PEER:/name for one peer's")
     return TopicName("/" + topic.strip("/"), peer or None)

@@ -133,7 +133,7 @@ class ServiceClient:
         """
         ok, body = await self.connection.call(_serialize(self.kind.request, request), timeout)
         if not ok:
-            raise PeerRefused(f"service {self.connection.service}", printable(str(bytes(body), "utf-8", "replace")))
+            raise PeerRefused(f"service {self.connection.service}", str(bytes(body), "utf-8", "replace"))
         return self.kind.response.deserialize(body)
 
     def close(self) -> None:

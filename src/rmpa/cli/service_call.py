@@ -1,0 +1,123 @@
+"""``rmpa service call``: one call, with a request in YAML or JSON."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from typing import TYPE_CHECKING, Final
+
+import click
+
+from rmpa.cli.master import choose_master, read_graph, read_topic
+from rmpa.cli.message_text import to_text
+from rmpa.cli.options import agent_option, json_option, master_option
+from rmpa.cli.output import print_json, printable
+from rmpa.cli.service_ends import CALLER_ID, known_type, lookup, require_service
+from rmpa.cli.topic_pub import fill_stamps, read_values
+from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+
+if TYPE_CHECKING:
+    from rmpa.cli.master import Master, TopicName
+    from rmpa.ros.messages import Plain
+
+_LOOK: Final = 0.1
+"""Between two looks whether a service is there."""
+
+
+@click.command(
+    context_settings={"ignore_unknown_options": True},
+    epilog="""\
+\b
+The request is one YAML value, or one for each field in order; what is not given is 0, empty or false.
+Its type is the server's; its definition comes with rmpa, or from this machine's ROS packages (PYTHONPATH,
+ROS_PACKAGE_PATH, CMAKE_PREFIX_PATH).
+
+\b
+Examples:
+  rmpa service call /add_two_ints 20 22
+  rmpa service call /arm/enable '{data: true}'
+  rmpa service call base:/plan '{start: {header: auto}}' --timeout 120
+  rmpa service call /map_server/static_map --wait --json | jq .response.map.info
+""",
+)
+@click.argument("service")
+@click.argument("values", nargs=-1)
+@click.option("-w", "--wait", is_flag=True, help="Wait until the service is there, for as long as --timeout says.")
+@click.option(
+    "-t", "--timeout", type=click.FloatRange(0.001), default=60.0, show_default=True, help="Seconds for the answer."
+)
+@json_option
+@agent_option
+@master_option
+def call(
+    service: str,
+    values: tuple[str, ...],
+    wait: bool,
+    timeout: float,
+    as_json: bool,
+    agent: str | None,
+    master: str | None,
+) -> None:
+    """Call a SERVICE with VALUES, in YAML or JSON, and print its response.
+
+    An error of the server is told on stderr, in its own words; the exit code is 1 then.
+    """
+    wanted = read_topic(service, "service")
+    plain = read_values(values)
+    chosen = choose_master(master, agent, os.environ)
+    began = time.monotonic()
+    response = asyncio.run(_call(chosen, wanted, plain, timeout, wait=wait))
+    if as_json:
+        print_json({"service": wanted.topic, "response": response, "took": time.monotonic() - began})
+    elif response:
+        click.echo(to_text(response))
+
+
+async def _call(
+    master: Master,
+    wanted: TopicName,
+    plain: Plain,
+    timeout: float,  # noqa: ASYNC109 - the user's
+    *,
+    wait: bool,
+) -> dict[str, Plain]:
+    from rmpa.ros.aio.service_client import ServiceConnection
+
+    if wait:
+        await _wait(master, wanted, timeout)
+    require_service(await read_graph(master), wanted)
+    uri = await lookup(master, wanted.topic)
+    connection = await ServiceConnection.open(uri, wanted.topic, CALLER_ID, timeout=timeout)
+    try:
+        kind = known_type(connection.description)
+        request = kind.request.serialize(kind.request.make(fill_stamps(plain, time.time_ns())))
+        ok, body = await connection.call(request, timeout)
+    finally:
+        connection.close()
+    if not ok:
+        text = printable(str(bytes(body), "utf-8", "replace")) or "it gave no reason"
+        raise PeerRefused(f"service {wanted.topic}", text)
+    return kind.response.to_plain(kind.response.deserialize(body))
+
+
+async def _wait(master: Master, wanted: TopicName, timeout: float) -> None:  # noqa: ASYNC109 - likewise
+    """Wait until a service is registered, by that peer if one was named.
+
+    Raises:
+        UnreachableError: It is not in time.
+    """
+    last: RmpaError | None = None
+    try:
+        async with asyncio.timeout(timeout):
+            while True:
+                try:
+                    require_service(await read_graph(master), wanted)
+                except RmpaError as error:
+                    last = error
+                else:
+                    return
+                await asyncio.sleep(_LOOK)
+    except TimeoutError:
+        remedy = str(last) if last is not None else ""
+        raise UnreachableError(f"service {wanted}", f"{master.uri} within {timeout:g} s", remedy) from None
