@@ -22,6 +22,7 @@ from bench import (
     period,
     profile,
     scale,
+    services,
     startup,
     storm,
     throughput,
@@ -75,6 +76,7 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     "joining": Measurement(
         "how soon modules and their graphs are joined, and what a mesh costs while nothing happens", joining.measure
     ),
+    "services": Measurement("a service call through two agents, and a direct one", services.measure),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),
 }
 
