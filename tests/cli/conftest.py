@@ -91,10 +91,12 @@ def agent(place: Place, background: Background) -> Iterator[Callable[..., None]]
     """Starts fake agents: by name, what they show, and how they answer a ping."""
     servers: list[ControlServer] = []
 
-    def start(name: str = "base", snapshot: Snapshot = SNAPSHOT, ping: Handler | None = None) -> None:
+    def start(
+        name: str = "base", snapshot: Snapshot = SNAPSHOT, ping: Handler | None = None, **others: Handler
+    ) -> None:
         times = iter([0.0004, None, 0.0006] * 100)
         answer = ping or (lambda _: PingReply(times=(next(times),), remote="10.0.0.2:40002"))
-        server = ControlServer(place.path, name, {"snapshot": lambda _: snapshot, "ping": answer})
+        server = ControlServer(place.path, name, {"snapshot": lambda _: snapshot, "ping": answer, **others})
         background.do(server.start())
         servers.append(server)
 

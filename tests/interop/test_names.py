@@ -87,11 +87,11 @@ def test_one_computer_works_with_two_robots_that_are_all_alike(
     assert not hearing["robot2"].events("first")
 
     # Actions and services go by the same names.
-    client = pc.ros.rospy("action_client", name="client", action="/robot2/count", commands=True)
-    client.tell("server 20")
-    assert client.wait_event("server", 30.0)["found"] is True
-    client.tell("send 5")
-    assert (done := client.wait_event("done"))["state"] == "SUCCEEDED", done
+    goals = pc.ros.rospy("action_client", name="client", action="/robot2/count", commands=True)
+    goals.tell("server 20")
+    assert goals.wait_event("server", 30.0)["found"] is True
+    goals.tell("send 5")
+    assert (done := goals.wait_event("done"))["state"] == "SUCCEEDED", done
     assert done["result"] == 5
     eventually(lambda: "/robot2/work" in pc.ros.tool("rosservice", "list").split(), what="the robot's service")
     caller = pc.ros.roscpp("caller", service="/robot2/work", wait=True, commands=True)

@@ -257,8 +257,8 @@ async def _serve(
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop.set)
     hangups = Hangups(agent.reloader, stop.set)
-    hangups.start()
     await agent.start()
+    hangups.start()
     try:
         notify_service_manager("READY=1")
         await stop.wait()

@@ -1,0 +1,159 @@
+"""Reading the settings again: what changes, what waits, and what SIGHUP means."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import pty
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.agent import reload
+from rmpa.agent.reload import Hangups, Reloader
+from rmpa.core.config import HostPort, PeerRule, PolicySettings, Settings
+from rmpa.core.config_sources import Flags, Loaded, load_settings
+from rmpa.core.contract import Rule
+from rmpa.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+OLD = Settings(name="a", config_file=Path("/etc/rmpa.toml"))
+NEW = replace(
+    OLD,
+    policy=PolicySettings(deny=("/secret",)),
+    peers=(PeerRule("b", "/b"),),
+    contracts=(Rule(("/a",), (), {"depth": 3}),),
+    log_level="debug",
+    port=40001,
+    seeds=(HostPort("10.0.0.1", 7),),
+    core_port=11312,
+)
+
+
+def reloader(load: Callable[[], Loaded], applied: list[Settings]) -> Reloader:
+    return Reloader(OLD, load, applied.append)
+
+
+async def test_what_can_be_taken_is_taken_and_the_rest_is_named() -> None:
+    applied: list[Settings] = []
+    made = reloader(lambda: Loaded(NEW, ("doubtful",)), applied)
+    checked = await made.reload(check=True)
+    assert (applied, made.waiting) == ([], ())
+    reply = await made.reload()
+    assert reply == checked
+    assert reply.file == "/etc/rmpa.toml"
+    assert reply.changed == ("bridge.deny", "[[peer]]", "[[contract]]", "log.level")
+    waiting = (
+        "core.port (11312 instead of 11311)",
+        "mesh.port (40001 instead of 0)",
+        "discovery.seeds ([10.0.0.1:7] instead of [])",
+    )
+    assert reply.restart == made.waiting == waiting
+    assert reply.notes == ("doubtful",)
+    assert applied == [replace(NEW, port=0, seeds=(), core_port=11311)]
+
+
+async def test_a_second_time_only_what_waits_is_left() -> None:
+    applied: list[Settings] = []
+    made = reloader(lambda: Loaded(NEW), applied)
+    await made.reload()
+    reply = await made.reload()
+    assert (reply.changed, len(reply.restart), len(applied)) == ((), 3, 1)
+
+
+async def test_settings_that_cannot_be_used_change_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    def load() -> Loaded:
+        raise ConfigError("bridge.deny", "no", "yes", Path("/x.toml"), 7)
+
+    applied: list[Settings] = []
+    made = reloader(load, applied)
+    assert (await made.reload(check=True)).problem == "/x.toml:7: bridge.deny: no; yes"
+    assert not caplog.records
+    assert (await made.reload()).problem == "/x.toml:7: bridge.deny: no; yes"
+    assert applied == []
+    assert "the settings stay as they are: /x.toml:7: bridge.deny: no; yes" in caplog.text
+
+
+async def test_an_agent_that_a_program_made_says_so() -> None:
+    with pytest.raises(ConfigError, match="this agent was given them by a program"):
+        await Reloader(OLD, None, lambda _: None).reload()
+
+
+def test_a_file_is_read_again(tmp_path: Path) -> None:
+    load = partial(load_settings, Flags(), {}, host_name="a", cwd=tmp_path)
+    before = load().settings
+    (tmp_path / "rmpa.toml").write_text('[bridge]\ndeny = ["/x"]\n')
+    assert (before.policy.deny, load().settings.policy.deny) == ((), ("/x",))
+
+
+# --- SIGHUP -------------------------------------------------------------------------------------------------------
+
+
+async def test_sighup_reads_the_settings_again_and_tells_the_service_manager(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(reload, "notify_service_manager", told.append)
+    monkeypatch.setattr(reload, "_has_terminal", lambda: False)
+    applied: list[Settings] = []
+    hangups = Hangups(reloader(lambda: Loaded(NEW), applied), lambda: pytest.fail("it must go on"))
+    hangups.start()
+    os.kill(os.getpid(), signal.SIGHUP)
+    async with asyncio.timeout(20):
+        while "READY=1" not in told:
+            await asyncio.sleep(0.005)
+    assert applied
+    assert told[0].startswith("RELOADING=1\nMONOTONIC_USEC=")
+    await hangups.close()
+
+
+async def test_where_sighup_is_ignored_it_stays_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        hangups = Hangups(reloader(lambda: pytest.fail("nobody asked"), []), lambda: None)
+        hangups.start()
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+        await hangups.close()
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+_ON_A_TERMINAL = """
+import fcntl, os, sys, termios
+os.setsid()
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+os.execv(sys.executable, [sys.executable, "-m", "rmpa.cli.main", "up", *sys.argv[1:]])
+"""
+
+
+def test_an_agent_whose_terminal_is_closed_ends(tmp_path: Path, unused_tcp_port: int) -> None:
+    ours, its = pty.openpty()
+    words = ["--name", "a", "--interface", "lo", "--multicast", "off", "--core-port", str(unused_tcp_port)]
+    with subprocess.Popen(
+        [sys.executable, "-c", _ON_A_TERMINAL, *words],
+        stdin=its,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "RMPA_RUNTIME_DIR": str(tmp_path)},
+        text=True,
+    ) as process:
+        os.close(its)
+        assert process.stderr is not None
+        seen = ""
+        while "ROS_MASTER_URI" not in seen and (line := process.stderr.readline()):
+            seen += line
+        process.send_signal(signal.SIGHUP)  # the terminal is there: it reads its settings
+        while "settings read again" not in seen and (line := process.stderr.readline()):
+            seen += line
+        os.close(ours)
+        rest = process.stderr.read()
+        assert process.wait(20) == 0
+    assert "settings read again: nothing has changed" in seen
+    assert "the terminal is gone" in rest
