@@ -1,0 +1,134 @@
+"""``rmpa why`` and ``rmpa doctor`` between real nodes on several hosts: what only those can bring about."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.interop.modules import flows
+from tests.interop.processes import eventually
+
+if TYPE_CHECKING:
+    from tests.interop.agents import Agent
+    from tests.interop.conftest import ModuleFactory
+    from tests.interop.modules import Module
+
+pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
+
+
+def why(agent: Agent, *words: str) -> list[dict[str, Any]]:
+    code, output = agent.rmpa("why", *words, "--json")
+    assert "Traceback" not in output
+    found: list[dict[str, Any]] = json.loads(output)
+    assert code == (0 if all(one["flows"] for one in found) else 1), output
+    return found
+
+
+def stop(agent: Agent, *words: str) -> str:
+    """The stage at which the only way ends; empty if it does not."""
+    (found,) = why(agent, *words)
+    last = found["stages"][-1]
+    assert found["flows"] or last["remedy"]
+    return "" if found["flows"] else f"{last['name']}: {last['text']}"
+
+
+def until(module: Module, begins: str, *words: str) -> str:
+    """Ask until the answer begins so; return it."""
+    found: list[str] = []
+
+    def asked() -> bool:
+        found.append(stop(module.agent, *words))
+        return found[-1].startswith(begins)
+
+    eventually(asked, 40.0, what=f"rmpa why {' '.join(words)} says {begins!r}; it said {found}")
+    return found[-1]
+
+
+def test_a_topic_from_its_publisher_to_its_reader_and_each_that_fails(modules: ModuleFactory) -> None:
+    a, b = modules("a", "b", config="[services]\nloggers = true\n")
+    topic = f"{a.name}:/chatter"
+    assert stop(b.agent, topic) == f"publisher: no node of {a.name} publishes /chatter"
+    talker = a.ros.rospy("talker", topic="/chatter", rate=50, size=100_000, name="talker")
+    talker.wait_event("up")
+    until(b, "subscriber: no node here subscribes", topic)
+
+    # A subscriber of another type is refused, loudly at both ends.
+    wrong = b.ros.rospy("listener", topic="/chatter", type="String", name="wrong")
+    wrong.wait_event("up")
+    assert "md5" in until(b, "md5: ", topic)
+    wrong.end()
+
+    heard = b.ros.roscpp("listener", topic="/chatter", name="listener")
+    flows(heard)
+    code, text = b.agent.rmpa("why", topic)
+    assert (code, text.splitlines()[-1]) == (0, "it flows"), text
+    (found,) = why(a.agent, "/chatter")
+    assert (found["flows"], found["peer"], found["to"]) == (True, a.name, b.name), "the other end says so too"
+
+    # A reader that is stopped: 5 MB/s fill what the kernel keeps for it in a moment.
+    heard.freeze()
+    assert "/listener (" in until(b, "reader: ", topic)
+    heard.thaw()
+
+    # A publisher that is stopped; its logger service does not answer either.
+    service = f"{a.name}:/talker/get_loggers"
+    assert stop(b.agent, service) == ""
+    talker.freeze()
+    assert "does not answer" in stop(b.agent, service)
+    until(b, "arrived: nothing for", topic)
+    talker.thaw()
+
+    # The cable is out.
+    a.host.cut()
+    b.agent.wait_no_peer(a.name)
+    assert stop(b.agent, topic).startswith(("link: ", "peer: "))
+
+
+def test_multicast_by_hand_and_the_doctor_of_a_host(modules: ModuleFactory) -> None:
+    a, b = modules("a", "b")
+    waiting = b.host.command([*_rmpa(), "multicast", "receive", "--timeout", "30", "--json"])
+    receiver = b.ros.start(*waiting, name="receive", env=b.agent.env)
+
+    def heard() -> bool:
+        code, output = a.agent.rmpa("multicast", "send")
+        assert code == 0, output
+        return receiver.returncode is not None
+
+    eventually(heard, what="a packet of the other host")
+    packet = json.loads(receiver.output.splitlines()[-1])
+    assert receiver.wait() == 0
+    assert (packet["source"].partition(":")[0], packet["interface"]) == (
+        a.host.address,
+        b.host.cables[0].interface,
+    )
+
+    def findings() -> dict[tuple[str, str], dict[str, str]]:
+        code, output = b.agent.rmpa("doctor", "--json")
+        answers = json.loads(output)
+        assert code == int(any(answer["level"] == "fail" for answer in answers))
+        return {(answer["check"], answer["subject"]): answer for answer in answers}
+
+    found = findings()
+    assert found["multicast", b.host.cables[0].interface]["level"] == "ok"
+    assert found["agent", b.name]["level"] == "ok"
+    assert found["peer", f"{b.name}-{a.name}"]["text"].startswith("linked by ")
+    assert found["clock", f"{b.name}-{a.name}"]["level"] == "ok"
+    assert found["route", f"{a.host.address} ({a.name})"]["level"] == "ok"
+    assert b.name in found["port", "11311"]["text"]
+    assert not any("beacon.malformed" in line for line in a.agent.process.lines), (
+        "agents pass the doctor's packet over"
+    )
+    # The interface goes down: no multicast, and no way to the peer.
+    b.host.switch_off()
+    found = findings()
+    assert ("multicast", b.host.cables[0].interface) not in found
+    assert found["interface", ""]["level"] == "warn"
+    b.host.switch_on()
+
+
+def _rmpa() -> list[str]:
+    from tests.interop.agents import RMPA
+
+    return [str(RMPA)]
