@@ -1,0 +1,173 @@
+"""When a task is due, what is measured of it, and how long a failed one waits; all without a clock of its own."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+RESTART_FIRST: Final = 0.1
+"""Seconds before a task goes on that failed for the first time."""
+RESTART_MAX: Final = 5.0
+"""The same at most, when it fails again and again."""
+STUCK_PERIODS: Final = 10
+"""A run that takes so many periods is stuck, unless the task says otherwise."""
+STUCK_LEAST: Final = 5.0
+"""None is stuck sooner than after so many seconds, unless the task says otherwise."""
+_EARLY: Final = 1e-9
+
+
+class Schedule:
+    """The times at which a periodic task is due: start, start + period, start + 2 periods …
+
+    Absolute, so that no lateness adds up. A time that is a whole period past is left out.
+
+    Args:
+        period: Seconds, above 0.
+        start: The first time, monotonic seconds.
+    """
+
+    def __init__(self, period: float, start: float) -> None:
+        self.period = period
+        self.missed = 0
+        """Times that were left out."""
+        self._start = start
+        self._tick = -1
+
+    def next_due(self, now: float) -> float:
+        """Go on to the next time; return when that is."""
+        self._tick += 1
+        late = math.floor((now - self._start) / self.period + _EARLY) - self._tick
+        if late > 0:
+            self._tick += late
+            self.missed += late
+        return self._start + self._tick * self.period
+
+
+@dataclass(frozen=True, slots=True)
+class TaskReport:
+    """What was measured of a task over one window; a figure that nothing was measured of is ``None``.
+
+    Args:
+        runs: How often it ran.
+        failures: How often it raised.
+        overruns: Runs that took more than a period.
+        missed: Times that were left out because of that.
+        dropped: Messages of its input that it was too slow for.
+        lateness: Mean of the seconds from when it was due to when it began.
+        lateness_max: The greatest of them.
+        period_sd: Standard deviation of the time from one beginning to the next, seconds.
+        busy: Share of the window in which it ran.
+    """
+
+    runs: int = 0
+    failures: int = 0
+    overruns: int = 0
+    missed: int = 0
+    dropped: int = 0
+    lateness: float | None = None
+    lateness_max: float | None = None
+    period_sd: float | None = None
+    busy: float = 0.0
+
+
+class TaskFigures:
+    """Measures one task; told by the thread that runs it, asked by the loop. Sums only.
+
+    Args:
+        period: Of a periodic one, else ``None``.
+        now: Monotonic seconds.
+    """
+
+    def __init__(self, period: float | None, now: float) -> None:
+        self._period = period
+        self._window = now
+        self._began: float | None = None
+        self._last: float | None = None
+        self.in_a_row = 0
+        """Failures since the last run that ended well."""
+        self.error = ""
+        """What the last failure said; empty once a run ended well."""
+        self._clear()
+
+    def _clear(self) -> None:
+        self._runs = self._failures = self._overruns = self._missed = self._dropped = 0
+        self._late = self._late_max = self._busy = 0.0
+        self._lates = self._periods = 0
+        self._sum = self._squares = 0.0
+
+    @property
+    def running_since(self) -> float | None:
+        """When the present run began, or ``None`` between two."""
+        return self._began
+
+    def begun(self, due: float, now: float) -> None:
+        """A run begins that was due at a time."""
+        self._began = now
+        late = max(0.0, now - due)
+        self._late += late
+        self._late_max = max(self._late_max, late)
+        self._lates += 1
+        if self._last is not None:
+            period = now - self._last
+            self._periods += 1
+            self._sum += period
+            self._squares += period * period
+        self._last = now
+
+    def ended(self, now: float, error: str = "") -> None:
+        """The run has ended, well or with an error."""
+        took = now - self._began if self._began is not None else 0.0
+        self._began = None
+        self._runs += 1
+        self._busy += took
+        if self._period is not None and took > self._period:
+            self._overruns += 1
+        self.error = error
+        if error:
+            self._failures += 1
+            self.in_a_row += 1
+        else:
+            self.in_a_row = 0
+
+    def interrupted(self) -> None:
+        """The times between two runs are no period any more: it waited for another reason."""
+        self._last = None
+
+    def missed(self, count: int) -> None:
+        """So many times were left out."""
+        self._missed += count
+
+    def dropped(self) -> None:
+        """A message was, for the task was too slow."""
+        self._dropped += 1
+
+    def window(self, now: float) -> TaskReport:
+        """What was measured since the last window; a new one begins."""
+        mean = self._sum / self._periods if self._periods else 0.0
+        report = TaskReport(
+            runs=self._runs,
+            failures=self._failures,
+            overruns=self._overruns,
+            missed=self._missed,
+            dropped=self._dropped,
+            lateness=self._late / self._lates if self._lates else None,
+            lateness_max=self._late_max if self._lates else None,
+            period_sd=math.sqrt(max(0.0, self._squares / self._periods - mean * mean)) if self._periods > 1 else None,
+            busy=min(1.0, self._busy / max(now - self._window, _EARLY)),
+        )
+        self._window = now
+        self._clear()
+        return report
+
+
+def restart_delay(in_a_row: int) -> float:
+    """Seconds before a task goes on that has failed so often in a row."""
+    return min(RESTART_FIRST * 2.0 ** min(max(0, in_a_row - 1), 16), RESTART_MAX)
+
+
+def stuck_after(period: float | None, said: float | None) -> float:
+    """Seconds that one run may take before it counts as stuck."""
+    if said is not None:
+        return said
+    return max(STUCK_LEAST, STUCK_PERIODS * period) if period is not None else STUCK_LEAST
