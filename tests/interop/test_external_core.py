@@ -25,13 +25,16 @@ Joined = tuple[Module, Module, "Process"]
 
 
 @pytest.fixture
-def joined(lab: Lab, shell: ShellFactory, agent: AgentFactory) -> Callable[[], Joined]:
-    """Make two linked modules, ``a`` with a real master and ``b`` with the embedded core; and that master."""
+def joined(lab: Lab, shell: ShellFactory, agent: AgentFactory) -> Callable[..., Joined]:
+    """Make two linked modules, ``a`` with a real master and ``b`` with the embedded core; and that master.
 
-    def make() -> Joined:
+    ``whole=True`` makes a ``roscore`` of it, with ``/rosout`` and ``/run_id``.
+    """
+
+    def make(*, whole: bool = False) -> Joined:
         first, second = lab.hosts("a", "b")
         ros = shell(first)
-        master = ros.master()
+        master = ros.roscore() if whole else ros.master()
         a = Module(first, agent(first, name="a", flags=EXTERNAL), ros)
         b = Module(second, agent(second, name="b"), shell(second))
         a.agent.wait_peer("b")
@@ -53,7 +56,7 @@ def notes(agent: Agent) -> str:
 
 
 def test_nodes_of_a_roscore_and_of_an_embedded_core_hear_each_other_and_it_is_left_clean(
-    joined: Callable[[], Joined],
+    joined: Callable[..., Joined],
 ) -> None:
     a, b, _ = joined()
     there = b.ros.rospy("listener", topic="/from_a")
@@ -67,6 +70,9 @@ def test_nodes_of_a_roscore_and_of_an_embedded_core_hear_each_other_and_it_is_le
     assert "std_msgs/UInt8MultiArray" in a.ros.tool("rostopic", "info", "/from_b")
     assert "data: " in a.ros.tool("rostopic", "echo", "-n", "1", "/from_b")
 
+    code, output = a.agent.rmpa("topic", "list")
+    assert (code, "/from_b" in output) == (0, True), "our own tools ask the same master"
+
     # The same name at another address: rosmaster's state is the same as before.
     talker.kill()
     a.ros.rospy("talker", "__name:=speaker", topic="/from_a", rate=50, source=2)
@@ -79,7 +85,7 @@ def test_nodes_of_a_roscore_and_of_an_embedded_core_hear_each_other_and_it_is_le
     assert "/from_b" not in a.ros.tool("rostopic", "list", "-p").split()
 
 
-def test_a_new_node_is_seen_within_a_second_and_a_dead_one_crosses_no_more(joined: Callable[[], Joined]) -> None:
+def test_a_new_node_is_seen_within_a_second_and_a_dead_one_crosses_no_more(joined: Callable[..., Joined]) -> None:
     a, b, _ = joined()
     talker = a.ros.roscpp("talker", topic="/chatter", rate=100)
     a.wait_topic("/chatter")
@@ -93,16 +99,18 @@ def test_a_new_node_is_seen_within_a_second_and_a_dead_one_crosses_no_more(joine
     assert "/chatter" in a.topics(), "rosmaster keeps what nobody unregisters, and it is not ours to change"
 
 
-def test_what_flows_outlives_the_roscore_and_the_next_one_gets_all_of_ours(joined: Callable[[], Joined]) -> None:
-    a, b, master = joined()
+def test_what_flows_outlives_the_roscore_and_the_next_one_gets_all_of_ours(joined: Callable[..., Joined]) -> None:
+    a, b, master = joined(whole=True)
     a.ros.roscpp("talker", topic="/chatter", rate=100)
     b.ros.roscpp("talker", "__name:=other", topic="/from_b", rate=10)
     abroad = b.ros.roscpp("listener", topic="/chatter")
     flows(abroad)
-    master.kill()
+    run_id = a.ros.tool("rosparam", "get", "/run_id")
+    master.interrupt()
     eventually(lambda: "does not answer" in notes(a.agent), what="the note")
     flows(abroad, 50)
-    a.ros.master()
+    a.ros.roscore()
+    assert a.ros.tool("rosparam", "get", "/run_id") != run_id
     eventually(lambda: "does not answer" not in notes(a.agent), what="no note")
     eventually(lambda: {"/rmpa", "/rmpa/b/other"} <= nodes(a), what="our nodes at the new master")
     a.ros.roscpp("talker", "__name:=fresh", topic="/fresh", rate=100)
@@ -112,8 +120,35 @@ def test_what_flows_outlives_the_roscore_and_the_next_one_gets_all_of_ours(joine
     assert (report["gaps"], report["doubled"]) == (0, 0)
 
 
+def test_services_and_parameters_cross_and_a_local_provider_wins(joined: Callable[..., Joined]) -> None:
+    a, b, _ = joined()
+    a.ros.rospy("worker", "__name:=at_a", service="/work").wait_event("up")
+    b.ros.roscpp("worker", "__name:=at_b", service="/far").wait_event("up")
+    for module, service in ((a, "/far"), (b, "/work")):
+        with_wait = module.ros.rospy("caller", service=service, wait=True, commands=True)
+        with_wait.wait_event("there")
+        with_wait.tell("echo 0 1000 3 once")
+        done = with_wait.wait_event("done")
+        assert (done["ok"], done["same"]) == (3, 3), done
+        assert module.ros.tool("rosservice", "type", service).strip() == "rmpa_test/Work"
+    assert a.ros.tool("rosservice", "node", "/far").strip() == "/rmpa/b/at_b"
+    local = a.ros.roscpp("worker", "__name:=local", service="/far")
+    local.wait_event("up")
+    assert a.ros.tool("rosservice", "node", "/far").strip() == "/local"
+    local.terminate()
+    eventually(lambda: "/rmpa/b/at_b" in a.ros.tool("rosservice", "list", "-n"), what="the one of b again")
+
+    a.ros.tool("rosparam", "set", "/gain", "{p: 1.5, names: [x, y]}")
+    code, output = b.agent.rmpa("param", "get", "/gain", "--peer", "a")
+    assert code == 0, output
+    assert "p: 1.5" in output
+    code, output = b.agent.rmpa("param", "set", "/gain/p", "2.5", "--peer", "a")
+    assert code == 0, output
+    assert a.ros.tool("rosparam", "get", "/gain/p").strip() == "2.5"
+
+
 def test_one_agent_a_roscore_and_what_a_killed_one_left_is_purged(
-    joined: Callable[[], Joined], agent: AgentFactory
+    joined: Callable[..., Joined], agent: AgentFactory
 ) -> None:
     a, b, _ = joined()
     b.ros.roscpp("talker", "__name:=speaker", topic="/chatter", rate=50)
