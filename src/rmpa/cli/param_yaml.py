@@ -220,17 +220,19 @@ def _problem(error: Exception) -> str:
     return str(getattr(error, "problem", None) or error).splitlines()[0]
 
 
-def _unsayable(value: object, key: str = "") -> Iterator[tuple[str, str]]:
+def _unsayable(value: object, key: str = "", depth: int = 0) -> Iterator[tuple[str, str]]:
     """What in a value no parameter can be, with its key."""
-    if isinstance(value, dict):
+    if depth > limits.PARAM_DEPTH_MAX:
+        yield key.partition("[")[0], f"nested deeper than {limits.PARAM_DEPTH_MAX} levels"
+    elif isinstance(value, dict):
         for name, member in value.items():
             if not isinstance(name, str):
                 yield key, f"the key {name!r} is not a string; put it in quotes"
             else:
-                yield from _unsayable(member, f"{key}/{name}")
+                yield from _unsayable(member, f"{key}/{name}", depth + 1)
     elif isinstance(value, list | tuple):
         for index, member in enumerate(value):
-            yield from _unsayable(member, f"{key}[{index}]")
+            yield from _unsayable(member, f"{key}[{index}]", depth + 1)
     elif value is None:
         yield key, "null is no value of a parameter; write '' for an empty string, or leave it out"
     elif isinstance(value, int) and not isinstance(value, bool) and not -_INT_MAX - 1 <= value <= _INT_MAX:

@@ -1,0 +1,65 @@
+"""What peers may do with parameters, by name."""
+
+from __future__ import annotations
+
+import pytest
+
+from rmpa.bridge.params import ParamPolicy, follow_rules, key_problem, leaves
+from rmpa.core.config import FollowRule, ParamSettings, TimeSettings
+
+POLICY = ParamPolicy(
+    ParamSettings(
+        ("/open/**", "/followed/**"),
+        ("/open/**", "/roslaunch/**", "/followed/**"),
+        (FollowRule("/x", "arm", "/followed"),),
+    ),
+    TimeSettings(),
+)
+
+
+@pytest.mark.parametrize(
+    ("key", "get", "put", "follow"),
+    [
+        ("/open/a", "", "", ""),
+        ("/open", "", "", ""),
+        ("/opened", "remote_get", "remote_set", "remote_get"),
+        ("/", "remote_get", "the root", "the root"),
+        ("/roslaunch/uris", "remote_get", "roslaunch's own", "remote_get"),
+        ("/run_id", "remote_get", "names the run", "remote_get"),
+        ("/use_sim_time", "remote_get", "[time] alone", "does not share"),
+        ("/followed", "", "followed from arm:/x", "followed from arm:/x"),
+        ("/followed/deep", "", "followed from arm:/x", "followed from arm:/x"),
+    ],
+)
+def test_policy(key: str, get: str, put: str, follow: str) -> None:
+    for why, expected in (
+        (POLICY.why_not_get(key), get),
+        (POLICY.why_not_set(key), put),
+        (POLICY.why_not_follow(key), follow),
+    ):
+        assert (expected in why) if expected else why == ""
+
+
+def test_time_is_followed_where_it_is_shared() -> None:
+    assert ParamPolicy(ParamSettings(remote_get=()), TimeSettings(share=True)).why_not_follow("/use_sim_time") == ""
+    chained = ParamPolicy(ParamSettings(), TimeSettings("sim", share=True))
+    assert "time comes from sim here" in chained.why_not_follow("/use_sim_time")
+    rules = follow_rules(ParamSettings(), TimeSettings("sim"))
+    assert rules == (FollowRule("/use_sim_time", "sim", "/use_sim_time"),)
+
+
+@pytest.mark.parametrize("key", ["/a", "/joint-1/x.y", "/", "/a/b/"])
+def test_names_that_masters_take(key: str) -> None:
+    assert key_problem(key) == ""
+
+
+@pytest.mark.parametrize("key", ["", "a", "~a", 1, None, "/a//b", "/a b", "/a\n", "/" + "a" * 2000, "/a" * 100])
+def test_names_that_are_none(key: object) -> None:
+    assert key_problem(key)
+
+
+def test_leaves() -> None:
+    value = {"a": 1, "b": {"c": [1], "d": {}}, "e": {"f": "x"}}
+    assert list(leaves("/x", value)) == [("/x/a", 1), ("/x/b/c", [1]), ("/x/e/f", "x")]
+    assert list(leaves("/", {"a": 1})) == [("/a", 1)]
+    assert list(leaves("/x", 5)) == [("/x", 5)]

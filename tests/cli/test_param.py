@@ -1,0 +1,195 @@
+"""``rmpa param`` against our own core, and against a fake agent's peer."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rmpa.bridge import param_transfer as transfer
+from rmpa.cli.param_yaml import read_documents, read_yaml, show_yaml, write_yaml
+from rmpa.core import limits
+from rmpa.core.errors import PeerRefused, RmpaError
+from rmpa.monitor.aio.control_server import ControlServer
+from rmpa.monitor.snapshot import FollowedInfo
+from rmpa.ros.xmlrpc import parse_response, serialize_response
+from tests.monitor.samples import SNAPSHOT
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from typing import Any
+
+    from rmpa.ros.aio.core import RosCore
+    from tests.cli.conftest import Background, Place
+
+
+def test_the_verbs(place: Place, core: RosCore) -> None:
+    place.environ["ROS_MASTER_URI"] = core.uri
+    assert place.run("param", "set", "/base", "{speed: 1.5, names: [a, 'on'], deep: {x: -3}}") == (0, "", "")
+    assert place.run("param", "get", "/base/deep/x") == (0, "-3\n", "")
+    assert place.run("param", "get", "/base") == (0, "deep:\n  x: -3\nnames:\n- a\n- 'on'\nspeed: 1.5\n", "")
+    assert place.json("param", "get", "base", "--json") == [{"deep": {"x": -3}, "names": ["a", "on"], "speed": 1.5}]
+    assert place.run("param", "set", "/base/deep", "-5") == (0, "", "")
+    assert place.run("param", "list", "/base")[1].split() == ["/base/deep", "/base/names", "/base/speed"]
+    code, _, err = place.run("param", "get", "/base/sped")
+    assert (code, err.split("; ")[1]) == (1, "did you mean /base/speed?\n")
+    assert place.run("param", "dump", "base.yaml", "/base")[0] == 0
+    assert place.run("param", "load", "base.yaml", "/copy")[0] == 0
+    assert core.call("getParam", "/x", "/copy").value == core.call("getParam", "/x", "/base").value
+    assert place.run("param", "delete", "/copy")[0] == 0
+    assert place.run("param", "delete", "/copy")[0] == 1
+    (place.path / "ns.yaml").write_text("_ns: inner\na: 1\n---\nb: 2\n")
+    assert place.json("param", "load", "ns.yaml", "/outer", "--json") == [{"set": 2}]
+    assert core.call("getParam", "/x", "/outer").value == {"inner": {"a": 1}, "b": 2}
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "error"),
+    [
+        (("set", "/a", "[1,"), 1, "VALUE:1:4: not YAML"),
+        (("set", "/a", "null"), 1, "VALUE: null is no value"),
+        (("set", "/a", "{1: 2}"), 1, "the key 1 is not a string"),
+        (("set", "/a", "99999999999"), 1, "does not fit the 32 bits"),
+        (("set", "/a", "{b: 1, b: 2}"), 1, "found duplicate key"),
+        (("set", "/a"), 2, "VALUE: none is given"),
+        (("set", "/a", "1", "-t", "x"), 2, "VALUE: two are given"),
+        (("set", "/", "5"), 1, "the root can only be set to a dictionary"),
+        (("set", "/a", "{b: {'c d': 1}}"), 1, "'/a/b/c d' is not a parameter's name"),
+        (("set", "/a", "-t", "nothing"), 1, "nothing cannot be read: No such file"),
+        (("get", "~a"), 2, "private to a node"),
+        (("get", "/a//b"), 2, "not a parameter's name"),
+        (("delete", "/"), 2, "the root holds every parameter"),
+        (("load", "list.yaml"), 1, "not a dictionary of parameters"),
+        (("get", "/a", "--peer", "b", "--master", "http://x:1/"), 2, "--peer"),
+        (("gte", "/a"), 2, "Did you mean get?"),
+    ],
+)
+def test_mistakes_change_nothing(place: Place, core: RosCore, words: tuple[str, ...], code: int, error: str) -> None:
+    place.environ["ROS_MASTER_URI"] = core.uri
+    (place.path / "list.yaml").write_text("- 1\n")
+    found = place.run("param", *words)
+    assert (found[0], found[1]) == (code, "")
+    assert error in found[2]
+    assert core.call("hasParam", "/x", "/a").value is False
+
+
+@pytest.fixture
+def peer(place: Place, background: Background) -> Iterator[dict[str, Any]]:
+    """A fake agent whose only peer, base, has these parameters."""
+    kept: dict[str, Any] = {"/speed": 1.5, "/big": "x" * (3 * limits.PARAM_PORTION)}
+    transfers = transfer.Transfers()
+
+    def ask(args: dict[str, object]) -> object:
+        assert args["peer"] == "base"
+        inner = args["args"]
+        assert isinstance(inner, dict)
+        match args["what"]:
+            case transfer.GET if inner["key"] not in kept:
+                raise PeerRefused("base", f"there is no parameter {inner['key']}")
+            case transfer.GET:
+                return transfers.answer(serialize_response(kept[inner["key"]]).decode(), 0.0)
+            case transfer.NAMES:
+                return transfers.answer(serialize_response(list(kept)).decode(), 0.0)
+            case transfer.MORE:
+                return transfers.more(inner, 0.0)
+            case transfer.PUT:
+                return transfers.put(inner, 0.0)
+            case transfer.SET:
+                kept[inner["key"]] = parse_response(transfers.written(inner, 0.0).encode())
+                return {"count": 1}
+        del kept[inner["key"]]
+        return {}
+
+    rows = (
+        FollowedInfo(key="/a", owner="base", owner_key="/b", state="followed", size=12),
+        FollowedInfo(key="/c", owner="arm", owner_key="/c", state="refused", problem="it may not be read"),
+    )
+    server = ControlServer(
+        place.path, "pad", {"snapshot": lambda _: SNAPSHOT, "param": ask, "followed": lambda _: rows}
+    )
+    background.do(server.start())
+    yield kept
+    background.do(server.close())
+
+
+def test_a_peers(place: Place, peer: dict[str, Any]) -> None:
+    assert place.run("param", "get", "--peer", "base", "/speed") == (0, "1.5\n", "")
+    assert place.json("param", "get", "--peer", "base", "/big", "--json") == [peer["/big"]]
+    assert place.run("param", "list", "--peer", "base") == (0, "/big\n/speed\n", "")
+    (place.path / "text").write_text("é" * 40_000)
+    assert place.json("param", "set", "--peer", "base", "/new", "-t", "text", "--json") == [{"key": "/new", "set": 1}]
+    assert peer["/new"] == "é" * 40_000
+    assert place.run("param", "delete", "--peer", "base", "/new") == (0, "", "")
+    assert "/new" not in peer
+    code, _, err = place.run("param", "get", "--peer", "base", "/nothing")
+    assert code == 1
+    assert "there is no parameter /nothing" in err
+
+
+def test_followed(place: Place, peer: dict[str, Any]) -> None:
+    code, out, err = place.run("param", "followed")
+    assert code == 0
+    assert [line.split() for line in out.splitlines()] == [
+        ["KEY", "STATE", "OWNER", "SIZE"],
+        ["/a", "followed", "base:/b", "12", "B"],
+        ["/c", "refused", "arm:/c", "-"],
+    ]
+    assert err == "! /c: it may not be read\n"
+    assert place.json("param", "followed", "--json")[0][0]["owner_key"] == "/b"  # type: ignore[index]
+
+
+_SCALARS = (
+    st.booleans()
+    | st.integers(-(1 << 31), (1 << 31) - 1)
+    | st.floats(allow_nan=False)
+    | st.text(st.characters(exclude_categories=("Cs",)), max_size=200)
+    | st.binary(max_size=40)
+)
+_VALUES = st.recursive(
+    _SCALARS,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text("abn-1:#' ", min_size=1), inner, max_size=4),
+    max_leaves=12,
+)
+
+
+@given(_VALUES)
+def test_what_is_written_is_read_again(value: Any) -> None:
+    back = read_yaml(write_yaml(value), "x")
+    assert back == value
+    assert type(back) is type(value)
+    assert read_yaml(show_yaml(value), "x") == value
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("on", True), ("'on'", "on"), ("y", "y"), ("010", 8), ("0o7", "0o7"), ("1:30", 90), ("1e3", "1e3"),
+        ("1.0e+3", 1000.0), ("0x1f", 31), ("1_000", 1000), (".5", 0.5), ("!!str", ""), ("", ""), ("=", "="),
+        ("!!binary aGk=", b"hi"), ("deg(90)", math.pi / 2), ("rad(pi/2)", math.pi / 2), ("!degrees 180", math.pi),
+        ("!radians 2*pi", 2 * math.pi), ("rad(-(pi)/2)", "rad(-(pi)/2)"), ("<<: {a: 1}", {"a": 1}), ("-5", -5),
+    ],
+)  # fmt: skip
+def test_yaml_as_rosparam_reads_it(text: str, value: object) -> None:
+    found = read_yaml(text, "x")
+    assert found == value
+    assert type(found) is type(value)
+
+
+@pytest.mark.parametrize(
+    "text", ["rad(__import__)", "!radians x", "!degrees 1/0", "!radians 9**9**9", "&a [*a]", "!x 1"]
+)
+def test_what_is_no_angle_and_no_yaml(text: str) -> None:
+    with pytest.raises(RmpaError):
+        read_yaml(text, "x")
+
+
+def test_documents() -> None:
+    assert read_documents("a: 1\n---\nb: 2001-01-01\n", "x") == [
+        {"a": 1},
+        {"b": read_yaml("2001-01-01 00:00:00", "x")},
+    ]
+    assert json.loads(json.dumps(read_documents("", "x"))) == []
