@@ -123,6 +123,21 @@ GOLDEN: list[tuple[Message, bytes]] = [
     ),
     (Audience(7, ("/arm", "/move_base")), b'{"op":"audience","route":7,"nodes":["/arm","/move_base"]}'),
     (
+        AdvertiseServices(
+            added=(ServiceOffer("/add", "/rmpa/a/b", Origin("a", "10.0.0.1:4000#7", PAD, "/b", (R, R))),)
+        ),
+        (
+            b'{"op":"services","added":[{"service":"/add","node":"/rmpa/a/b","origin":{"name":"a","guid":'
+            b'"10.0.0.1:4000#7","instance":"'
+            + PAD.encode()
+            + b'","node":"/b","path":["'
+            + R.encode()
+            + b'","'
+            + R.encode()
+            + b'"]}}],"removed":[],"full":false,"more":false}'
+        ),
+    ),
+    (
         AdvertiseServices(added=(ServiceOffer("/add", "/adder"),), full=True),
         b'{"op":"services","added":[{"service":"/add","node":"/adder"}],"removed":[],"full":true,"more":false}',
     ),
@@ -195,6 +210,7 @@ def test_golden_bytes(message: Message, wire: bytes) -> None:
         relayed(path=["f" * 32] * 5),
         relayed(path=["f" * 31]),
         relayed(path="f" * 32),
+        relayed(path=[]).replace(b"advertise", b"services").replace(b"topic", b"service"),
         b'{"op":"opened","route":1,"description":{"type":"*","md5":"*","definition":"","latching":false}}',
         (
             b'{"op":"opened","route":1,"description":{"type":"a/B","md5":"5a9ea5f83505693b71e785041e67a8bb",'

@@ -9,6 +9,7 @@ import pytest
 
 from tests.interop.modules import Module, flows
 from tests.interop.processes import eventually
+from tests.interop.ros import lacks
 
 if TYPE_CHECKING:
     from tests.interop.conftest import AgentFactory, ShellFactory
@@ -137,6 +138,39 @@ def test_relays_pass_on_what_two_networks_without_a_router_publish(
     eventually(lambda: "a" not in b.agent.peers(), what="no way to a")
     b.wait_no_topic("/rmpa/a/talker", 1.0)
     assert "/rmpa/a/talker" not in b.ros.tool("rosnode", "list")
+
+
+def test_services_and_actions_go_by_a_relay_too(lab: Lab, agent: AgentFactory, shell: ShellFactory) -> None:
+    hosts = [lab.host("a", 0), lab.host("b", 1), lab.host("r", 0, 1)]
+    a, b, r = (Module(h, agent(h, name=h.name, config=RELAY if h.name == "r" else ""), shell(h)) for h in hosts)
+    full_mesh(a, r)
+    full_mesh(b, r)
+    a.ros.rospy("worker", service="/work", name="worker").wait_event("up")
+    caller = b.ros.rospy("caller", service="/work", wait=True, commands=True)
+    caller.wait_event("there")
+    for line, ok, errors in (
+        ("echo 0 200000 3 once", 3, []),
+        ("echo 0 64 20 persistent", 20, []),
+        ("fail 0 0 1 once", 0, ["the gripper is jammed"]),
+    ):
+        since = caller.mark_events()
+        caller.tell(line)
+        done = caller.wait_event("done", since=since)
+        assert (done["ok"], len(done["errors"])) == (ok, len(errors)), done  # type: ignore[arg-type]
+        assert all(text in str(done["errors"]) for text in errors), done
+    assert b.ros.tool("rosservice", "node", "/work").strip() == "/rmpa/a/worker"
+    assert "/work" in r.ros.tool("rosservice", "list").split()
+
+    if not lacks("actionlib"):
+        server = a.ros.rospy("action_server", name="server")
+        client = b.ros.roscpp("action_client", name="client", commands=True)
+        client.tell("server 30")
+        assert client.wait_event("server", 40.0)["found"] is True
+        since = client.mark_events()
+        client.tell("send 20")
+        done = client.wait_event("done", since=since)
+        assert (done["state"], done["result"]) == ("SUCCEEDED", 20)
+        server.kill()
 
 
 def test_a_relay_is_not_needed_where_there_is_a_way(lab: Lab, agent: AgentFactory, shell: ShellFactory) -> None:

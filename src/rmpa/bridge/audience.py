@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.messages import is_crossing_name
-from rmpa.bridge.policy import is_own
+from rmpa.bridge.policy import OWN_NODE
 from rmpa.core import limits
 
 if TYPE_CHECKING:
@@ -27,6 +27,9 @@ def is_watched(type_name: str) -> bool:
 
 
 def audience(caller_ids: Iterable[str]) -> tuple[str, ...]:
-    """The nodes to name to a publisher: sorted, each once, at most ``limits.AUDIENCE_MAX``, proxies left out."""
-    names = {name for name in caller_ids if is_crossing_name(name) and not is_own(name)}
+    """The nodes to name to a publisher: sorted, each once, at most ``limits.AUDIENCE_MAX``, but for the agent.
+
+    Proxies listen to proxies only where this module relays: there a listener of another module is named by it.
+    """
+    names = {name for name in caller_ids if is_crossing_name(name) and name != OWN_NODE}
     return tuple(sorted(names)[: limits.AUDIENCE_MAX])

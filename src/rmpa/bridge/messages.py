@@ -204,16 +204,18 @@ class Audience(msgspec.Struct, frozen=True, tag_field="op", tag="audience"):
     nodes: tuple[str, ...] = ()
 
 
-class ServiceOffer(msgspec.Struct, frozen=True):
+class ServiceOffer(msgspec.Struct, frozen=True, omit_defaults=True):
     """A service that the sender's graph has.
 
     Args:
         service: Its global name, as the receiver is to see it unless it renames it.
-        node: The node that provides it.
+        node: The node that provides it; where it is relayed: what stands for it in the sender's graph.
+        origin: Whose it is, if it is not the sender's own.
     """
 
     service: str
     node: str
+    origin: Origin | None = None
 
 
 class AdvertiseServices(msgspec.Struct, frozen=True, tag_field="op", tag="services"):
@@ -426,6 +428,8 @@ def _validate_service(message: ServiceMessage) -> None:
             raise LimitExceeded("advertisement (in services)", len(message.added), limits.SERVICES_PER_PEER_MAX)
         for offer in message.added:
             _check_names(offer.service, offer.node)
+            if offer.origin is not None:
+                _check_origin(offer.origin)
         _check_names(*message.removed)
         return
     _check_service_route(message.route)

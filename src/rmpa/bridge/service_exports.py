@@ -24,21 +24,24 @@ from rmpa.bridge.messages import (
     ServiceOpened,
     is_crossing_name,
 )
+from rmpa.bridge.relay import may_have
 from rmpa.core import limits
 from rmpa.core.errors import RemoteProtocolError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from rmpa.bridge.messages import Origin
     from rmpa.bridge.service_rules import ServiceRules
 
 
 @dataclass(frozen=True, slots=True)
 class LocalService:
-    """Who provides a service in the local graph: the node, and its ``rosrpc://`` address."""
+    """Who provides a service in the local graph: the node, its ``rosrpc://`` address, and whose it is if we relay."""
 
     node: str
     uri: str
+    origin: Origin | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +129,7 @@ class _Peer:
         sessions: What it has open, by its own route.
         routes: Counts our routes: even ones, the odd ones are for our own calls.
         beginning: Whether it has not heard everything once yet.
+        instance: The peer's run.
     """
 
     name: str
@@ -135,6 +139,7 @@ class _Peer:
     sessions: dict[int, _Session] = field(default_factory=dict)
     routes: int = 0
     beginning: bool = True
+    instance: str = ""
 
 
 class ServiceExports:
@@ -223,7 +228,8 @@ class ServiceExports:
 
     def _crosses(self, service: str, server: LocalService) -> bool:
         named = is_crossing_name(service) and is_crossing_name(server.node)
-        return named and self._rules.judge(service, server.node).allowed
+        node = server.node if server.origin is None else server.origin.node
+        return named and self._rules.judge(service, node).allowed
 
     def _end(self, service: str, reason: str) -> list[ExportAction]:
         """Its server is no longer what it was: end all routes to it."""
@@ -237,9 +243,9 @@ class ServiceExports:
 
     # --- telling -----------------------------------------------------------------------------------------------
 
-    def link_up(self, peer: int, name: str) -> list[ExportAction]:
-        """A link is up: ``tell`` begins with all we have."""
-        self._peers[peer] = _Peer(name, dict.fromkeys(self._crossing))
+    def link_up(self, peer: int, name: str, instance: str = "") -> list[ExportAction]:
+        """A link is up: ``tell`` begins with all we have, but for what came from that very run of the peer."""
+        self._peers[peer] = _Peer(name, dict.fromkeys(self._crossing), instance=instance)
         return [Send(peer, self._next(self._peers[peer], full=True))]
 
     def link_down(self, peer: int) -> list[ExportAction]:
@@ -265,21 +271,23 @@ class ServiceExports:
         for service in tuple(islice(peer.news, limits.ADVERTISED_AT_ONCE)):
             del peer.news[service]
             server = self._crossing.get(service)
-            wire = self._wire(peer, service) if server is not None else None
+            wire = self._wire(peer, service, server) if server is not None else None
             known = peer.told.get(service)
             if known is not None and (wire is None or known[0] != wire):
                 removed.append(known[0])
                 del peer.told[service]
                 del peer.wires[known[0]]
             if wire is not None and server is not None and known != (wire, server):
-                added.append(ServiceOffer(wire, server.node))
+                added.append(ServiceOffer(wire, server.node, server.origin))
                 peer.told[service] = (wire, server)
                 peer.wires[wire] = service
         peer.beginning = peer.beginning and bool(peer.news)
         return AdvertiseServices(added=tuple(added), removed=tuple(removed), full=full, more=peer.beginning)
 
-    def _wire(self, peer: _Peer, service: str) -> str | None:
+    def _wire(self, peer: _Peer, service: str, server: LocalService) -> str | None:
         """What a peer is to know a service by, if it may at all."""
+        if server.origin is not None and not may_have(peer.instance, server.origin):
+            return None
         wire = self._rules.wire_name(peer.name, service)
         if not is_crossing_name(wire) or not self._rules.judge_for(peer.name, service, wire).allowed:
             return None

@@ -30,13 +30,16 @@ from rmpa.bridge.messages import (
     ServiceOpened,
     is_crossing_name,
 )
+from rmpa.bridge.relay import Linked, Ways
 from rmpa.bridge.service_exports import About
 from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
+from rmpa.core.guid import Guid
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping
 
+    from rmpa.bridge.messages import Origin
     from rmpa.bridge.service_rules import ServiceRules
 
 
@@ -133,6 +136,7 @@ class RemoteService:
         due: While it is asked for: when that has taken too long, monotonic seconds.
         about: What it is, once known.
         problem: Why it could not be opened last, or empty.
+        origin: Whose it is, if its peer only passes it on.
     """
 
     wire: str
@@ -146,6 +150,7 @@ class RemoteService:
     due: float = 0.0
     about: About | None = None
     problem: str = ""
+    origin: Origin | None = None
 
 
 @dataclass(slots=True)
@@ -183,6 +188,8 @@ class ServiceImports:
     def __init__(self, rules: ServiceRules) -> None:
         self._rules = rules
         self._peers: dict[int, _Peer] = {}
+        self.ways = Ways()
+        """By which of its ways each module is reached whose services relays offer."""
         self._local: dict[str, str] = {}
         # By the name here: who offers it.
         self._claims: dict[str, dict[int, RemoteService]] = {}
@@ -210,7 +217,7 @@ class ServiceImports:
 
     # --- links -------------------------------------------------------------------------------------------------
 
-    def link_up(self, peer: int, name: str, rank: int) -> list[ImportAction]:
+    def link_up(self, peer: int, name: str, rank: int, instance: str = "") -> list[ImportAction]:
         """A link is up, of a new peer or of one that was away."""
         known = self._peers.get(peer)
         if known is None:
@@ -219,7 +226,20 @@ class ServiceImports:
             known.away = False
             known.serial = -1
             known.rank = rank
-        return []
+        return self._choose_of(self.ways.linked(peer, Linked(name, instance, Guid(rank)))) if instance else []
+
+    def unlinked(self, peer: int) -> list[ImportAction]:
+        """Behind ``gone``: relays may bring on what the peer brought."""
+        return self._choose_of(self.ways.unlinked(peer))
+
+    def _choose_of(self, instances: Collection[str]) -> list[ImportAction]:
+        """Some modules may be reached another way."""
+        touched = [
+            service
+            for service, claims in self._claims.items()
+            if any(remote.origin is not None and remote.origin.instance in instances for remote in claims.values())
+        ]
+        return [action for service in touched for action in self._choose(service)]
 
     def link_down(self, peer: int) -> list[ImportAction]:
         """A link is gone: nothing can be called; what was offered stays until ``gone``."""
@@ -268,7 +288,7 @@ class ServiceImports:
     def _offer(self, peer: int, known: _Peer, offer: ServiceOffer) -> list[ImportAction]:
         before = known.services.get(offer.service)
         actions: list[ImportAction] = []
-        if before is not None and before.node == offer.node:
+        if before is not None and (before.node, before.origin) == (offer.node, offer.origin):
             # The same once more: another server behind it, or a new link; what it is may have changed.
             before.about = None
             return [ForgetAbout(peer, before.name)] if before.shown else []
@@ -277,9 +297,11 @@ class ServiceImports:
         elif len(known.services) >= limits.SERVICES_PER_PEER_MAX:
             text = f"{known.name} offers more than {limits.SERVICES_PER_PEER_MAX} services; the rest is left out"
             return [Warn("services.too_many", known.name, text)]
-        name = self._rules.local_name(known.name, offer.service)
-        remote = known.services[offer.service] = RemoteService(offer.service, offer.node, name)
+        name = self._rules.local_name(offer.origin.name if offer.origin else known.name, offer.service)
+        remote = known.services[offer.service] = RemoteService(offer.service, offer.node, name, origin=offer.origin)
         known.nodes[offer.node] += 1
+        if offer.origin is not None and self.ways.learn(peer, offer.origin):
+            actions += self._choose_of({offer.origin.instance})
         if not is_crossing_name(name):
             remote.hidden = f"the rules of names make {name!r} of it"
             return actions
@@ -299,6 +321,7 @@ class ServiceImports:
         if not known.nodes[remote.node]:
             del known.nodes[remote.node]
         actions = self._end(peer, remote.route, reason) if remote.route else []
+        another_way = remote.origin is not None and self.ways.forget(peer, remote.origin)
         if remote.shown:
             remote.shown = False
             actions.append(Withdraw(peer, remote.name, remote.node, reason))
@@ -309,6 +332,8 @@ class ServiceImports:
                 actions += self._choose(remote.name)
             else:
                 del self._claims[remote.name]
+        if remote.origin is not None and another_way:
+            actions += self._choose_of({remote.origin.instance})
         return actions
 
     # --- who is shown ------------------------------------------------------------------------------------------
@@ -327,9 +352,9 @@ class ServiceImports:
         actions: list[ImportAction] = []
         for number, known in self._peers.items():
             for wire, remote in list(known.services.items()):
-                if rules.local_name(known.name, wire) != remote.name:
+                if rules.local_name(remote.origin.name if remote.origin else known.name, wire) != remote.name:
                     actions += self._remove(number, wire, "a rule has another name for it now")
-                    actions += self._offer(number, known, ServiceOffer(wire, remote.node))
+                    actions += self._offer(number, known, ServiceOffer(wire, remote.node, remote.origin))
         for service in list(self._claims):
             actions += self._choose(service)
         return actions
@@ -358,9 +383,13 @@ class ServiceImports:
         return actions
 
     def _objection(self, service: str, number: int, remote: RemoteService) -> str | None:
-        decision = self._rules.judge(service, remote.node)
-        if decision.allowed:
-            decision = self._rules.judge_for(self._peers[number].name, service, remote.wire)
+        origin = remote.origin
+        if origin is not None and (why := self.ways.why_not(number, origin)):
+            return why
+        decision = self._rules.judge(service, remote.node if origin is None else origin.node)
+        for name in (self._peers[number].name, *([origin.name] if origin is not None else ())):
+            if decision.allowed:
+                decision = self._rules.judge_for(name, service, remote.wire)
         if not decision.allowed:
             return f"policy: {decision.rule}"
         nodes = self._peers[number].nodes

@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from rmpa.bridge.aio.part import DataTaker, Part
+    from rmpa.bridge.relay import Place
     from rmpa.bridge.watch import Occurred
     from rmpa.core.config import Settings
     from rmpa.mesh.aio.link import MeshLink
@@ -586,7 +587,12 @@ class Bridge:
             breathe()
             if again := attached.inbound.reconcile(publishers):
                 self.counters.add("proxy.registered_again", again)
-        self._relayed = {i: prefix for i, prefix in self._relayed.items() if i in self._imports.ways}
+        used = {name for attached in self._by_number.values() for name in attached.inbound.names.values()}
+        self._relayed = {
+            instance: prefix
+            for instance, prefix in self._relayed.items()
+            if any(name.startswith(f"{prefix}/") for name in used)
+        }
         for part in self._parts:
             breathe()
             part.reconcile()
@@ -714,14 +720,24 @@ class Bridge:
                 attached.inbound.detach(action)
 
     def _publish(self, attached: Attached, action: act.Publish) -> None:
-        source, origin, who = action.source, action.origin, attached.link.identity
-        name = proxy_name(attached.inbound.prefix, source.node)
-        if origin is not None:
-            name = attached.inbound.names[source.node] = self._stands_for(origin)
-        if self.relay.enabled:
-            whose = origin or Origin(who.name, str(who.guid), who.instance.hex(), source.node)
-            self.relay.shown(action.peer, source, (action.topic or source.topic, name), whose)
+        source = action.source
+        name = self.stand_in(attached, source.node, action.origin)
+        self.relay_on(attached, source, (action.topic or source.topic, name), action.origin)
         attached.inbound.publish(action)
+
+    def stand_in(self, attached: Attached, node: str, origin: Origin | None) -> str:
+        """The name of what stands here for a node of a peer, or for one that it passes on."""
+        if origin is None:
+            return proxy_name(attached.inbound.prefix, node)
+        name = attached.inbound.names[node] = self._stands_for(origin)
+        return name
+
+    def relay_on(self, attached: Attached, source: Source, place: Place, origin: Origin | None) -> None:
+        """Let what a peer brings be offered to others, if this module relays."""
+        if self.relay.enabled:
+            who = attached.link.identity
+            whose = origin or Origin(who.name, str(who.guid), who.instance.hex(), source.node)
+            self.relay.shown(attached.peer, source, place, whose)
 
     def _warn(self, kind: str, who: str, text: str) -> None:
         self._refusals.refuse(self._loop.time(), kind, who, text)

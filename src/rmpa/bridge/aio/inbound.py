@@ -284,6 +284,8 @@ class Inbound:
         for proxy, topic in missing:
             self._register(proxy, topic)
         if self._jobs.empty():
+            there = {*self._proxies, *(source.node for source in self._wanted), *(node for node, _ in self._holds)}
+            self.names = {node: name for node, name in self.names.items() if node in there}
             for source, action in breathing(list(self._wanted.items())):
                 if self.publication(source) is None:
                     self._jobs.put_nowait(action)

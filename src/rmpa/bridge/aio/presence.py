@@ -13,7 +13,7 @@ from rmpa.bridge.aio.part import Part
 from rmpa.bridge.audience import audience, is_watched
 from rmpa.bridge.imports import RouteState
 from rmpa.bridge.messages import Audience, encode
-from rmpa.bridge.proxy_names import proxy_name
+from rmpa.bridge.proxy_names import proxied_node, proxy_name
 from rmpa.core import limits
 from rmpa.ros.aio.subscription import PublisherConnection
 
@@ -117,7 +117,7 @@ class Presence(Part):
             return True
         if self._exports.description(source) is None:
             return True  # its publisher has just gone
-        names = {proxy_name(attached.inbound.prefix, node) for node in message.nodes}
+        names = {name for node in message.nodes if (name := self._name(attached, node))}
         shown = self._shown.setdefault((attached.peer, source), {})
         for name in shown.keys() - names:
             shown.pop(name).close()
@@ -131,6 +131,14 @@ class Presence(Part):
         if not shown:
             del self._shown[attached.peer, source]
         return True
+
+    def _name(self, attached: Attached, node: str) -> str:
+        """What a listener is here; one that a relay names for another module is what stands for that; else empty."""
+        whose = proxied_node(node)
+        if whose is None:
+            return proxy_name(attached.inbound.prefix, node)
+        relay = attached.link.name
+        return node if any((o.name, via) == (whose[0], relay) for o, via in self._imports.ways) else ""
 
     def _count(self, peer: int) -> int:
         return sum(len(shown) for (owner, _), shown in self._shown.items() if owner == peer)

@@ -25,6 +25,7 @@ from rmpa.bridge.messages import (
     OpenService,
     ServiceClosed,
     ServiceOpened,
+    Source,
     encode,
 )
 from rmpa.bridge.naming import Names
@@ -178,8 +179,10 @@ class Services(Part):
             grace.cancel()
         self._attached[peer] = attached
         self._budgets[peer] = Budgets()
-        self._act(self.imports.link_up(peer, link.name, link.guid.value))
-        self._act(self.exports.link_up(peer, link.name))
+        instance = link.identity.instance.hex()
+        self.imports.ways.instance = self._bridge.relay.instance
+        self._act(self.imports.link_up(peer, link.name, link.guid.value, instance))
+        self._act(self.exports.link_up(peer, link.name, instance))
         for shown in [one for one in self._shown.values() if one.peer == peer and (one.waiting or one.asking)]:
             self._want(shown)
         self._schedule()
@@ -199,6 +202,7 @@ class Services(Part):
     def gone(self, attached: Attached) -> None:
         """The peer will not come back."""
         self._stay_away(attached.peer)
+        self._act(self.imports.unlinked(attached.peer))
         self._attached.pop(attached.peer, None)
         self._budgets.pop(attached.peer, None)
 
@@ -283,7 +287,14 @@ class Services(Part):
         local = next((LocalService(node, uri) for node, uri in providers.items() if not is_own(node)), None)
         # That it is taken is known before it is told on: nobody may be shown two of a name.
         self._act(self.imports.local(service, local.node if local is not None else None))
-        self._act(self.exports.graph(service, local))
+        self._act(self.exports.graph(service, local or self._to_relay(service, providers)))
+
+    def _to_relay(self, service: str, providers: Mapping[str, str]) -> LocalService | None:
+        """What of a service is passed on for another module."""
+        for node, uri in providers.items():
+            if (origin := self._bridge.relay.origin(_relayed(service, node))) is not None:
+                return LocalService(node, uri, origin)
+        return None
 
     def _learn(self) -> None:
         """Take in a portion of what a peer provides."""
@@ -360,6 +371,14 @@ class Services(Part):
         attached = self._attached.get(action.peer)
         if attached is None:
             return
+        remote = self.imports.get(action.peer, action.service)
+        name = self._bridge.stand_in(attached, action.node, remote.origin if remote is not None else None)
+        self._bridge.relay_on(
+            attached,
+            Source(f"service {action.service}", action.node),
+            _relayed(action.service, name),
+            remote.origin if remote is not None else None,
+        )
         shown = self._shown[action.peer, action.service] = Shown(action.peer, action.service, action.node)
         attached.inbound.hold(action.node, f"service {action.service}", lambda proxy: self._expose(shown, proxy))
 
@@ -388,6 +407,7 @@ class Services(Part):
             _log.error("! the local core does not take %s of %s: %s", shown.service, proxy.name, status)
 
     def _withdraw(self, action: Withdraw) -> None:
+        self._bridge.relay.gone(action.peer, Source(f"service {action.service}", action.node))
         shown = self._shown.pop((action.peer, action.service), None)
         if shown is None:
             return
@@ -488,6 +508,11 @@ class Services(Part):
         self._refusals.refuse(
             self._loop.time(), "service.mismatch_remote", attached.link.name, f"{attached.link.name}: {text}"
         )
+
+
+def _relayed(service: str, node: str) -> tuple[str, str]:
+    """A service's place among what is relayed: a topic may have its name."""
+    return f"service {service}", node
 
 
 def _description(about: About) -> ServiceDescription:
