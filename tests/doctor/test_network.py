@@ -44,6 +44,11 @@ def test_no_network_at_all() -> None:
     assert only(judge_cards((LO,), ()), Level.WARN).remedy == "plug in a network"
 
 
+def test_settings_that_keep_to_loopback_mean_it() -> None:
+    (found,) = judge_cards((LO, Card("eth0", ETH.networks, used=False)), ("lo",))
+    assert (found.subject, found.level) == ("lo", Level.OK)
+
+
 def test_an_interface_that_the_settings_name_and_that_is_not_there() -> None:
     warned = only(judge_cards((LO, WLAN), ("wlan0", "eth7")), Level.WARN)
     assert warned.subject == "eth7"

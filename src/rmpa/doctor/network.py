@@ -70,7 +70,11 @@ def judge_cards(cards: Sequence[Card], wanted: Sequence[str], *, container: bool
         text = f"the settings name it, and it is not here (there are {have})"
         found.append(Finding("interface", name, Level.WARN, text, "correct discovery.interfaces, or plug it in"))
     outer = [card for card in cards if card.used and not card.loopback]
-    if not outer:
+    kept = [card.name for card in cards if card.loopback and card.name in wanted]
+    if not outer and kept and not missing:
+        text = "the settings keep agents to this machine"
+        found.append(Finding("interface", kept[0], Level.OK, text))
+    elif not outer:
         down = [card.name for card in cards if not card.loopback]
         text = "none but loopback can be used: agents of other machines are not found"
         remedy = f"see `ip address`: {', '.join(down)} need to be up and have an IPv4 address" if down else ""
