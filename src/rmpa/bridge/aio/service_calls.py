@@ -97,9 +97,8 @@ class Caller(BodyTaker):
         self._serial = serial = self._serial + 1 & _MASK
         call.on_gone = partial(self._gone, serial)
         now = self.used_at = self._loop.time()
-        self._pending[serial] = (call, now, False)
-        if self._sender.send(serial, call.request):
-            self._pending[serial] = (call, now, True)
+        self._pending[serial] = (call, now, size > limits.EXPRESS_MESSAGE_MAX)
+        self._sender.send(serial, call.request)
 
     def body(self, sequence: int, body: bytes | bytearray) -> None:
         """A reply came; one that nobody waits for any more is dropped."""
