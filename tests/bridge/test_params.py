@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import pytest
 
 from rmpa.bridge.params import ParamPolicy, follow_rules, key_problem, leaves
 from rmpa.core.config import FollowRule, ParamSettings, TimeSettings
+
+if TYPE_CHECKING:
+    from rmpa.ros.xmlrpc import XmlRpcValue
 
 POLICY = ParamPolicy(
     ParamSettings(
@@ -59,7 +64,7 @@ def test_names_that_are_none(key: object) -> None:
 
 
 def test_leaves() -> None:
-    value = {"a": 1, "b": {"c": [1], "d": {}}, "e": {"f": "x"}}
+    value: XmlRpcValue = {"a": 1, "b": {"c": [1], "d": {}}, "e": {"f": "x"}}
     assert list(leaves("/x", value)) == [("/x/a", 1), ("/x/b/c", [1]), ("/x/e/f", "x")]
     assert list(leaves("/", {"a": 1})) == [("/a", 1)]
     assert list(leaves("/x", 5)) == [("/x", 5)]

@@ -75,11 +75,11 @@ BASE = '[[param]]\nkey = "/a"\nfrom = "base"\n'
         (BASE.replace("/a", "/" + "a" * 2000), "2: param.key: a name of 2001 characters"),
         (BASE.replace("base", "robot-1"), "3: param.from: 'robot-1' is not a ROS base name"),
         (BASE.replace("base", "pad"), "3: param.from: pad is this module itself"),
-        (BASE + 'to = "/run_id"', "4: param.to: /run_id cannot be followed: /run_id: it names the run"),
+        (BASE + 'to = "/run_id"', "4: param.to: /run_id cannot be followed: it names the run"),
         (BASE + 'to = "/roslaunch"', "4: param.to: /roslaunch cannot be followed"),
         (
             BASE.replace("/a", "/use_sim_time"),
-            "2: param.key: /use_sim_time cannot be followed: /use_sim_time: time is",
+            "2: param.key: /use_sim_time cannot be followed: time is",
         ),
         (BASE + BASE, "4: param: /a cannot come from base too: /a comes from base's /a already; a parameter has one"),
         (

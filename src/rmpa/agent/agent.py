@@ -113,7 +113,7 @@ class Agent:
             started=time.time(),
             wishes=wishes,
         )
-        self.params = Params(self.core, self.bridge, settings.name, settings.params, settings.time)
+        self.params = Params(self.core, self.bridge, settings.params, settings.time)
         self.bridge.add(self.params)
         rules = ServiceRules(
             settings.services, Policy(settings.policy, settings.peers, settings.time), Names(settings.peers)

@@ -12,7 +12,7 @@ from rmpa.bridge import param_transfer as transfer
 from rmpa.bridge.params import key_problem, leaves
 from rmpa.cli.master import Master, choose_master
 from rmpa.core.config_values import did_you_mean
-from rmpa.core.errors import ConfigError, LocalProtocolError, RmpaError, UnreachableError
+from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.names import is_legal_name
 from rmpa.monitor.aio.control_client import ControlClient, choose_agent
 
@@ -221,4 +221,7 @@ class PeerStore:
 
     def _ask(self, question: transfer.Question) -> object:
         what, args = question
-        return self.client.call("param", dict[str, Any], peer=self.peer, what=what, args=args)
+        try:
+            return self.client.call("param", dict[str, Any], peer=self.peer, what=what, args=args)
+        except PeerRefused as error:
+            raise RmpaError(error.reason) from None  # our agent only passes on what the peer's says

@@ -30,7 +30,7 @@ def untouchable(key: str) -> str:
     """Why a key may not be changed from another module: it, one below it or one above it is untouchable; or empty."""
     for pattern, why in UNTOUCHABLE.items():
         if matches(pattern, key) or overlap(pattern.removesuffix("/**"), key):
-            return f"{pattern}: {why}"
+            return why if pattern == key.rstrip("/") else f"{pattern}: {why}"
     return ""
 
 

@@ -78,7 +78,7 @@ class Side:
             node=SimpleNamespace(uri=OURS), asks=self.asks, counters=self.counters, attached=self.links.values
         )
         self.params = Params(
-            cast("Core", self.core), cast("Bridge", bridge), name, params or ParamSettings(), time or TimeSettings()
+            cast("Core", self.core), cast("Bridge", bridge), params or ParamSettings(), time or TimeSettings()
         )
         self.core.told = self.params.param_update
 

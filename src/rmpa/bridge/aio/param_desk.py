@@ -14,7 +14,7 @@ from rmpa.bridge.params import key_problem, leaves
 from rmpa.core import limits
 from rmpa.core.aio.loop import breathe, breathing
 from rmpa.core.config_param import overlap
-from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError
+from rmpa.core.errors import LocalProtocolError, RmpaError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -34,14 +34,12 @@ class ParamDesk:
         core: The local core.
         policy: What peers may do.
         asks: Gets the handlers.
-        name: This module's, for the text of errors.
     """
 
-    def __init__(self, core: ParamCore, policy: ParamPolicy, asks: Asks, name: str) -> None:
+    def __init__(self, core: ParamCore, policy: ParamPolicy, asks: Asks) -> None:
         self._core = core
         self.policy = policy
         self._asks = asks
-        self._name = name
         self._transfers: dict[int, transfer.Transfers] = defaultdict(transfer.Transfers)
         self._followers: dict[int, tuple[Attached, set[str]]] = {}
         self._last: dict[str, str | None] = {}
@@ -117,7 +115,7 @@ class ParamDesk:
         found, value = await self._core.get(key)
         self._refuse(self._why_not_get(key, value))
         if not found:
-            raise PeerRefused(self._name, f"there is no parameter {key}")
+            raise RmpaError(f"there is no parameter {key}")
         return self._of(attached).answer(await write_text(key, value), self._now())
 
     async def _names(self, attached: Attached, _args: dict[str, Any]) -> dict[str, object]:
@@ -142,7 +140,7 @@ class ParamDesk:
         key = self._key(args.get("key"))
         self._refuse(self.policy.why_not_set(key))
         if not await self._core.delete(key, PEERS):
-            raise PeerRefused(self._name, f"there is no parameter {key}")
+            raise RmpaError(f"there is no parameter {key}")
         _log.info("< %s deletes parameter %s", attached.link.name, key)
         return {}
 
@@ -150,7 +148,7 @@ class ParamDesk:
         """From now on a peer follows these keys, and none of those that it did before."""
         keys = args.get("keys")
         if not isinstance(keys, list) or len(keys) > limits.FOLLOWERS_KEYS_MAX:
-            raise PeerRefused(self._name, f"keys is not a list of at most {limits.FOLLOWERS_KEYS_MAX} parameters")
+            raise RmpaError(f"keys is not a list of at most {limits.FOLLOWERS_KEYS_MAX} parameters")
         refused: dict[str, str] = {}
         wanted: set[str] = set()
         for given in keys:
@@ -182,7 +180,7 @@ class ParamDesk:
 
     def _refuse(self, why: str) -> None:
         if why:
-            raise PeerRefused(self._name, why)
+            raise RmpaError(why)
 
     # --- news ----------------------------------------------------------------------------------------------------
 

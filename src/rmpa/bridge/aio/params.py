@@ -33,14 +33,13 @@ class Params(Part):
     Args:
         core: The local core.
         bridge: Its node is told of changes, its asks carry the questions; add this part to it.
-        name: This module's.
         params: What peers may do, and what is followed.
         time: Whether time is shared, and whose is followed.
     """
 
-    def __init__(self, core: Core, bridge: Bridge, name: str, params: ParamSettings, time: TimeSettings) -> None:
+    def __init__(self, core: Core, bridge: Bridge, params: ParamSettings, time: TimeSettings) -> None:
         self._core = ParamCore(core, bridge.node)
-        self._desk = ParamDesk(self._core, ParamPolicy(params, time), bridge.asks, name)
+        self._desk = ParamDesk(self._core, ParamPolicy(params, time), bridge.asks)
         self._follower = ParamFollower(
             self._core, bridge.asks, bridge.attached, follow_rules(params, time), bridge.counters
         )
