@@ -1,6 +1,7 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import re
+from pathlib import Path
 
 import pytest
 
@@ -8,8 +9,7 @@ from rmpa.core.config import PeerRule, PolicySettings, Remap
 from rmpa.core.config_sources import Flags, Loaded, load_settings
 from rmpa.core.errors import ConfigError
 
-if TYPE_CHECKING:
-    from pathlib import Path
+ROOT = Path(__file__).parents[2]
 
 
 def load(tmp_path: Path, text: str) -> Loaded:
@@ -92,6 +92,11 @@ PEER = '[[peer]]\nname = "r"\n'
 )
 def test_what_cannot_be_meant_is_refused_with_its_line(tmp_path: Path, text: str, says: str) -> None:
     assert says in refused(tmp_path, text)
+
+
+def test_the_documentation_s_examples_load(tmp_path: Path) -> None:
+    blocks = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "names.md").read_text(), re.DOTALL)
+    assert [load(tmp_path, block).notes for block in blocks] == [()] * 3
 
 
 def test_names_that_only_look_alike_are_taken(tmp_path: Path) -> None:

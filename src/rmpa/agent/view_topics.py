@@ -169,6 +169,7 @@ class TopicsView:
         flow = self._bridge.outbound.flows.get(source)
         leg = flow.by_peer.get(peer) if flow else None
         contract = self._bridge.exports.contract(source, peer)
+        offer = self._bridge.exports.offer(peer, source)
         return RouteInfo(
             peer=name,
             node=source.node,
@@ -180,6 +181,7 @@ class TopicsView:
             bytes=flow.bytes - LENGTH.size * flow.messages if flow else 0,
             dropped=flow.dropped if flow else 0,
             latched=about.latching if about else False,
+            wire=offer.topic if offer is not None and offer.topic != source.topic else "",
             lane=leg.lane if leg else "",
             contract=_contract(contract or self._contracts.of(source.topic, local.type)),
         )

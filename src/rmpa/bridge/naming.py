@@ -7,7 +7,7 @@
     /cmd_vel ◄─── /cmd_vel ◄─out─ /robot1/cmd_vel
 
 The first rule that fits renames a name, once; its outcome is not looked at again. What stands here for a node of
-another module is never passed on under any name, so no rule can send a message round.
+another module is not passed on but by a relay, and never back to where it came from: no rule sends a message round.
 """
 
 from __future__ import annotations

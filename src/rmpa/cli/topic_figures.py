@@ -78,6 +78,8 @@ def losses_text(route: RouteInfo) -> str:
 
 def facts(route: RouteInfo) -> Iterator[tuple[str, str]]:
     """All that is known of a route, a label and a text each."""
+    if route.wire:
+        yield "there", route.wire
     if route.lane:
         yield "lane", route.lane
     if route.direction == "in" and route.messages:
