@@ -566,6 +566,10 @@ DESCRIPTOR_MAX: Final = 1 * MIB
 """Characters of a resource's descriptor: one with a hundred profiles of twenty attributes has some 100 KB."""
 REQUIREMENT_TEXT_MAX: Final = 1024
 """Characters in what is asked of one attribute."""
+TASK_QUEUE_MESSAGES: Final = 10
+"""Messages of its input that wait for a task; the oldest is dropped beyond it: control acts on the newest."""
+TASK_END_TIMEOUT: Final = 2.0
+"""How long an ending resource waits for a task's last run; a thread that is stuck is left behind."""
 REQUIREMENT_BOUNDS_MAX: Final = 256
 """Attributes that one client asks for."""
 

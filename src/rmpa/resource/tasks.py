@@ -13,12 +13,12 @@ RESTART_MAX: Final = 5.0
 STUCK_PERIODS: Final = 10
 """A run that takes so many periods is stuck, unless the task says otherwise."""
 STUCK_LEAST: Final = 5.0
-"""None is stuck sooner than after so many seconds, unless the task says otherwise."""
+"""No run is stuck sooner than after so many seconds, unless the task says otherwise."""
 _EARLY: Final = 1e-9
 
 
 class Schedule:
-    """The times at which a periodic task is due: start, start + period, start + 2 periods …
+    """The times at which a periodic task is due: start, start + period, start + 2 periods and so on.
 
     Absolute, so that no lateness adds up. A time that is a whole period past is left out.
 

@@ -11,19 +11,12 @@ from rmpa.resource.declare import Input, Output, Resource
 from rmpa.resource.descriptor import Descriptor
 from rmpa.ros.aio.core import RosCore
 from rmpa.ros.aio.node import Node
-from rmpa.ros.messages import MessageError, MessageType
+from rmpa.ros.messages import MessageError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from rmpa.ros.aio.topics import Received
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _warm() -> None:
-    """Import numpy and rosbags before a test watches for blocking calls."""
-    kind = MessageType("std_msgs/String")
-    kind.deserialize(kind.serialize(kind.make()))
 
 
 @pytest.fixture

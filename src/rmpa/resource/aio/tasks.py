@@ -1,0 +1,366 @@
+"""Runs the tasks of a resource: each periodic one on an absolute schedule, each other one on its input's messages.
+
+A plain function has a thread of its own, so that it may block and sleep; a coroutine function runs in the loop. One
+that raises is reported and goes on after a pause that grows (or ends, as it was declared). One that does not come
+back is reported as stuck: a coroutine is cancelled; a thread cannot be, so it is given up, and a new one takes over.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import threading
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Any, Final
+
+from rmpa.core import limits
+from rmpa.core.aio.timerfd import TimerFd
+from rmpa.resource.aio.runtime import RuntimePart
+from rmpa.resource.declare import OnFailure
+from rmpa.resource.tasks import Schedule, TaskFigures, restart_delay, stuck_after
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from rmpa.resource.aio.runtime import Runtime
+    from rmpa.resource.declare import Input, Task
+    from rmpa.resource.tasks import TaskReport
+    from rmpa.ros.aio.topics import Received
+
+_log = logging.getLogger(__name__)
+_LOOK: Final = 0.25
+"""Seconds between looks whether a task is stuck."""
+_SLICE: Final = 0.1
+"""Seconds that a thread sleeps at most without a look whether it is to end."""
+
+
+class TaskProblem:
+    """What went wrong with a task, for the diagnostics and the log."""
+
+    def __init__(self, task: Task, kind: str, text: str) -> None:
+        self.task = task
+        self.kind = kind
+        """``failed``, ``stuck`` or ``stopped``."""
+        self.text = text
+
+    def __str__(self) -> str:
+        """Say which task, and what."""
+        return f"task {self.task.name} {self.kind}: {self.text}"
+
+
+class Tasks(RuntimePart):
+    """All tasks of one resource.
+
+    Args:
+        runtime: Of the resource.
+        on_problem: Called in the loop.
+        on_deactivate: Called in the loop with the reason when a task's failure is to deactivate the resource.
+    """
+
+    def __init__(
+        self,
+        runtime: Runtime,
+        *,
+        on_problem: Callable[[TaskProblem], None],
+        on_deactivate: Callable[[str], None],
+    ) -> None:
+        self._runtime = runtime
+        self._on_problem = on_problem
+        self._on_deactivate = on_deactivate
+        self._runners: dict[str, _Runner] = {}
+        self._looker: asyncio.TimerHandle | None = None
+
+    @property
+    def running(self) -> Mapping[str, str]:
+        """By task: ``running``, ``waiting`` (it failed and pauses) or ``stopped`` and why."""
+        return {name: runner.state for name, runner in self._runners.items()}
+
+    def activate(self) -> None:
+        """Begin all tasks."""
+        for task in self._runtime.resource.tasks.values():
+            self._begin(task)
+        self._look()
+
+    async def deactivate(self) -> None:
+        """End all tasks; returns when none runs any more, but for those that are stuck."""
+        if self._looker is not None:
+            self._looker.cancel()
+            self._looker = None
+        runners, self._runners = list(self._runners.values()), {}
+        for runner in runners:
+            runner.stop()
+        await asyncio.gather(*(runner.ended() for runner in runners))
+
+    async def close(self) -> None:
+        """End with the resource."""
+        await self.deactivate()
+
+    def reports(self, now: float) -> dict[str, TaskReport]:
+        """What was measured of each task since the last call."""
+        return {name: runner.figures.window(now) for name, runner in self._runners.items()}
+
+    def received(self, item: Input, message: Received) -> None:
+        """Hand a message to the tasks that run on its input."""
+        for runner in self._runners.values():
+            if runner.task.on is item:
+                runner.give(message)
+
+    # --- inside -------------------------------------------------------------------------------------------------
+
+    def _begin(self, task: Task) -> None:
+        kind = _AsyncRunner if asyncio.iscoroutinefunction(task.function) else _ThreadRunner
+        runner = kind(task, self._runtime, lambda text: self._failed(task, text))
+        self._runners[task.name] = runner
+        runner.start()
+
+    def _failed(self, task: Task, text: str) -> None:
+        """A run raised; called in the loop."""
+        runner = self._runners.get(task.name)
+        if runner is None:
+            return
+        self._on_problem(TaskProblem(task, "failed", text))
+        if task.on_failure is not OnFailure.RESTART:
+            self._end(runner, text)
+
+    def _end(self, runner: _Runner, text: str) -> None:
+        runner.stop()
+        runner.over = text
+        self._on_problem(TaskProblem(runner.task, "stopped", text))
+        if runner.task.on_failure is OnFailure.DEACTIVATE:
+            self._on_deactivate(f"task {runner.task.name}: {text}")
+
+    def _look(self) -> None:
+        """See whether a task is stuck."""
+        self._looker = asyncio.get_running_loop().call_later(_LOOK, self._look)
+        now = time.monotonic()
+        for runner in list(self._runners.values()):
+            since = runner.figures.running_since
+            if since is None or runner.stopped or now - since < runner.patience:
+                continue
+            text = f"a run has not ended for {now - since:.3g} s"
+            self._on_problem(TaskProblem(runner.task, "stuck", text))
+            runner.stop(stuck=True)
+            if runner.task.on_failure is OnFailure.RESTART:
+                self._begin(runner.task)
+            else:
+                self._end(runner, text)
+
+
+class _Runner:
+    """Runs one task until it is stopped."""
+
+    def __init__(self, task: Task, runtime: Runtime, on_failed: Callable[[str], None]) -> None:
+        period = 1 / task.rate if task.rate else None
+        self.task = task
+        self.waiting = False
+        """Whether it pauses after a failure."""
+        self.over = ""
+        """Why it ended by itself, or empty."""
+        self.stopped = False
+        self.patience = stuck_after(period, task.stuck_after)
+        self.figures = TaskFigures(period, time.monotonic())
+        self._period = period
+        self._runtime = runtime
+        self._on_failed = on_failed
+        self._messages: deque[Received] = deque()
+
+    @property
+    def state(self) -> str:
+        """For people."""
+        if self.over:
+            return f"stopped: {self.over}"
+        return "waiting" if self.waiting else "running"
+
+    def start(self) -> None:
+        raise NotImplementedError
+
+    def stop(self, *, stuck: bool = False) -> None:
+        raise NotImplementedError
+
+    async def ended(self) -> None:
+        raise NotImplementedError
+
+    def wake(self) -> None:
+        raise NotImplementedError
+
+    def give(self, message: Received) -> None:
+        """Queue a message; the oldest gives way."""
+        if len(self._messages) >= limits.TASK_QUEUE_MESSAGES:
+            self._messages.popleft()
+            self.figures.dropped()
+        self._messages.append(message)
+        self.wake()
+
+    def _arguments(self, message: Received | None) -> tuple[Any, ...]:
+        return () if message is None else (message.message,)
+
+    def _error(self, error: BaseException) -> str:
+        text = f"{type(error).__name__}: {error}"
+        _log.warning("! task %s failed: %s", self.task.name, text, exc_info=error)
+        return text
+
+
+class _AsyncRunner(_Runner):
+    """A coroutine function, in the loop."""
+
+    def start(self) -> None:
+        """Begin."""
+        self._wake = asyncio.Event()
+        self._task = asyncio.get_running_loop().create_task(self._run(), name=f"task {self.task.name}")
+
+    def stop(self, *, stuck: bool = False) -> None:  # noqa: ARG002 - a coroutine can always be cancelled
+        """End, in the middle of a run too."""
+        self.stopped = True
+        self._task.cancel()
+
+    async def ended(self) -> None:
+        """Wait until it has."""
+        await asyncio.wait([self._task], timeout=limits.TASK_END_TIMEOUT)
+
+    def wake(self) -> None:
+        """A message is there."""
+        self._wake.set()
+
+    async def _run(self) -> None:
+        if self._period is None:
+            await self._on_messages()
+            return
+        with TimerFd(blocking=False) as timer:
+            loop = asyncio.get_running_loop()
+            loop.add_reader(timer.fileno(), self._wake.set)
+            try:
+                await self._periodically(self._period, timer)
+            finally:
+                loop.remove_reader(timer.fileno())
+
+    async def _periodically(self, period: float, timer: TimerFd) -> None:
+        schedule = Schedule(period, time.monotonic())
+        while True:
+            missed = schedule.missed
+            due = schedule.next_due(time.monotonic())
+            self.figures.missed(schedule.missed - missed)
+            timer.set(due)
+            while not timer.wait():
+                self._wake.clear()
+                await self._wake.wait()
+            if not await self._once(due, None):
+                schedule = Schedule(period, time.monotonic())
+
+    async def _on_messages(self) -> None:
+        while True:
+            while self._messages:
+                message = self._messages.popleft()
+                await self._once(message.stamp_ns / 1e9 - time.time() + time.monotonic(), message)
+            self._wake.clear()
+            await self._wake.wait()
+
+    async def _once(self, due: float, message: Received | None) -> bool:
+        """One run; false after a failure and its pause."""
+        self.figures.begun(due, time.monotonic())
+        try:
+            outcome = self.task.function(*self._arguments(message))
+            if outcome is not None:
+                await outcome
+        except Exception as error:  # noqa: BLE001 - the top of the user's code
+            text = await asyncio.to_thread(self._error, error)  # the traceback reads source files
+        else:
+            self.figures.ended(time.monotonic())
+            return True
+        self.figures.ended(time.monotonic(), text)
+        self._on_failed(text)
+        self.waiting = True
+        await asyncio.sleep(restart_delay(self.figures.in_a_row))
+        self.waiting = False
+        self.figures.interrupted()
+        return False
+
+
+class _ThreadRunner(_Runner):
+    """A plain function, in a thread of its own."""
+
+    def start(self) -> None:
+        """Begin."""
+        self._end = threading.Event()
+        self._ready = threading.Semaphore(0)
+        self._loop = asyncio.get_running_loop()
+        self._done = asyncio.Event()
+        name = f"task {self.task.name}"
+        # A daemon: one that is stuck must not keep the process from its end.
+        threading.Thread(target=self._thread, name=name, daemon=True).start()
+
+    def stop(self, *, stuck: bool = False) -> None:
+        """End behind the present run; a stuck one is not waited for."""
+        self.stopped = True
+        self._end.set()
+        self._ready.release()
+        if stuck:
+            self._done.set()
+
+    async def ended(self) -> None:
+        """Wait until it has, a while at the most."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(limits.TASK_END_TIMEOUT):
+                await self._done.wait()
+                return
+        _log.warning("! task %s does not end; it is left behind", self.task.name)
+
+    def wake(self) -> None:
+        """A message is there."""
+        self._ready.release()
+
+    def _thread(self) -> None:
+        try:
+            if self._period is None:
+                self._on_messages()
+            else:
+                with TimerFd(blocking=True) as timer:
+                    self._periodically(self._period, timer)
+        finally:
+            with contextlib.suppress(RuntimeError):  # the loop has ended before us
+                self._loop.call_soon_threadsafe(self._done.set)
+
+    def _periodically(self, period: float, timer: TimerFd) -> None:
+        schedule = Schedule(period, time.monotonic())
+        while not self._end.is_set():
+            missed = schedule.missed
+            due = schedule.next_due(time.monotonic())
+            self.figures.missed(schedule.missed - missed)
+            while due - time.monotonic() > _SLICE:
+                if self._end.wait(min(due - time.monotonic() - _SLICE / 2, _SLICE)):
+                    return
+            timer.set(due)
+            timer.wait()
+            if not self._once(due, None):
+                schedule = Schedule(period, time.monotonic())
+
+    def _on_messages(self) -> None:
+        while True:
+            self._ready.acquire()
+            if self._end.is_set():
+                return
+            with contextlib.suppress(IndexError):  # it gave way to newer ones
+                message = self._messages.popleft()
+                self._once(message.stamp_ns / 1e9 - time.time() + time.monotonic(), message)
+
+    def _once(self, due: float, message: Received | None) -> bool:
+        """One run; false after a failure and its pause."""
+        self.figures.begun(due, time.monotonic())
+        try:
+            self.task.function(*self._arguments(message))
+        except Exception as error:  # noqa: BLE001 - the top of the user's code
+            text = self._error(error)
+        else:
+            self.figures.ended(time.monotonic())
+            return True
+        self.figures.ended(time.monotonic(), text)
+        if self._end.is_set():
+            return False
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._on_failed, text)
+        self.waiting = True
+        self._end.wait(restart_delay(self.figures.in_a_row))
+        self.waiting = False
+        self.figures.interrupted()
+        return False

@@ -1,0 +1,181 @@
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from rmpa.resource.aio.tasks import TaskProblem, Tasks
+from rmpa.resource.declare import Resource
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+
+class Bench:
+    """A resource whose tasks run, without a node."""
+
+    def __init__(self) -> None:
+        self.resource = Resource("r", role="sensing")
+        self.problems: list[TaskProblem] = []
+        self.deactivated: list[str] = []
+        self.change = asyncio.Event()
+        runtime: Any = SimpleNamespace(resource=self.resource)
+        self.tasks = Tasks(runtime, on_problem=self._problem, on_deactivate=self.deactivated.append)
+
+    def _problem(self, problem: TaskProblem) -> None:
+        self.problems.append(problem)
+        self.change.set()
+
+    async def problem(self, kind: str) -> TaskProblem:
+        async with asyncio.timeout(30):
+            while True:
+                for problem in self.problems:
+                    if problem.kind == kind:
+                        return problem
+                self.change.clear()
+                await self.change.wait()
+
+
+@pytest.fixture
+async def bench() -> AsyncIterator[Bench]:
+    one = Bench()
+    yield one
+    await one.tasks.deactivate()
+
+
+class Counter:
+    """Counts runs, from any thread."""
+
+    def __init__(self, enough: int) -> None:
+        self.times: list[float] = []
+        self.enough = enough
+        self.done = threading.Event()
+
+    def __call__(self) -> None:
+        self.times.append(time.monotonic())
+        if len(self.times) >= self.enough:
+            self.done.set()
+
+    async def wait(self) -> None:
+        assert await asyncio.to_thread(self.done.wait, 30)
+
+
+@pytest.mark.parametrize("kind", ["thread", "coroutine"])
+async def test_a_periodic_task_keeps_to_its_schedule(bench: Bench, kind: str) -> None:
+    count = Counter(30)
+
+    def plain() -> None:
+        count()
+
+    async def coroutine() -> None:
+        count()
+
+    bench.resource.task(rate=100)(plain if kind == "thread" else coroutine)
+    bench.tasks.activate()
+    await count.wait()
+    report = next(iter(bench.tasks.reports(time.monotonic()).values()))
+    assert report.runs + report.missed >= 29
+    # No lateness adds up: the 29 periods took no less than they should, however late each was.
+    assert count.times[29] - count.times[0] > 0.2
+    assert report.lateness is not None
+    await bench.tasks.deactivate()
+    ran = len(count.times)
+    await asyncio.sleep(0.05)
+    assert len(count.times) == ran
+    assert bench.problems == []
+
+
+@pytest.mark.parametrize("kind", ["thread", "coroutine"])
+async def test_a_task_that_raises_is_reported_and_goes_on(bench: Bench, kind: str) -> None:
+    count = Counter(4)
+
+    def fail_twice() -> None:
+        count()
+        if len(count.times) <= 2:
+            raise ValueError("no echo")
+
+    async def coroutine() -> None:
+        fail_twice()
+
+    bench.resource.task(rate=200)(fail_twice if kind == "thread" else coroutine)
+    bench.tasks.activate()
+    assert (await bench.problem("failed")).text == "ValueError: no echo"
+    await count.wait()
+    assert [p.kind for p in bench.problems] == ["failed", "failed"]
+    assert count.times[2] - count.times[1] > 0.15, "the second pause is longer"
+
+
+@pytest.mark.parametrize("kind", ["thread", "coroutine"])
+async def test_a_task_can_end_at_its_first_failure(bench: Bench, kind: str) -> None:
+    def plain() -> None:
+        raise ValueError("no echo")
+
+    async def coroutine() -> None:
+        plain()
+
+    bench.resource.task(rate=200, name="t", on_failure="deactivate")(plain if kind == "thread" else coroutine)
+    bench.tasks.activate()
+    await bench.problem("stopped")
+    assert bench.tasks.running == {"t": "stopped: ValueError: no echo"}
+    assert bench.deactivated == ["task t: ValueError: no echo"]
+
+
+@pytest.mark.parametrize("kind", ["thread", "coroutine"])
+async def test_a_task_that_is_stuck_is_reported_and_replaced(bench: Bench, kind: str) -> None:
+    count = Counter(3)
+    free = threading.Event()
+
+    def plain() -> None:
+        count()
+        if len(count.times) == 1:
+            free.wait(60)
+
+    async def coroutine() -> None:
+        count()
+        if len(count.times) == 1:
+            await asyncio.sleep(60)
+
+    bench.resource.task(rate=100, stuck_after=0.3)(plain if kind == "thread" else coroutine)
+    bench.tasks.activate()
+    assert "a run has not ended for" in (await bench.problem("stuck")).text
+    await count.wait()
+    free.set()
+
+
+@pytest.mark.parametrize("kind", ["thread", "coroutine"])
+async def test_a_task_on_an_input_gets_the_newest_messages(bench: Bench, kind: str) -> None:
+    item = bench.resource.input("orders", "std_msgs/String")
+    got: list[str] = []
+    gate, first, last = threading.Event(), threading.Event(), threading.Event()
+
+    def plain(message: str) -> None:
+        got.append(message)
+        if message == "m0":
+            first.set()
+            gate.wait(30)
+        if message == "m14":
+            last.set()
+
+    async def coroutine(message: str) -> None:
+        await asyncio.to_thread(plain, message)
+
+    bench.resource.task(on=item, name="t")(plain if kind == "thread" else coroutine)
+    bench.tasks.activate()
+
+    def give(number: int) -> None:
+        message: Any = SimpleNamespace(message=f"m{number}", stamp_ns=time.time_ns())
+        bench.tasks.received(item, message)
+
+    give(0)
+    assert await asyncio.to_thread(first.wait, 30)
+    for number in range(1, 15):
+        give(number)
+    gate.set()
+    assert await asyncio.to_thread(last.wait, 30)
+    # Ten wait; the oldest four gave way.
+    assert got == ["m0", *(f"m{n}" for n in range(5, 15))]
+    assert bench.tasks.reports(time.monotonic())["t"].dropped == 4
