@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.ros.aio.core import RosCore
 from rmpa.ros.aio.external_core import ExternalCore
+from rmpa.ros.aio.http_client import is_own_name
 from rmpa.ros.aio.local_addresses import local_addresses
 from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback
 
@@ -25,12 +26,13 @@ def make_core(settings: Settings) -> Core:
     if settings.core_mode == "embedded":
         return RosCore(settings.core_host, settings.core_port)
     uri = settings.core_master or DEFAULT_MASTER_URI
-    # The proxies are nodes like any other: where nobody asked for an address and the master is on this machine, so
-    # are they. A graph over several machines has its master at an address of the network.
+    # The proxies are nodes like any other, and are where a node that was started here would be: where nobody asked
+    # for an address, at loopback beside a master that is only there, and under the machine's name if the master is
+    # known by it (other nodes have that, too, and it works without a network).
     variables = {name: os.environ.get(name, "") for name in ("ROS_HOSTNAME", "ROS_IP")}
     environment = RosEnvironment.read(variables, (), local_addresses())
-    address = environment.host
-    if not environment.host_given and is_loopback(host_of(uri)):
-        address = "127.0.0.1"
+    address, master = environment.host, host_of(uri)
+    if not environment.host_given and (is_loopback(master) or is_own_name(master)):
+        address = "127.0.0.1" if is_loopback(master) else master
     host = "127.0.0.1" if is_loopback(address) else "0.0.0.0"  # noqa: S104 - as every node of such a graph does
     return ExternalCore(uri, own_node=OWN_NODE, node_host=host, node_address=address)

@@ -264,6 +264,24 @@ def test_an_answer_that_is_no_survey_is_an_error(answer: XmlRpcValue) -> None:
         read_lookups(answer, ["/a"] * 5, [])
 
 
+ANSWERS: Final = st.recursive(
+    st.none() | st.booleans() | st.integers(-1, 2) | st.sampled_from(["", "/t", "/n", OURS]),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from(["faultCode", "x"]), inner),
+    max_leaves=40,
+)
+
+
+@given(st.lists(st.builds(lambda value: [[1, "", value]], ANSWERS) | ANSWERS, min_size=4, max_size=7))
+def test_whatever_a_master_answers_is_a_survey_or_an_error(answer: list[XmlRpcValue]) -> None:
+    try:
+        survey = read_survey(answer, ["/n", "/m"], ["/srv"])
+    except RemoteProtocolError:
+        return
+    mirror = Mirror()
+    mirror.learn(survey, 0, mirror.strangers(survey, "/rmpa", 0))
+    assert set(mirror.state().nodes) <= set(survey.uris)
+
+
 NAMES: Final = st.sampled_from(["/a", "/b"])
 APIS: Final = st.sampled_from([THEIRS, MOVED])
 METHODS: Final = st.sampled_from(

@@ -106,7 +106,9 @@ def look_at_ports(settings: Settings, ours: Mapping[int, str]) -> tuple[Port, ..
         settings: The settings.
         ours: The ports that agents of this machine have, and whose each is.
     """
-    ports = [_tcp("the ROS core", settings.core_host, settings.core_port, ours)]
+    ports: list[Port] = []
+    if settings.core_mode == "embedded":  # an external core has its port already
+        ports.append(_tcp("the ROS core", settings.core_host, settings.core_port, ours))
     if settings.port:
         ports.append(_tcp("the mesh (TCP)", "", settings.port, ours))
     number = settings.discovery_port
