@@ -111,6 +111,17 @@ def test_service_uris() -> None:
     assert parse_service_uri("rosrpc://localhost:1234") == ("localhost", 1234)
     assert parse_service_uri("rosrpc://127.0.0.1:1234/") == ("127.0.0.1", 1234)
     assert parse_service_uri("rosrpc://[::1]:1234") == ("::1", 1234)
-    for bad in ("http://a:1", "rosrpc://a", "rosrpc://:1", "rosrpc://a:b", "", "rosrpc://"):
+    with pytest.raises(ConfigError):
+        parse_service_uri("rosrpc://a:" + "9" * 5000)
+    for bad in (
+        "http://a:1",
+        "rosrpc://a",
+        "rosrpc://:1",
+        "rosrpc://a:b",
+        "",
+        "rosrpc://",
+        "rosrpc://a:0",
+        "rosrpc://a:65536",
+    ):
         with pytest.raises(ConfigError, match="is not a service's address"):
             parse_service_uri(bad)

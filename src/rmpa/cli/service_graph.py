@@ -13,10 +13,12 @@ from rmpa.cli.master import Graph, Master, choose_master, read_graph, read_topic
 from rmpa.cli.options import agent_option, json_option, master_option
 from rmpa.cli.output import Column, coloured, print_json, print_table, printable, warn
 from rmpa.cli.service_ends import known_type, probe, probe_all, require_service, service_peers
+from rmpa.cli.service_mesh import crossing, print_crossing
 from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
     from rmpa.cli.service_ends import Probed
+    from rmpa.monitor.snapshot import ServiceInfo
     from rmpa.ros.messages import MessageType
 
 
@@ -98,27 +100,44 @@ def info(service: str, as_json: bool, agent: str | None, master: str | None) -> 
     """Show a service's node, address, type and arguments, and what of it crosses."""
     wanted = read_topic(service, "service")
     chosen, graph = _graph(master, agent)
+    mesh = crossing(chosen, wanted)
+    if any(each.hidden for each in mesh) and all(each.hidden for each in mesh):
+        # Not in the graph, and that is what the user wants to know.
+        if as_json:
+            print_json({"name": wanted.topic, "mesh": mesh})
+        else:
+            print_crossing(mesh)
+        return
     require_service(graph, wanted)
     found = asyncio.run(probe(chosen, wanted.topic))
     request, response, unknown = _halves(found)
     if as_json:
         about = _service_json(graph, wanted.topic, found)
-        print_json(about | {"request": request and _fields(request), "response": response and _fields(response)})
+        about |= {"request": request and _fields(request), "response": response and _fields(response)}
+        print_json(about | {"mesh": mesh})
         return
     click.echo(f"Node: {printable(_whose(graph, wanted.topic))}")
     click.echo(f"URI: {printable(found.uri)}")
     if found.description is None:
+        _print_mesh(mesh)
         raise RmpaError(f"{wanted.topic} does not say what it is: {found.problem}")
     click.echo(f"Type: {printable(found.description.type)}")
     click.echo(f"MD5: {printable(found.description.md5sum)}")
     if request is None or response is None:
         warn(printable(unknown))
-        return
-    click.echo(f"Args: {' '.join(_fields(request))}")
-    for title, half in (("Request", request), ("Response", response)):
-        click.echo(f"{title}:" + ("" if half.fields else " nothing"))
-        for field in half.fields:
-            click.echo(f"  {field} {field.name}")
+    else:
+        click.echo(f"Args: {' '.join(_fields(request))}")
+        for title, half in (("Request", request), ("Response", response)):
+            click.echo(f"{title}:" + ("" if half.fields else " nothing"))
+            for field in half.fields:
+                click.echo(f"  {field} {field.name}")
+    _print_mesh(mesh)
+
+
+def _print_mesh(mesh: tuple[ServiceInfo, ...]) -> None:
+    if mesh:
+        click.echo("\nMesh:")
+        print_crossing(mesh)
 
 
 def _halves(found: Probed) -> tuple[MessageType | None, MessageType | None, str]:

@@ -9,6 +9,7 @@ Names and md5 sums are compared as rospy and roscpp 1.15 do: literally, ``*`` ma
 
 from __future__ import annotations
 
+import re
 import struct
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -186,9 +187,9 @@ def parse_service_uri(uri: str) -> tuple[str, int]:
     Raises:
         ConfigError: It is not one.
     """
-    host, colon, port = uri.removeprefix(_SCHEME).rstrip("/").rpartition(":")
-    if not uri.startswith(_SCHEME) or not colon or not host or not port.isascii() or not port.isdigit():
-        raise ConfigError(
-            "service", f"{printable(uri)!r} is not a service's address", "one looks like rosrpc://host:port"
-        )
-    return host.strip("[]"), int(port)
+    host, _, port = uri.removeprefix(_SCHEME).rstrip("/").rpartition(":")
+    number = int(port) if re.fullmatch(r"[0-9]{1,5}", port) else 0
+    if not uri.startswith(_SCHEME) or not host.strip("[]") or not 0 < number < 1 << 16:
+        problem = f"{printable(uri)!r} is not a service's address"
+        raise ConfigError("service", problem, "one looks like rosrpc://host:port")
+    return host.strip("[]"), number

@@ -1,0 +1,58 @@
+"""What an agent knows of the services that cross, as ``rmpa service`` shows it."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING
+
+import click
+
+from rmpa.cli.output import duration, printable, warn
+from rmpa.core.errors import RmpaError
+
+if TYPE_CHECKING:
+    from rmpa.cli.master import Master, TopicName
+    from rmpa.monitor.snapshot import ServiceInfo
+
+
+def crossing(master: Master, wanted: TopicName | None = None) -> tuple[ServiceInfo, ...]:
+    """What the master's agent knows of its services and its peers', or of one; empty without an agent."""
+    with contextlib.suppress(RmpaError):
+        snapshot = master.snapshot()
+        return tuple(
+            info
+            for info in (snapshot.services if snapshot is not None else ())
+            if wanted is None or (info.name == wanted.topic and wanted.peer in (None, info.peer))
+        )
+    return ()
+
+
+def print_crossing(infos: tuple[ServiceInfo, ...]) -> None:
+    """Lines about one service: whether it may cross, each peer that offers it, and how its calls went."""
+    for info in infos:
+        click.echo(printable(f" * {_headline(info)}"))
+        for label, text in _facts(info):
+            click.echo(printable(f"     {label:<10} {text}"))
+        if info.problem:
+            warn(printable(f"{info.peer or info.node}: {info.problem}"))
+
+
+def _headline(info: ServiceInfo) -> str:
+    if info.direction == "out":
+        who = f", open at {', '.join(info.callers)}" if info.callers else ""
+        return f"{'may cross' if info.crosses else 'stays home'}: {info.policy}{who}"
+    over_there = f", {info.wire} over there" if info.wire else ""
+    state = f"not here: {info.hidden}" if info.hidden else info.state
+    return f"from {info.peer}: {info.node}{over_there}, {state}"
+
+
+def _facts(info: ServiceInfo) -> list[tuple[str, str]]:
+    facts = []
+    if info.calls or info.active:
+        under_way = f", {info.active} under way" if info.active else ""
+        facts.append(("calls", f"{info.calls}, {info.failed} failed{under_way}"))
+    if info.latency is not None:
+        spread = info.latency
+        label = "latency" if info.direction == "in" else "server"
+        facts.append((label, f"p50 {duration(spread.p50)}, p99 {duration(spread.p99)}, max {duration(spread.max)}"))
+    return facts
