@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tests.interop.modules import flows
+from tests.interop.modules import Module, flows
 from tests.interop.processes import eventually
 
 if TYPE_CHECKING:
     from tests.interop.agents import Agent
-    from tests.interop.conftest import ModuleFactory
-    from tests.interop.modules import Module
+    from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
+    from tests.interop.namespaces import Lab
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
 
@@ -35,12 +35,12 @@ def stop(agent: Agent, *words: str) -> str:
 
 
 def until(module: Module, begins: str, *words: str) -> str:
-    """Ask until the answer begins so; return it."""
+    """Ask until the answer begins so (empty: until it flows); return it."""
     found: list[str] = []
 
     def asked() -> bool:
         found.append(stop(module.agent, *words))
-        return found[-1].startswith(begins)
+        return found[-1].startswith(begins) if begins else not found[-1]
 
     eventually(asked, 40.0, what=f"rmpa why {' '.join(words)} says {begins!r}; it said {found}")
     return found[-1]
@@ -84,6 +84,30 @@ def test_a_topic_from_its_publisher_to_its_reader_and_each_that_fails(modules: M
     a.host.cut()
     b.agent.wait_no_peer(a.name)
     assert stop(b.agent, topic).startswith(("link: ", "peer: "))
+
+
+def test_what_a_relay_passes_on(lab: Lab, agent: AgentFactory, shell: ShellFactory) -> None:
+    loggers = "[services]\nloggers = true\n"
+    relays = "[relay]\nenabled = true\n"
+    hosts = [lab.host("a", 0), lab.host("b", 1), lab.host("r", 0, 1)]
+    a, b, r = (
+        Module(host, agent(host, name=host.name, config=loggers + (relays if host.name == "r" else "")), shell(host))
+        for host in hosts
+    )
+    a.agent.wait_peer("r")
+    b.agent.wait_peer("r")
+    a.ros.rospy("talker", topic="/chatter", rate=20, name="talker")
+    until(b, "subscriber: no node here", "a:/chatter")
+    heard = b.ros.roscpp("listener", topic="/chatter", name="listener")
+    flows(heard)
+    (found,) = why(b.agent, "/chatter")
+    assert (found["flows"], found["peer"], found["to"]) == (True, "a", "b"), found
+    assert found["stages"][1]["text"] == "no link of its own; r passes on what it publishes"
+    until(b, "", "a:/talker/get_loggers")
+    assert stop(b.agent, "r:/chatter") == "publisher: no node of r publishes /chatter"
+    r.agent.kill()
+    b.agent.wait_no_peer("r")
+    assert stop(b.agent, "a:/chatter").startswith(("peer: ", "link: "))
 
 
 def test_multicast_by_hand_and_the_doctor_of_a_host(modules: ModuleFactory) -> None:

@@ -196,9 +196,10 @@ class Why:
 
     async def _service(self, service: str, name: str | None) -> tuple[Diagnosis, ...]:
         """Walk the way of a service from each peer, or from one, to here."""
-        peers = [peer for peer in self._view.snapshot(frozenset()).peers if peer.state == "linked"]
+        peers = [peer for peer in self._view.snapshot(frozenset()).peers if peer.state in ("linked", "relayed")]
         if name is None:
-            offering = [p.guid for p in peers if (at := self._carrier(p)) and self._services.offers(at, service)]
+            carried = [(peer, at) for peer in peers if (at := self._carrier(peer)) is not None]
+            offering = [p.guid for p, at in carried if self._services.offers(at, service, p.instance)]
             found = await asyncio.gather(
                 *(self._calls(guid, service) for guid in offering or [p.guid for p in peers])
             )
@@ -211,7 +212,7 @@ class Why:
         snapshot = self._view.snapshot(frozenset())
         peer = find_peer(snapshot, name)
         attached = self._carrier(peer) if peer is not None else None
-        if peer is None or attached is None or attached.link.name != peer.name:
+        if peer is None or attached is None:
             return walk_service(walk_peer(snapshot, name), snapshot.agent.name, name, service)
         service, wire = self._topics.there(peer.name, service)
         far: FarService | None = None

@@ -47,9 +47,12 @@ class ServiceFacts:
         """Whether some peer offers a service, by its name here."""
         return any(remote.name == service for _, remote in self._services.imports)
 
-    def offers(self, attached: Attached, service: str) -> bool:
-        """Whether this peer does."""
-        return self._services.imports.get(attached.peer, service) is not None
+    def offers(self, attached: Attached, service: str, instance: str) -> bool:
+        """Whether this link brings a service of this module, be it the peer's own or one that it passes on."""
+        remote = self._services.imports.get(attached.peer, service)
+        if remote is None:
+            return False
+        return (remote.origin.instance if remote.origin else attached.link.identity.instance.hex()) == instance
 
     def nowhere(self, here: str, service: str, linked: list[str]) -> Diagnosis:
         """No peer has it."""
@@ -102,7 +105,7 @@ class ServiceFacts:
             server = seen.get(service)
             if server is None:
                 continue
-            decision = self._rules.judge(service, server.node)
+            decision = self._rules.judge(service, server.node if server.origin is None else server.origin.node)
             if decision.allowed:
                 special = self._rules.judge_for(peer, service, wire)
                 decision = special if special.rule else decision
