@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-from pathlib import Path
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import pytest
 
+from rmpa.cli.main import main
 from rmpa.core.errors import RmpaError
+from rmpa.monitor.snapshot import ServiceInfo, Spread
 from rmpa.ros.aio.node import Node
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.service_types import ServiceType
+from tests.cli.conftest import with_core
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from rmpa.ros.aio.core import RosCore
     from tests.cli.conftest import Background, Place
+
+Rmpa = Callable[..., tuple[int, str, str]]
 
 
 def add(request: Any) -> dict[str, int]:
@@ -32,9 +38,31 @@ def enable(request: Any) -> dict[str, object]:
 
 
 @pytest.fixture
-def served(place: Place, core: RosCore, background: Background) -> Iterator[RosCore]:
+def rmpa(core: RosCore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Rmpa:
+    """Runs ``rmpa service`` within this process: exit code, output, errors."""
+    for name in ("ROS_PACKAGE_PATH", "PYTHONPATH", "CMAKE_PREFIX_PATH", "RMPA_AGENT"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in (("ROS_MASTER_URI", core.uri), ("RMPA_RUNTIME_DIR", str(tmp_path)), ("NO_COLOR", "1")):
+        monkeypatch.setenv(name, value)
+
+    def run(*words: str) -> tuple[int, str, str]:
+        capsys.readouterr()
+        code = main(["service", *words])
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def as_json(rmpa: Rmpa, *words: str) -> dict[str, Any]:
+    code, out, _ = rmpa(*words)
+    assert code == 0
+    value: dict[str, Any] = json.loads(out)
+    return value
+
+
+@pytest.fixture
+def served(core: RosCore, background: Background) -> Iterator[RosCore]:
     """A node with services, and one that a bridge would have registered for peer base."""
-    place.environ["ROS_MASTER_URI"] = core.uri
     nodes: list[Node] = []
 
     async def start() -> None:
@@ -56,27 +84,27 @@ def served(place: Place, core: RosCore, background: Background) -> Iterator[RosC
     background.do(stop())
 
 
-def test_list(place: Place, served: RosCore) -> None:
+def test_list(rmpa: Rmpa, served: RosCore) -> None:
     own = ["/add", "/arm/enable  [base]", "/arm/nothing  [base]", "/my/do"]
-    assert place.run("service", "list")[1].splitlines() == [*own, "/rosout/get_loggers", "/rosout/set_logger_level"]
-    assert place.run("service", "list", "base:/")[1].splitlines() == own[1:3]
-    assert place.run("service", "list", "/my")[1] == "/my/do\n"
-    code, out, _ = place.run("service", "list", "-v", "/arm")
+    assert rmpa("list")[1].splitlines() == [*own, "/rosout/get_loggers", "/rosout/set_logger_level"]
+    assert rmpa("list", "base:/")[1].splitlines() == own[1:3]
+    assert rmpa("list", "/my")[1] == "/my/do\n"
+    code, out, _ = rmpa("list", "-v", "/arm")
     assert code == 0
     assert out.splitlines()[1].split(maxsplit=2) == [
         "/arm/enable",
         "std_srvs/SetBool",
         "/arm of peer base, by its proxy /rmpa/base/arm",
     ]
-    listed = json.loads(place.run("service", "list", "base:/arm/enable", "--json")[1])
+    listed = json.loads(rmpa("list", "base:/arm/enable", "--json")[1])
     assert listed == [
         {"name": "/arm/enable", "node": "/rmpa/base/arm", "peer": "base", "remote_node": "/arm"},
     ]
 
 
-def test_info_type_and_find(place: Place, served: RosCore) -> None:
+def test_info_type_and_find(rmpa: Rmpa, served: RosCore) -> None:
     uri = served.call("lookupService", "/x", "/add").value
-    code, out, err = place.run("service", "info", "/add")
+    code, out, err = rmpa("info", "/add")
     assert (code, err) == (0, "")
     assert out.splitlines() == [
         "Node: /server",
@@ -90,71 +118,114 @@ def test_info_type_and_find(place: Place, served: RosCore) -> None:
         "Response:",
         "  int64 sum",
     ]
-    (info,) = place.json("service", "info", "base:/arm/enable", "--json")
+    info = as_json(rmpa, "info", "base:/arm/enable", "--json")
     assert (info["peer"], info["type"], info["request"]) == ("base", "std_srvs/SetBool", ["data"])
-    assert place.run("service", "type", "/add")[1] == "rospy_tutorials/AddTwoInts\n"
-    assert place.run("service", "find", "std_srvs/SetBool")[1] == "/arm/enable  [base]\n"
-    assert place.run("service", "info", "/ad") == (1, "", "rmpa: no service /ad; did you mean /add?\n")
-    code, _, err = place.run("service", "info", "joystick:/arm/enable")
+    assert rmpa("type", "/add")[1] == "rospy_tutorials/AddTwoInts\n"
+    assert rmpa("find", "std_srvs/SetBool")[1] == "/arm/enable  [base]\n"
+    assert rmpa("info", "/ad") == (1, "", "rmpa: no service /ad; did you mean /add?\n")
+    code, _, err = rmpa("info", "joystick:/arm/enable")
     assert (code, "is served by /rmpa/base/arm, not by peer joystick" in err) == (1, True)
-    code, out, err = place.run("service", "info", "/my/do")
+    code, out, err = rmpa("info", "/my/do")
     assert code == 0
     assert "Type: my_pkg/Do\n" in out
     assert "is not a service that comes with rmpa" in err
-    assert place.run("service", "info", "a b")[0] == 2
+    assert rmpa("info", "a b")[0] == 2
 
 
-def test_a_server_that_is_gone_is_said(place: Place, served: RosCore) -> None:
+def test_a_server_that_is_gone_is_said(rmpa: Rmpa, served: RosCore) -> None:
     served.call("registerService", "/dead", "/dead/do", "rosrpc://127.0.0.1:9", "http://127.0.0.1:9/")
-    code, out, err = place.run("service", "find", "std_srvs/Empty")
+    code, out, err = rmpa("find", "std_srvs/Empty")
     assert (code, out) == (0, "/arm/nothing  [base]\n")
     assert "/dead/do: no server of service /dead/do answers at rosrpc://127.0.0.1:9" in err
-    code, _, err = place.run("service", "call", "/dead/do")
+    code, _, err = rmpa("call", "/dead/do")
     assert (code, "no server of service /dead/do answers" in err) == (1, True)
-    assert "does not answer" in place.run("service", "list", "-v", "/dead")[1]
+    assert "does not answer" in rmpa("list", "-v", "/dead")[1]
     served.call("unregisterService", "/dead", "/dead/do", "rosrpc://127.0.0.1:9")
 
 
-def test_call(place: Place, served: RosCore) -> None:
-    assert place.run("service", "call", "/add", "20", "22") == (0, "sum: 42\n", "")
-    assert place.run("service", "call", "/add", "{a: 1, b: -2}")[1] == "sum: -1\n"
-    assert place.run("service", "call", "/add", "--", "-1", "-2")[1] == "sum: -3\n"
-    assert place.run("service", "call", "base:/arm/enable", "data: false") == (
+def test_call(rmpa: Rmpa, served: RosCore) -> None:
+    assert rmpa("call", "/add", "20", "22") == (0, "sum: 42\n", "")
+    assert rmpa("call", "/add", "{a: 1, b: -2}")[1] == "sum: -1\n"
+    assert rmpa("call", "/add", "--", "-1", "-2")[1] == "sum: -3\n"
+    assert rmpa("call", "base:/arm/enable", "data: false") == (
         0,
         'success: True\nmessage: "off"\n',
         "",
     )
-    assert place.run("service", "call", "/arm/nothing") == (0, "", "")
-    (answer,) = place.json("service", "call", "/add", "[20, 22]", "--json")
+    assert rmpa("call", "/arm/nothing") == (0, "", "")
+    answer = as_json(rmpa, "call", "/add", "[20, 22]", "--json")
     assert answer["response"] == {"sum": 42}
-    assert place.run("service", "call", "/arm/enable", "true") == (
+    assert rmpa("call", "/arm/enable", "true") == (
         1,
         "",
         "rmpa: service /arm/enable refused: the arm is jammed\\x1b[2J\n",
     )
 
 
-def test_what_cannot_be_called(place: Place, served: RosCore) -> None:
-    code, _, err = place.run("service", "call", "/add", "{c: 1}")
+def test_what_cannot_be_called(rmpa: Rmpa, served: RosCore) -> None:
+    code, _, err = rmpa("call", "/add", "{c: 1}")
     assert (code, err) == (1, "rmpa: rospy_tutorials/AddTwoIntsRequest has no field 'c'; it has a, b\n")
-    assert place.run("service", "call", "/add", "{a")[0] == 2
-    code, _, err = place.run("service", "call", "/none")
+    assert rmpa("call", "/add", "{a")[0] == 2
+    code, _, err = rmpa("call", "/none")
     assert (code, err) == (1, "rmpa: no service /none; `rmpa service list` shows all\n")
-    code, _, err = place.run("service", "call", "/none", "--wait", "-t", "0.3")
+    code, _, err = rmpa("call", "/none", "--wait", "-t", "0.3")
     assert code == 1
     assert "no service /none answers at http" in err
     assert "within 0.3 s" in err
 
 
-def test_a_type_of_this_machines_packages(place: Place, served: RosCore) -> None:
-    folder = Path(place.environ["HOME"]) / "ws" / "my_pkg" / "srv"
+def test_a_type_of_this_machines_packages(
+    rmpa: Rmpa, served: RosCore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "my_pkg" / "srv"
     folder.mkdir(parents=True)
     (folder / "Do.srv").write_text("int32 a\n---\nint32 b\n")
-    place.environ["ROS_PACKAGE_PATH"] = str(folder.parents[1])
-    assert place.run("service", "call", "/my/do", "1") == (0, "b: 7\n", "")
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path))
+    assert rmpa("call", "/my/do", "1") == (0, "b: 7\n", "")
     (folder / "Do.srv").write_text("int32 a\n---\nint64 b\n")
-    code, _, err = place.run("service", "call", "/my/do", "1")
+    code, _, err = rmpa("call", "/my/do", "1")
     assert code == 1
     assert "my_pkg/Do has another definition at the server" in err
-    with contextlib.suppress(KeyError):
-        del place.environ["ROS_PACKAGE_PATH"]
+
+
+def test_info_tells_what_crosses(
+    rmpa: Rmpa,
+    served: RosCore,
+    place: Place,
+    agent: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    spread = Spread(count=9, mean=0.002, sd=0, min=0.001, max=0.004, p50=0.002, p99=0.003)
+    services = (
+        ServiceInfo(name="/add", node="/server", direction="out", policy="[services] allow", callers=("base",)),
+        ServiceInfo(
+            name="/arm/enable",
+            node="/arm",
+            direction="in",
+            peer="base",
+            state="open",
+            calls=9,
+            failed=1,
+            latency=spread,
+            problem="its server died\x1b in the middle of the call",
+        ),
+        ServiceInfo(name="/add", node="/adder", direction="in", peer="base", hidden="/server serves it here"),
+    )
+    agent("here", msgspec.structs.replace(with_core(served.uri), services=services))
+    monkeypatch.setenv("RMPA_RUNTIME_DIR", str(place.path))
+    code, out, err = rmpa("info", "/arm/enable")
+    assert code == 0
+    assert out.endswith(
+        "\nMesh:\n"
+        " * from base: /arm, open\n"
+        "     calls      9, 1 failed\n"
+        "     latency    p50 2.00 ms, p99 3.00 ms, max 4.00 ms\n"
+    )
+    assert err == "! base: its server died\\x1b in the middle of the call\n"
+    out = rmpa("info", "/add")[1]
+    assert (
+        " * may cross: [services] allow, open at base\n * from base: /adder, not here: /server serves it here\n"
+        in out
+    )
+    assert rmpa("info", "base:/add") == (0, " * from base: /adder, not here: /server serves it here\n", "")
+    assert as_json(rmpa, "info", "base:/arm/enable", "--json")["mesh"][0]["calls"] == 9
