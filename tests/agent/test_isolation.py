@@ -27,7 +27,7 @@ from rmpa.agent import Agent
 from rmpa.core import limits
 from rmpa.core.aio import loop as loop_module
 from rmpa.core.aio.loop import AgentLoop, DirectSelector, breathe
-from rmpa.core.config import Settings
+from rmpa.core.config import PeerRule, PolicySettings, Settings
 from rmpa.core.errors import UnreachableError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
@@ -144,9 +144,9 @@ class World:
             while not condition():
                 await asyncio.sleep(0.01)
 
-    def shown(self) -> int:
+    def shown(self, namespace: str = "/fleet/") -> int:
         """Topics of the far module that the near one's graph has."""
-        return sum(topic.startswith("/fleet/") for topic in self.near.core.state().publishers)
+        return sum(topic.startswith(namespace) for topic in self.near.core.state().publishers)
 
     def linked(self) -> bool:
         return all(len(list(agent.bridge.attached())) == 1 for agent in (self.near, self.far))
@@ -247,6 +247,17 @@ async def plans_are_reconciled(world: World) -> None:
         await world.until(lambda: not (world.near.bridge._changed or world.far.bridge._changed))
 
 
+async def other_rules_hold(world: World) -> None:
+    """Every topic gets another name here, and is kept home over there; and back."""
+    for rules in ((PeerRule("far", "/moved"),), ()) * 3:
+        world.near._take(replace(world.near._settings, peers=rules))
+        await world.until(lambda rules=rules: world.shown() == (0 if rules else TOPICS))  # type: ignore[misc]
+        await world.until(lambda rules=rules: world.shown("/moved/fleet/") == (TOPICS if rules else 0))  # type: ignore[misc]
+    for policy in (PolicySettings(deny=("/fleet/**",)), PolicySettings()) * 3:
+        world.far._take(replace(world.far._settings, policy=policy))
+        await world.until(lambda policy=policy: world.shown() == (0 if policy.deny else TOPICS))  # type: ignore[misc]
+
+
 async def the_link_falls_and_comes_back(world: World) -> None:
     for _ in range(4):
         attached = next(iter(world.near.bridge.attached()))
@@ -285,6 +296,7 @@ PHASES: Final[tuple[Callable[[World], Awaitable[None]], ...]] = (
     parameters_are_large,
     somebody_looks_at_everything,
     plans_are_reconciled,
+    other_rules_hold,
     the_link_falls_and_comes_back,
     many_peers_shout,
     the_fleet_leaves,
