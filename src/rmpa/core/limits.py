@@ -568,6 +568,8 @@ REQUIREMENT_TEXT_MAX: Final = 1024
 """Characters in what is asked of one attribute."""
 TASK_QUEUE_MESSAGES: Final = 10
 """Messages of its input that wait for a task; the oldest is dropped beyond it: control acts on the newest."""
+TASK_PAUSE_TIMEOUT: Final = 1.0
+"""How long a profile that is to be applied waits for the runs under way; one that takes longer is stuck or slow."""
 TASK_END_TIMEOUT: Final = 2.0
 """How long an ending resource waits for a task's last run; a thread that is stuck is left behind."""
 REQUIREMENT_BOUNDS_MAX: Final = 256

@@ -179,3 +179,36 @@ async def test_a_task_on_an_input_gets_the_newest_messages(bench: Bench, kind: s
     # Ten wait; the oldest four gave way.
     assert got == ["m0", *(f"m{n}" for n in range(5, 15))]
     assert bench.tasks.reports(time.monotonic())["t"].dropped == 4
+
+
+@pytest.mark.parametrize("kind", ["thread", "coroutine"])
+async def test_between_pause_and_resume_no_run_is_under_way(bench: Bench, kind: str) -> None:
+    count = Counter(20)
+    within: list[int] = []
+    lock = threading.Lock()
+
+    def plain() -> None:
+        with lock:
+            within.append(1)
+        time.sleep(0.003)
+        count()
+        with lock:
+            within.pop()
+
+    async def coroutine() -> None:
+        within.append(1)
+        await asyncio.sleep(0.003)
+        count()
+        within.pop()
+
+    bench.resource.task(rate=200)(plain if kind == "thread" else coroutine)
+    bench.tasks.activate()
+    async with asyncio.timeout(30):
+        while len(count.times) < 20:
+            await bench.tasks.pause()
+            assert within == []
+            ran = len(count.times)
+            await asyncio.sleep(0.01)
+            assert len(count.times) == ran
+            bench.tasks.resume()
+            await asyncio.sleep(0.01)

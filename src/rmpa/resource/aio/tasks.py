@@ -32,8 +32,63 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 _LOOK: Final = 0.25
 """Seconds between looks whether a task is stuck."""
+_GATE_LOOK: Final = 0.002
+"""Seconds between a coroutine's looks whether it may go on; a profile is applied seldom, and soon."""
 _SLICE: Final = 0.1
 """Seconds that a thread sleeps at most without a look whether it is to end."""
+
+
+class Gate:
+    """Lets runs through while it is open; who closes it waits until none is within.
+
+    So that a profile is applied between two runs: no message is made half under the one and half under the other.
+    """
+
+    def __init__(self) -> None:
+        self._change = threading.Condition()
+        self._open = True
+        self._within = 0
+
+    def enter(self, ended: Callable[[], bool]) -> bool:
+        """Wait in a thread until it is open, or ``ended`` says that nobody need go in any more (then false)."""
+        with self._change:
+            while not self._open:
+                if ended():
+                    return False
+                self._change.wait(_SLICE)
+            self._within += 1
+            return True
+
+    def leave(self) -> None:
+        """The run has ended."""
+        with self._change:
+            self._within -= 1
+            self._change.notify_all()
+
+    def close(self) -> None:
+        """Let nobody in any more."""
+        with self._change:
+            self._open = False
+
+    def empty(self, timeout: float) -> bool:
+        """Wait in a thread until nobody is within; false if that takes longer than so many seconds."""
+        with self._change:
+            return self._change.wait_for(lambda: not self._within, timeout)
+
+    def open(self) -> None:
+        """Let runs through again."""
+        with self._change:
+            self._open = True
+            self._change.notify_all()
+
+    async def enter_soon(self) -> None:
+        """As ``enter``, in the loop."""
+        while True:
+            with self._change:
+                if self._open:
+                    self._within += 1
+                    return
+            await asyncio.sleep(_GATE_LOOK)
 
 
 class TaskProblem:
@@ -71,6 +126,7 @@ class Tasks(RuntimePart):
         self._on_deactivate = on_deactivate
         self._runners: dict[str, _Runner] = {}
         self._looker: asyncio.TimerHandle | None = None
+        self._gate = Gate()
 
     @property
     def running(self) -> Mapping[str, str]:
@@ -93,6 +149,15 @@ class Tasks(RuntimePart):
             runner.stop()
         await asyncio.gather(*(runner.ended() for runner in runners))
 
+    async def pause(self) -> None:
+        """Let no run begin, and wait until none is under way; one that is stuck is not waited for."""
+        self._gate.close()
+        await asyncio.to_thread(self._gate.empty, limits.TASK_PAUSE_TIMEOUT)
+
+    def resume(self) -> None:
+        """Let the tasks go on."""
+        self._gate.open()
+
     async def close(self) -> None:
         """End with the resource."""
         await self.deactivate()
@@ -111,7 +176,7 @@ class Tasks(RuntimePart):
 
     def _begin(self, task: Task) -> None:
         kind = _AsyncRunner if asyncio.iscoroutinefunction(task.function) else _ThreadRunner
-        runner = kind(task, self._runtime, lambda text: self._failed(task, text))
+        runner = kind(task, self._gate, lambda text: self._failed(task, text))
         self._runners[task.name] = runner
         runner.start()
 
@@ -151,7 +216,7 @@ class Tasks(RuntimePart):
 class _Runner:
     """Runs one task until it is stopped."""
 
-    def __init__(self, task: Task, runtime: Runtime, on_failed: Callable[[str], None]) -> None:
+    def __init__(self, task: Task, gate: Gate, on_failed: Callable[[str], None]) -> None:
         period = 1 / task.rate if task.rate else None
         self.task = task
         self.waiting = False
@@ -162,7 +227,7 @@ class _Runner:
         self.patience = stuck_after(period, task.stuck_after)
         self.figures = TaskFigures(period, time.monotonic())
         self._period = period
-        self._runtime = runtime
+        self._gate = gate
         self._on_failed = on_failed
         self._messages: deque[Received] = deque()
 
@@ -258,11 +323,15 @@ class _AsyncRunner(_Runner):
 
     async def _once(self, due: float, message: Received | None) -> bool:
         """One run; false after a failure and its pause."""
+        await self._gate.enter_soon()
         self.figures.begun(due, time.monotonic())
         try:
-            outcome = self.task.function(*self._arguments(message))
-            if outcome is not None:
-                await outcome
+            try:
+                outcome = self.task.function(*self._arguments(message))
+                if outcome is not None:
+                    await outcome
+            finally:
+                self._gate.leave()
         except Exception as error:  # noqa: BLE001 - the top of the user's code
             text = await asyncio.to_thread(self._error, error)  # the traceback reads source files
         else:
@@ -346,9 +415,14 @@ class _ThreadRunner(_Runner):
 
     def _once(self, due: float, message: Received | None) -> bool:
         """One run; false after a failure and its pause."""
+        if not self._gate.enter(self._end.is_set):
+            return False
         self.figures.begun(due, time.monotonic())
         try:
-            self.task.function(*self._arguments(message))
+            try:
+                self.task.function(*self._arguments(message))
+            finally:
+                self._gate.leave()
         except Exception as error:  # noqa: BLE001 - the top of the user's code
             text = self._error(error)
         else:

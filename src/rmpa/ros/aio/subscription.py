@@ -350,6 +350,11 @@ class Subscription:
         """Publishers that we are connected to."""
         return sum(link.connected for link in self._links.values())
 
+    @property
+    def callers(self) -> set[str]:
+        """The names of the publishers that we are connected to, as they say them."""
+        return {link.fields.get("callerid", "") for link in self._links.values() if link.connected}
+
     def connections(self) -> list[Connection]:
         """For ``getBusInfo`` and ``getBusStats``."""
         return [link.connection() for link in self._links.values()]

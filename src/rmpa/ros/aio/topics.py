@@ -200,6 +200,11 @@ class Subscriber:
         """Publishers that we are connected to."""
         return self.subscription.publishers
 
+    @property
+    def callers(self) -> set[str]:
+        """The names of the publishers that we are connected to."""
+        return self.subscription.callers
+
     async def __aiter__(self) -> AsyncIterator[Received]:
         """The messages, until the subscriber or its node is closed."""
         while True:
