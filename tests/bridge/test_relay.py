@@ -5,18 +5,25 @@ from __future__ import annotations
 import random
 from collections import deque
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from rmpa.bridge.actions import Action, Publish, Retract, Send
 from rmpa.bridge.exports import Exports, LocalSource
 from rmpa.bridge.imports import Imports
-from rmpa.bridge.messages import Advertise, Origin, Source, decode, encode
+from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, Source, decode, encode
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.relay import Linked, Relay, Ways, may_have
+from rmpa.bridge.service_exports import ExportAction, LocalService, ServiceExports
+from rmpa.bridge.service_rules import ServiceRules
+from rmpa.bridge.services import ImportAction, Provide, ServiceImports, Withdraw
 from rmpa.core import limits
-from rmpa.core.config import PolicySettings
+from rmpa.core.config import PolicySettings, ServiceSettings
 from rmpa.core.guid import Guid
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 TYPE = "std_msgs/String"
 
@@ -37,40 +44,67 @@ class Module:
     relays: bool
     exports: Exports = field(init=False)
     imports: Imports = field(init=False)
+    service_exports: ServiceExports = field(init=False)
+    service_imports: ServiceImports = field(init=False)
     relay: Relay = field(init=False)
     links: dict[int, int] = field(default_factory=dict)
     """Peer number here by module."""
     numbers: int = 0
     shown: dict[tuple[int, Source], tuple[str, str]] = field(default_factory=dict)
     """What a driver would register: topic and proxy's name, by peer and source."""
+    provided: dict[tuple[int, str], tuple[str, str]] = field(default_factory=dict)
+    """The same of services, by peer and service."""
     dirty: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
         policy = Policy(PolicySettings())
         self.exports, self.imports = Exports(policy), Imports(policy, rng=lambda: 0.5)
         self.relay = Relay(enabled=self.relays)
+        rules = ServiceRules(ServiceSettings(), policy)
+        self.service_exports, self.service_imports = ServiceExports(rules), ServiceImports(rules)
         self.relay.instance = self.imports.ways.instance = instance(self.number)
+        self.service_imports.ways.instance = instance(self.number)
         self.look()
 
     @property
     def topic(self) -> str:
         return f"/t{self.number}"
 
-    def look(self) -> list[Action]:
+    @property
+    def service(self) -> str:
+        return f"/s{self.number}"
+
+    def direct(self, peer: int, node: str) -> Origin:
+        """Whose a source is that comes by the link of its own module."""
+        there = next(module for module, number in self.links.items() if number == peer)
+        return Origin(f"m{there}", f"10.0.0.{there}:4000#0", instance(there), node)
+
+    def look(self) -> list[Any]:
         """The local graph as the agent's driver reads it."""
         topics = {self.topic, *self.dirty, *(place[0] for place in self.shown.values())}
-        self.dirty = set()
-        actions: list[Action] = []
+        actions: list[Any] = []
+        for service in {self.service, *self.dirty, *(place[0] for place in self.provided.values())}:
+            nodes = {place[1] for place in self.provided.values() if place[0] == service}
+            assert len(nodes) <= 1, "a graph has one provider"
+            local = LocalService("/n", "uri") if service == self.service else None
+            for node in nodes:
+                if whose := self.relay.origin((f"service {service}", node)):
+                    local = LocalService(node, "uri", whose)
+            actions += self.service_exports.graph(service, local)
         for topic in topics:
             nodes = {place[1] for place in self.shown.values() if place[0] == topic}
             graph = {n: LocalSource(TYPE, "uri", o) for n in nodes if (o := self.relay.origin((topic, n)))}
             if topic == self.topic:
                 graph["/n"] = LocalSource(TYPE, "uri")
             actions += self.exports.graph(topic, graph)
+        self.dirty = set()
         return actions
 
     def visible(self) -> list[tuple[str, str]]:
         return sorted(self.shown.values())
+
+    def callable(self) -> list[tuple[str, str]]:
+        return sorted(self.provided.values())
 
 
 class Map:
@@ -91,18 +125,23 @@ class Map:
             who = Linked(f"m{there}", instance(there), Guid(there))
             self.act(here, module.imports.link_up(number, f"m{there}", who))
             self.act(here, module.exports.link_up(number, f"m{there}", instance(there)))
+            self.act(here, module.service_imports.link_up(number, f"m{there}", there, instance(there)))
+            self.act(here, module.service_exports.link_up(number, f"m{there}", instance(there)))
 
     def unlink(self, one: int, other: int) -> None:
         for here, there in ((one, other), (other, one)):
             del self.wires[here, there]
             module = self.modules[here]
             number = module.links.pop(there)
+            self.act(here, module.service_exports.link_down(number))
+            self.act(here, module.service_imports.gone(number))
+            self.act(here, module.service_imports.unlinked(number))
             self.act(here, module.exports.link_down(number))
             self.act(here, list(module.imports.link_down(number)))
             module.relay.peer_gone(number)
             self.act(here, module.imports.unlinked(number))
 
-    def act(self, here: int, actions: list[Action]) -> None:
+    def act(self, here: int, actions: Sequence[Action | ExportAction | ImportAction]) -> None:
         module = self.modules[here]
         for action in actions:
             match action:
@@ -111,14 +150,22 @@ class Map:
                     if there is not None:
                         self.wires[here, there].append(encode(message))
                 case Publish(peer, source, _, topic, whose):
-                    there = next(m for m, number in module.links.items() if number == peer)
-                    whose = whose or Origin(f"m{there}", f"10.0.0.{there}:4000#0", instance(there), source.node)
+                    whose = whose or module.direct(peer, source.node)
                     place = (topic or source.topic, f"/rmpa/{whose.name}{whose.node}")
                     module.relay.shown(peer, source, place, whose)
                     module.shown[peer, source] = place
                 case Retract(peer, source):
                     module.relay.gone(peer, source)
                     module.dirty.add(module.shown.pop((peer, source))[0])
+                case Provide(peer, service, node):
+                    remote = module.service_imports.get(peer, service)
+                    whose = (remote.origin if remote is not None else None) or module.direct(peer, node)
+                    name = f"/rmpa/{whose.name}{whose.node}"
+                    module.relay.shown(peer, Source(f"service {service}", node), (f"service {service}", name), whose)
+                    module.provided[peer, service] = (service, name)
+                case Withdraw(peer, service, node):
+                    module.relay.gone(peer, Source(f"service {service}", node))
+                    module.dirty.add(module.provided.pop((peer, service))[0])
         if actions:
             self.act(here, module.look())
 
@@ -127,13 +174,18 @@ class Map:
             for here, module in self.modules.items():
                 while module.exports.untold:
                     self.act(here, module.exports.tell())
+                while module.service_exports.untold:
+                    self.act(here, module.service_exports.tell())
             full = [wire for wire, waiting in self.wires.items() if waiting]
             if not full:
                 return
             there, here = self.rng.choice(full)
             message = decode(self.wires[there, here].popleft())
-            assert isinstance(message, Advertise)
             module = self.modules[here]
+            if isinstance(message, AdvertiseServices):
+                self.act(here, module.service_imports.advertised(module.links[there], message))
+                continue
+            assert isinstance(message, Advertise)
             for portion in module.imports.portions(module.links[there], message):
                 self.act(here, module.imports.advertised(module.links[there], portion))
         raise AssertionError("it never settles")
@@ -151,6 +203,9 @@ class Map:
         for here, module in self.modules.items():
             expected = sorted((f"/t{m}", f"/rmpa/m{m}/n") for m in self.reachable(here))
             assert module.visible() == expected, f"module {here}"
+            assert module.callable() == [(topic.replace("t", "s"), node) for topic, node in expected], (
+                f"module {here}"
+            )
 
 
 def test_two_networks_and_two_relays_of_which_one_is_used() -> None:

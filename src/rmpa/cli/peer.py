@@ -180,10 +180,13 @@ def _route_row(topic: TopicInfo, route: RouteInfo) -> list[str]:
 
 
 def _facts(info: PeerInfo) -> list[tuple[str, str]]:
+    if info.via:
+        topics = f"{info.topics_in} topics that it publishes"
+        return [("Peer", info.name), ("GUID", info.guid), ("State", f"relayed: {info.via} passes on {topics}")]
     facts = [
         ("Peer", info.name),
         ("GUID", info.guid),
-        ("State", f"relayed by {info.via}" if info.via else f"{info.state} for {duration(info.since_ago)}"),
+        ("State", f"{info.state} for {duration(info.since_ago)}"),
         ("Addresses", ", ".join(info.addresses) or "-"),
         ("Found", f"{duration(info.found_ago)} ago by {info.source or 'a link'}"),
         ("Last beacon", f"{duration(info.beacon_ago)} ago" if info.beacon_ago is not None else "-"),
