@@ -35,7 +35,8 @@ ROUTE = limits.SERVICE_ROUTES + 1
 def told(exports: ServiceExports, peer: int = 1) -> list[AdvertiseServices]:
     found = []
     while exports.untold:
-        found += [a.message for a in exports.tell() if isinstance(a, Send) and a.peer == peer]
+        sent = [action.message for action in exports.tell() if isinstance(action, Send) and action.peer == peer]
+        found += [message for message in sent if isinstance(message, AdvertiseServices)]
     return found
 
 

@@ -53,6 +53,12 @@ def opened(imports: ServiceImports) -> None:
     ]
 
 
+def about(imports: ServiceImports) -> About | None:
+    remote = imports.get(1, "/add")
+    assert remote is not None
+    return remote.about
+
+
 def hidden(imports: ServiceImports, peer: int, service: str = "/add") -> str:
     remote = imports.get(peer, service)
     assert remote is not None
@@ -105,11 +111,9 @@ def test_an_opened_service_is_known_until_its_server_is_another_one(imports: Ser
     assert imports.want(1, "/add", 1.0) == [], "it is open"
     closing = imports.release(1, "/add")
     assert closing[0] == Send(1, CloseService(ROUTE))
-    remote = imports.get(1, "/add")
-    assert remote is not None
-    assert remote.about == About("a/Add", MD5)
+    assert about(imports) == About("a/Add", MD5)
     assert imports.advertised(1, offer("/add")) == [ForgetAbout(1, "/add")]
-    assert remote.about is None
+    assert about(imports) is None
     assert imports.want(1, "/add", 2.0) == [Send(1, OpenService(ROUTE + 2, "/add"))], "a route is never used again"
 
 

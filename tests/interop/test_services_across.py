@@ -45,7 +45,7 @@ def _worker(module: Module, kind: str, service: str, *, quiet: bool = True) -> P
 
 def _caller(module: Module, kind: str, service: str, **options: object) -> Process:
     start = module.ros.rospy if kind == "rospy" else module.ros.roscpp
-    return start("caller", service=service, wait=True, commands=True, **options)
+    return start("caller", service=service, wait=True, commands=True, **options)  # type: ignore[arg-type]  # the node's
 
 
 def _calls(caller: Process, line: str, timeout: float = 20.0) -> Event:

@@ -72,6 +72,7 @@ class Shown:
         peer: Whose.
         service: Its name here.
         node: Its node, in the peer's graph.
+        whose: The peer's name.
         stats: What became of its calls.
         proxy: The node that stands for that one, once it is there.
         endpoint: What clients connect to, likewise.
@@ -84,6 +85,7 @@ class Shown:
     peer: int
     service: str
     node: str
+    whose: str
     stats: CallStats = field(default_factory=CallStats)
     proxy: SlaveNode | None = None
     endpoint: ServiceEndpoint | None = None
@@ -379,7 +381,9 @@ class Services(Part):
             _relayed(action.service, name),
             remote.origin if remote is not None else None,
         )
-        shown = self._shown[action.peer, action.service] = Shown(action.peer, action.service, action.node)
+        shown = self._shown[action.peer, action.service] = Shown(
+            action.peer, action.service, action.node, self.imports.peer_name(action.peer)
+        )
         attached.inbound.hold(action.node, f"service {action.service}", lambda proxy: self._expose(shown, proxy))
 
     def _expose(self, shown: Shown, proxy: SlaveNode) -> None:
@@ -412,7 +416,7 @@ class Services(Part):
         if shown is None:
             return
         proxy = shown.proxy
-        text = f"service [{shown.service}] of {self._name(shown)}: {action.reason}"
+        text = f"service [{shown.service}] of {shown.whose}: {action.reason}"
         self._fail_waiting(shown, text)
         if proxy is not None:
             self._core.call("unregisterService", proxy.name, shown.service, proxy.service_uri)
@@ -443,7 +447,7 @@ class Services(Part):
         """Open a service; if its peer has no link at this moment, its next link or its end will go on from here."""
         remote = self.imports.get(shown.peer, shown.service)
         if remote is None or not remote.shown:
-            self._fail_waiting(shown, f"service [{shown.service}] of {self._name(shown)} has just gone")
+            self._fail_waiting(shown, f"service [{shown.service}] of {shown.whose} has just gone")
         elif remote.state is SessionState.IDLE and not self.imports.is_away(shown.peer):
             self._act(self.imports.want(shown.peer, shown.service, self._loop.time()))
 
@@ -452,7 +456,7 @@ class Services(Part):
         attached = self._attached.get(action.peer)
         if shown is None or attached is None or attached.away is not None:
             return
-        what = f"service [{shown.service}] of {self._name(shown)}"
+        what = f"service [{shown.service}] of {shown.whose}"
         caller = shown.caller = Caller(attached.link, action.requests, what, self._budgets[action.peer], shown.stats)
         attached.takers[action.route] = caller
         self._callers[action.peer, action.route] = shown
@@ -475,7 +479,7 @@ class Services(Part):
             caller.close(action.reason)
         shown = self._shown.get((action.peer, action.service))
         if shown is not None and shown.caller is None:
-            self._fail_waiting(shown, f"service [{shown.service}] of {self._name(shown)}: {action.reason}")
+            self._fail_waiting(shown, f"service [{shown.service}] of {shown.whose}: {action.reason}")
 
     def _fail_waiting(self, shown: Shown, text: str) -> None:
         asking, shown.asking = shown.asking, []
@@ -487,9 +491,6 @@ class Services(Part):
             shown.stats.calls += 1
             shown.stats.fail(text)
             call.fail(text)
-
-    def _name(self, shown: Shown) -> str:
-        return self.imports.peer_name(shown.peer)
 
     def _mismatched(self, shown: Shown, fields: Mapping[str, str], text: str) -> None:
         """A client was refused, here and at once; said on both sides."""

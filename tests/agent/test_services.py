@@ -1,0 +1,269 @@
+"""Services between whole agents in one process: registrations and calls when graphs and links change."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.core import limits
+from rmpa.core.config import PeerRule, ServiceRule, ServiceSettings, Settings
+from rmpa.core.errors import PeerRefused
+from rmpa.ros.aio.service_client import ServiceConnection
+from rmpa.ros.aio.service_server import ServiceCall, ServiceEndpoint
+from rmpa.ros.aio.slave_server import SlaveNode
+from rmpa.ros.services import ServiceDescription
+from tests.agent.test_agent import running, settings, until
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from rmpa.agent import Agent
+
+__all__ = ["settings"]
+
+MD5 = "6a2e34150c00229791cc89ff309fff21"
+
+
+class Server:
+    """A node with one service, which answers with what it was asked, or keeps the calls."""
+
+    def __init__(self, agent: Agent, node: SlaveNode, service: str) -> None:
+        self.agent = agent
+        self.node = node
+        self.service = service
+        self.keeps = False
+        self.calls: list[ServiceCall] = []
+        endpoint = ServiceEndpoint(service, node.name, self._serve, description=ServiceDescription("a/Add", MD5))
+        node.add_service(endpoint)
+        self.agent.core.call("registerService", node.name, service, node.service_uri, node.uri)
+
+    def _serve(self, call: ServiceCall) -> None:
+        self.calls.append(call)
+        if not self.keeps:
+            call.reply(True, call.request)
+
+    def unregister(self) -> None:
+        self.agent.core.call("unregisterService", self.node.name, self.service, self.node.service_uri)
+
+
+@asynccontextmanager
+async def serving(agent: Agent, service: str = "/add", name: str = "/adder") -> AsyncIterator[Server]:
+    node = SlaveNode(name, "127.0.0.1", agent.core.uri)
+    await node.start()
+    server = Server(agent, node, service)
+    try:
+        yield server
+    finally:
+        server.unregister()
+        await node.close()
+
+
+def provider(agent: Agent, service: str = "/add") -> str:
+    """The node that provides a service in a module's graph; empty if there is none."""
+    return next(iter(agent.core.state().services.get(service, {})), "")
+
+
+async def connect(agent: Agent, service: str = "/add", md5sum: str = "*") -> ServiceConnection:
+    (uri,) = agent.core.state().services[service].values()
+    return await ServiceConnection.open(uri, service, "/client", md5sum=md5sum)
+
+
+def fall_silent(*agents: Agent) -> None:
+    """The link between two agents falls silent, as far as services hear of it."""
+    for agent in agents:
+        for attached in agent.bridge.attached():
+            attached.link.silent = True
+            agent.services.link_down(attached)
+            attached.takers.clear()
+
+
+def come_back(*agents: Agent) -> None:
+    for agent in agents:
+        for attached in agent.bridge.attached():
+            attached.link.silent = False
+            agent.services.link_up(attached)
+
+
+async def test_a_call_goes_there_and_back_and_is_counted_on_both_sides(settings: Callable[..., Settings]) -> None:
+    async with running(settings("a"), settings("b")) as (a, b), serving(a) as server:
+        await until(lambda: provider(b) == "/rmpa/a/adder")
+        connection = await connect(b, md5sum=MD5)
+        assert connection.description.type == "a/Add"
+        for body in (b"", b"1", b"x" * 10_000, b"y" * 3_000_000):
+            assert await connection.call(body, 20.0) == (True, body)
+        connection.close()
+        assert len(server.calls) == 4
+        (there,) = [i for i in a._snapshot({}).services if i.name == "/add"]
+        (here,) = [i for i in b._snapshot({}).services if i.name == "/add"]
+        assert (there.direction, there.state, there.callers, there.calls, there.failed) == (
+            "out",
+            "open",
+            ("b",),
+            4,
+            0,
+        )
+        assert (here.direction, here.peer, here.state, here.type, here.md5) == ("in", "a", "open", "a/Add", MD5)
+        assert (here.calls, here.failed, here.active) == (4, 0, 0)
+        assert here.latency is not None
+        assert there.latency is not None
+        assert here.latency.max >= there.latency.min > 0
+    assert provider(b) == ""
+
+
+async def test_a_link_that_is_back_soon_keeps_services_and_answers_who_called_meanwhile(
+    settings: Callable[..., Settings],
+) -> None:
+    async with running(settings("a"), settings("b")) as (a, b), serving(a) as server:
+        await until(lambda: provider(b) == "/rmpa/a/adder")
+        connection = await connect(b)
+        server.keeps = True
+        asked = asyncio.create_task(connection.call(b"1", 20.0))
+        await until(lambda: server.calls)
+        changes = b.core.state().services
+        fall_silent(a, b)
+        ok, text = await asked
+        assert not ok
+        assert b"the link to a was lost" in text
+        server.keeps = False
+        waiting = asyncio.create_task(connection.call(b"2", 20.0))
+        await asyncio.sleep(limits.AWAY_GRACE / 5)
+        assert b.core.state().services == changes, "nobody was told of it"
+        come_back(a, b)
+        assert await waiting == (True, b"2")
+        connection.close()
+
+
+async def test_a_link_that_stays_away_takes_its_services_and_tells_who_waits(
+    settings: Callable[..., Settings],
+) -> None:
+    async with running(settings("a"), settings("b")) as (a, b), serving(a):
+        await until(lambda: provider(b) == "/rmpa/a/adder")
+        connection = await connect(b)
+        fall_silent(a, b)
+        ok, text = await connection.call(b"1", 20.0)
+        assert not ok
+        assert b"/add] of a: a is gone" in text
+        assert provider(b) == ""
+        come_back(a, b)
+        await until(lambda: provider(b) == "/rmpa/a/adder")
+        connection = await connect(b)
+        assert await connection.call(b"2", 20.0) == (True, b"2")
+        connection.close()
+
+
+async def test_a_local_service_is_never_pushed_out_and_ours_comes_when_it_goes(
+    settings: Callable[..., Settings],
+) -> None:
+    async with running(settings("a"), settings("b")) as (a, b), serving(a):
+        await until(lambda: provider(b) == "/rmpa/a/adder")
+        seen: list[str] = []
+        b.core.on_change(lambda change: seen.append(provider(b)) if change.name == "/add" else None)
+        async with serving(b, name="/mine"):
+            await until(lambda: provider(b) == "/mine")
+            b.services.reconcile()
+            await asyncio.sleep(0.05)
+            assert provider(b) == "/mine"
+            (info,) = [i for i in b._snapshot({}).services if i.peer == "a"]
+            assert (info.state, info.hidden) == ("hidden", "/mine of this module provides it itself")
+        await until(lambda: provider(b) == "/rmpa/a/adder")
+        assert seen == ["/mine", "/mine", "", "/rmpa/a/adder"], "ours went, its came; its went, ours came"
+
+
+async def test_what_somebody_took_out_of_the_graph_comes_back(settings: Callable[..., Settings]) -> None:
+    async with running(settings("a"), settings("b")) as (a, b), serving(a):
+        await until(lambda: provider(b) == "/rmpa/a/adder")
+        (uri,) = b.core.state().services["/add"].values()
+        b.core.call("unregisterService", "/rmpa/a/adder", "/add", uri)
+        assert provider(b) == ""
+        b.services.reconcile()
+        assert provider(b) == "/rmpa/a/adder"
+
+
+async def test_a_server_that_comes_back_at_another_address_is_asked_anew(settings: Callable[..., Settings]) -> None:
+    async with running(settings("a"), settings("b")) as (a, b), serving(a):
+        await until(lambda: provider(b) == "/rmpa/a/adder")
+        connection = await connect(b)
+        assert await connection.call(b"1", 20.0) == (True, b"1")
+        async with serving(a):  # the same node once more: the master ends the first one
+            await until(lambda: any(shown.caller is None for shown in b.services))
+            again = await connect(b)
+            assert await again.call(b"2", 20.0) == (True, b"2")
+            again.close()
+        connection.close()
+
+
+async def test_another_md5_sum_is_refused_and_both_sides_say_so(
+    settings: Callable[..., Settings], caplog: pytest.LogCaptureFixture
+) -> None:
+    async with running(settings("a"), settings("b")) as (a, b), serving(a):
+        await until(lambda: provider(b) == "/rmpa/a/adder")
+        with pytest.raises(PeerRefused, match=MD5):
+            await connect(b, md5sum="f" * 32)
+        await until(lambda: a.bridge.counters["service.mismatch_remote"])
+        assert b.bridge.counters["service.mismatch"] == 1
+        (info,) = [i for i in b._snapshot({}).services if i.name == "/add"]
+        assert "md5sum" in info.problem
+        said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+        assert sum(MD5 in line for line in said) == 2
+        connection = await connect(b, md5sum=MD5)
+        connection.close()
+
+
+async def test_names_and_rules_of_a_peer_hold_for_services_and_change_at_a_reload(
+    settings: Callable[..., Settings],
+) -> None:
+    mine = replace(settings("b"), peers=(PeerRule("a", prefix="/robot1"),))
+    async with running(settings("a"), mine) as (a, b), serving(a), serving(a, "/sub", "/other"):
+        await until(lambda: provider(b, "/robot1/add") == "/rmpa/a/adder")
+        await until(lambda: provider(b, "/robot1/sub"))
+        connection = await connect(b, "/robot1/add")
+        assert await connection.call(b"1", 20.0) == (True, b"1")
+        quick = ServiceSettings(deny=("/robot1/sub",), rules=(ServiceRule(("/robot1/**",), 0.2),))
+        b.bridge.reload(replace(mine, services=quick))
+        await until(lambda: not provider(b, "/robot1/sub"))
+        assert await connection.call(b"2", 20.0) == (True, b"2"), "what is not touched goes on"
+        connection.close()
+        b.bridge.reload(replace(mine, peers=()))
+        await until(lambda: provider(b) == "/rmpa/a/adder" and not provider(b, "/robot1/add"))
+
+
+async def test_the_deadline_of_a_call_is_the_callers(settings: Callable[..., Settings]) -> None:
+    mine = replace(settings("b"), services=ServiceSettings(timeout=0.3))
+    async with running(settings("a"), mine) as (a, b), serving(a) as server:
+        await until(lambda: provider(b) == "/rmpa/a/adder")
+        server.keeps = True
+        connection = await connect(b)
+        ok, text = await connection.call(b"1", 20.0)
+        assert not ok
+        assert b"0.3 s" in text
+        server.calls[0].reply(True, b"too late")
+        server.keeps = False
+        assert await connection.call(b"2", 20.0) == (True, b"2")
+        connection.close()
+
+
+async def test_a_service_that_has_no_server_behind_it_is_refused_with_the_reason(
+    settings: Callable[..., Settings],
+) -> None:
+    async with running(settings("a"), settings("b")) as (a, b), serving(a) as server:
+        a.core.call("registerService", "/ghost", "/boo", "rosrpc://127.0.0.1:1", server.node.uri)
+        await until(lambda: provider(b, "/boo"))
+        with pytest.raises(PeerRefused, match=r"rosrpc://127\.0\.0\.1:1"):
+            await connect(b, "/boo")
+        a.core.call("unregisterService", "/ghost", "/boo", "rosrpc://127.0.0.1:1")
+        await until(lambda: not provider(b, "/boo"))
+
+
+async def test_a_hundred_services_of_fifty_nodes_stand_in_the_other_graph(settings: Callable[..., Settings]) -> None:
+    async with running(settings("a"), settings("b")) as (a, b), serving(a) as server:
+        for number in range(100):
+            uri = f"http://127.0.0.1:1/{number % 50}"
+            a.core.call("registerService", f"/n{number % 50}", f"/s{number}", server.node.service_uri, uri)
+        await until(lambda: sum(name.startswith("/s") for name in b.core.state().services) == 100)
+        for number in range(100):
+            a.core.call("unregisterService", f"/n{number % 50}", f"/s{number}", server.node.service_uri)
+        await until(lambda: not any(name.startswith("/s") for name in b.core.state().services))
