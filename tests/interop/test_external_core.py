@@ -91,7 +91,7 @@ def test_a_new_node_is_seen_within_a_second_and_a_dead_one_crosses_no_more(joine
     a.wait_topic("/chatter")
     begin = time.monotonic()
     eventually(lambda: "/chatter" in b.topics(), what="/chatter at b", every=0.01)
-    assert time.monotonic() - begin < 2.5, "a second and the time that rostopic takes"
+    assert time.monotonic() - begin < 5.0, "a second, and what rostopic takes on a busy machine"
     flows(b.ros.roscpp("listener", topic="/chatter"))
     talker.kill()
     # The listener's subscription to the proxy goes with the proxy: only then is the topic's last name gone there.

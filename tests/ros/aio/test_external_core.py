@@ -102,7 +102,7 @@ async def test_others_are_seen_soon(master: RosCore, core: ExternalCore) -> None
     async with a_node() as api:
         master.call("registerPublisher", "/n", "/t", STRING, api)
         await until(lambda: told)
-        assert asyncio.get_running_loop().time() - begin < 1.0 + 0.5, "a second, and a busy machine"
+        assert asyncio.get_running_loop().time() - begin < 2.0, "a second, on a busy machine"
         assert core.publishers("/t") == {"/n": api}
         assert (core.type_of("/t"), core.type_of("/u")) == (STRING, "*")
         assert core.state() == master.state()
@@ -172,8 +172,12 @@ async def test_a_stopped_master_holds_up_nobody(monkeypatch: pytest.MonkeyPatch)
     await until(lambda: master.publishers("/t"))
     stopped.set()
     core.call("unregisterPublisher", "/rmpa", "/t", OURS)
+    asking = asyncio.create_task(core.ask("setParam", "/rmpa", "/key", 1))
     async with asyncio.timeout(limits.MASTER_FAREWELL + 2.0):
+        await asyncio.sleep(0.01)
         await core.close()
+        with pytest.raises(UnreachableError):
+            await asking
     await server.close()
     await master.close()
 

@@ -238,6 +238,7 @@ class ExternalCore:
                     await self._look()
             except Exception:  # noqa: BLE001 - the task's top: the graph must be followed on
                 _log.exception("! looking at the roscore %s failed", self._uri)
+                self._seen = b""
                 self._next_look = self._loop.time() + limits.MASTER_LOOK_MAX
             if self._loop.time() - checked > limits.NODE_CHECK_INTERVAL:
                 checked = self._loop.time()
@@ -288,19 +289,23 @@ class ExternalCore:
                 if services := [one for one in batch if one.method == "registerService" and not one.seen]:
                     taken = await self._taken(services)
                     batch = [one for one in batch if one not in taken]
-                await self._send(batch)
+                if batch:
+                    await self._send(batch)
             except UnreachableError as error:
                 for write in batch:
                     write.fail(error)
                 self._lost(error)
+            except BaseException:
+                for write in batch:
+                    write.fail(UnreachableError("ROS master", self._uri, "the call was given up"))
+                raise
         self._written.set()
 
     async def _taken(self, services: list[_Write]) -> list[_Write]:
         """Those that would push another provider out, which no look has shown yet: the next one decides."""
         try:
-            answers = await self._many(
-                [one_call("lookupService", [self._own_node, one.params[1]]) for one in services]
-            )
+            names = [str(one.params[1]) for one in services]
+            answers = await self._many(lookup_calls(self._own_node, (), names))
         except (LocalProtocolError, RemoteProtocolError, RosFault):
             return []  # what is wrong with them is said when they are sent
         found = []
@@ -316,7 +321,10 @@ class ExternalCore:
     async def _send(self, batch: list[_Write]) -> None:
         """Send calls as one; if that cannot be said or read, one by one."""
         try:
-            answers = await self._many([one_call(write.method, write.params) for write in batch])
+            # Parameters may be megabytes, which take a master long to read.
+            large = any(write.method in _PARAM_WRITES for write in batch)
+            timeout = limits.MASTER_ASK_TIMEOUT if large else limits.MASTER_TIMEOUT
+            answers = await self._many([one_call(write.method, write.params) for write in batch], timeout)
         except (LocalProtocolError, RemoteProtocolError, RosFault) as error:
             if len(batch) > 1:
                 for write in batch:
@@ -441,8 +449,8 @@ class ExternalCore:
             return f"{node} at {api}, process {reply.value}"
         return ""
 
-    async def _many(self, calls: Sequence[XmlRpcValue]) -> list[XmlRpcValue]:
-        answers = await call(self._uri, _MULTICALL, calls, timeout=limits.MASTER_TIMEOUT)
+    async def _many(self, calls: Sequence[XmlRpcValue], within: float = 0.0) -> list[XmlRpcValue]:
+        answers = await call(self._uri, _MULTICALL, calls, timeout=within or limits.MASTER_TIMEOUT)
         if not isinstance(answers, list) or len(answers) != len(calls):
             raise RemoteProtocolError(f"{len(calls)} calls were answered with {brief(answers)}")
         return answers
