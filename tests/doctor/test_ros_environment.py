@@ -62,6 +62,16 @@ def test_ros_master_uri_without_an_agent() -> None:
     assert "no agent of ours" in found.text
 
 
+def test_ros_master_uri_of_a_roscore_that_the_agent_uses() -> None:
+    alone = replace(SHELL, cores={}, domains={}, external="http://robot2:11311/", answers=True)
+    found = judged(alone, ROS_MASTER_URI="http://robot2:11311")["ROS_MASTER_URI"]
+    assert (found.level, "will use" in found.text) == (Level.OK, True)
+    found = judged(replace(alone, answers=False), ROS_MASTER_URI="http://robot2:11311")["ROS_MASTER_URI"]
+    assert (found.level, found.remedy) == (Level.WARN, "start it: roscore")
+    running = replace(SHELL, cores={"base": "http://robot2:11311/"})
+    assert judged(running, ROS_MASTER_URI="http://robot2:11311")["ROS_MASTER_URI"].level is Level.OK
+
+
 @pytest.mark.parametrize(
     ("variable", "value", "level", "part"),
     [

@@ -121,20 +121,20 @@ class Why:
         ways = [self._arrives(guid, topic) for guid in coming]
         ways += [self._leaves(topic, peer.guid) for peer in peers if own and peer.state == "linked"]
         found = [diagnosis for diagnoses in await asyncio.gather(*ways) for diagnosis in diagnoses]
-        return tuple(found) or (self._nowhere(topic, [peer.name for peer in peers]),)
+        return tuple(found) or (await self._nowhere(topic, [peer.name for peer in peers]),)
 
     def _offers(self, peer: PeerInfo, topic: str) -> bool:
         attached = self._carrier(peer)
         return attached is not None and bool(self._topics.near(attached, peer, topic).only)
 
-    def _nowhere(self, topic: str, linked: list[str]) -> Diagnosis:
+    async def _nowhere(self, topic: str, linked: list[str]) -> Diagnosis:
         here = self._view.snapshot(frozenset()).agent.name
         if self._topics.own(topic):
             text, remedy = "no peer is linked that it could go to", "`rmpa peer list` tells of the peers"
             stage = Stage("peer", Verdict.FAIL, text, remedy)
             return Diagnosis(name=topic, peer=here, to="", flows=False, stages=(stage,))
         state = self._core.state()
-        near = did_you_mean(topic, {*state.publishers, *state.subscribers})
+        near = await asyncio.to_thread(did_you_mean, topic, {*state.publishers, *state.subscribers})
         text = f"neither {here} nor a linked peer ({', '.join(linked) or 'there is none'}) publishes {topic}"
         remedy = f"did you mean {near}?" if near else "`rmpa topic list` shows what there is, `rmpa peer list` who"
         stage = Stage("publisher", Verdict.FAIL, text, remedy)
@@ -205,7 +205,7 @@ class Why:
             )
             served = tuple(diagnosis for diagnosis in found if diagnosis.node)
             here = self._view.snapshot(frozenset()).agent.name
-            return served or (self._services.nowhere(here, service, [p.name for p in peers]),)
+            return served or (await self._services.nowhere(here, service, [p.name for p in peers]),)
         return (await self._calls(name, service),)
 
     async def _calls(self, name: str, service: str) -> Diagnosis:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING, Any
 
 from rmpa.agent.why_topics import name_in
@@ -9,6 +10,7 @@ from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import OWN_NODE, Policy, is_own
 from rmpa.bridge.service_rules import ServiceRules
 from rmpa.core import limits
+from rmpa.core.aio.loop import breathing
 from rmpa.core.config_values import did_you_mean
 from rmpa.core.errors import RmpaError
 from rmpa.monitor.diagnosis import Diagnosis, Stage, Verdict
@@ -54,11 +56,11 @@ class ServiceFacts:
             return False
         return (remote.origin.instance if remote.origin else attached.link.identity.instance.hex()) == instance
 
-    def nowhere(self, here: str, service: str, linked: list[str]) -> Diagnosis:
+    async def nowhere(self, here: str, service: str, linked: list[str]) -> Diagnosis:
         """No peer has it."""
         state = self._core.state()
         own = [node for node in state.services.get(service, {}) if not is_own(node)]
-        near = did_you_mean(service, {*state.services})
+        near = await asyncio.to_thread(did_you_mean, service, {*state.services})
         text = f"no linked peer ({', '.join(linked) or 'there is none'}) provides {service}"
         remedy = f"did you mean {near}?" if near else "`rosservice list` shows what there is, `rmpa peer list` who"
         if own:
@@ -117,8 +119,10 @@ class ServiceFacts:
                 rule=decision.rule,
                 refusal=refusal,
             )
-        known = {self._rules.wire_name(peer, service) for service in seen}
-        return FarService(near=did_you_mean(wire, known) or "")
+        known = {self._rules.wire_name(peer, service) for service in breathing(list(seen))}
+        # To compare with thousands of names takes longer than a message may wait.
+        near = await asyncio.to_thread(did_you_mean, wire, known)
+        return FarService(near=near or "")
 
 
 async def _probe(uri: str, service: str) -> tuple[str, str]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Policy, is_own
 from rmpa.bridge.proxy_names import proxy_name
 from rmpa.core import limits
+from rmpa.core.aio.loop import breathing
 from rmpa.core.config_values import did_you_mean
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.names import is_global_name
@@ -112,7 +114,7 @@ class TopicFacts:
             for link in (publication.connections() if publication is not None else ())
         )
 
-    def tell(self, attached: Attached, args: dict[str, Any]) -> FarTopic:
+    async def tell(self, attached: Attached, args: dict[str, Any]) -> FarTopic:
         """Answer the agent that should receive a topic.
 
         Args:
@@ -132,23 +134,33 @@ class TopicFacts:
             if names.wire_name(topic, kind) == wire:
                 sources += [self._far(attached, Source(topic, node), wire) for node in nodes]
                 subscribers += [node for node in state.subscribers.get(topic, {}) if not is_own(node)]
-        known = {
-            names.wire_name(topic, state.types.get(topic, ""))
-            for topic, nodes in state.publishers.items()
-            if not all(map(is_own, nodes))
-        }
         return FarTopic(
             sources=tuple(sources[: limits.WHY_SOURCES_MAX]),
             subscribers=tuple(subscribers[: limits.WHY_SOURCES_MAX]),
-            near="" if sources else did_you_mean(wire, known) or "",
+            near="" if sources else await self._nearest(attached.link.name, wire),
         )
+
+    async def _nearest(self, asker: str, wire: str) -> str:
+        """The topic of ours whose name over there is most like this one; empty if none is."""
+        names, state = self._bridge.names.of(asker), self._core.state()
+        known = {
+            names.wire_name(topic, state.types.get(topic, ""))
+            for topic, nodes in breathing(list(state.publishers.items()))
+            if not all(map(is_own, nodes))
+        }
+        # To compare with thousands of names takes longer than a message may wait.
+        near = await asyncio.to_thread(did_you_mean, wire, known)
+        return near or ""
 
     def _relayed(self, topic: str, instance: object) -> list[str]:
         """What stands here for the nodes of a module whose topic we pass on."""
+        offered = self._bridge.exports.offered
         return [
-            source.node
-            for source, local in self._bridge.exports.offered.items()
-            if source.topic == topic and local.origin is not None and local.origin.instance == instance
+            node
+            for node in self._core.publishers(topic)
+            if (local := offered.get(Source(topic, node))) is not None
+            and local.origin is not None
+            and local.origin.instance == instance
         ]
 
     def _far(self, attached: Attached, source: Source, wire: str) -> FarSource:

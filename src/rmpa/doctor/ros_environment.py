@@ -29,6 +29,7 @@ class Shell:
         cores: The URI of each agent's core on this machine, by the agent's name.
         domains: The domain of each of these agents.
         answers: Whether somebody listens where ROS_MASTER_URI says; ``None`` if that was not tried.
+        external: The roscore that an agent with these settings would use; empty where it brings a core of its own.
     """
 
     environ: Mapping[str, str]
@@ -38,6 +39,7 @@ class Shell:
     cores: Mapping[str, str] = field(default_factory=dict)
     domains: Mapping[str, int] = field(default_factory=dict)
     answers: bool | None = None
+    external: str = ""
 
 
 def names_of(environ: Mapping[str, str], host_name: str) -> tuple[str, ...]:
@@ -102,6 +104,11 @@ def _master(shell: Shell) -> list[Finding]:
     export = next((f"export ROS_MASTER_URI={core}" for core in shell.cores.values()), "unset ROS_MASTER_URI")
     if any(core.rstrip("/") == uri.rstrip("/") for core in shell.cores.values()):
         return [_finding(variable, Level.OK, f"{said} is the core of {ours[0]}" if ours else said)]
+    if shell.external and shell.external.rstrip("/") == uri.rstrip("/"):
+        if shell.answers:
+            return [_finding(variable, Level.OK, f"{said} is the roscore that `rmpa up` will use")]
+        text = f"{said} does not answer, and is the roscore that `rmpa up` should use"
+        return [_finding(variable, Level.WARN, text, "start it: roscore")]
     if host != "localhost" and not addresses:
         text = f"{said}: nobody knows the name {host}, so nodes of this shell find no master"
         return [_finding(variable, Level.FAIL, text, export)]

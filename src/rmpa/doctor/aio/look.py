@@ -20,7 +20,7 @@ from rmpa.doctor.network import judge_cards, judge_ports, judge_routes, judge_rp
 from rmpa.doctor.ros_environment import Shell, judge_shell, names_of
 from rmpa.monitor.aio.control_client import ControlClient, find_agents
 from rmpa.monitor.snapshot import Snapshot
-from rmpa.ros.environment import host_of
+from rmpa.ros.environment import DEFAULT_MASTER_URI, host_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -122,7 +122,7 @@ def _ports(snapshots: Mapping[str, Snapshot]) -> dict[int, str]:
 
 def _shell(patient: Patient, addresses: set[str]) -> Shell:
     host_name = socket.gethostname()
-    environ = patient.environ
+    environ, settings = patient.environ, patient.settings
     resolved = resolve(names_of(environ, host_name))
     return Shell(
         environ=environ,
@@ -131,7 +131,8 @@ def _shell(patient: Patient, addresses: set[str]) -> Shell:
         resolved=resolved,
         cores={name: snapshot.agent.core_uri for name, snapshot in patient.snapshots.items()},
         domains={name: snapshot.agent.domain for name, snapshot in patient.snapshots.items()},
-        answers=_answers(environ.get("ROS_MASTER_URI", "") or "http://localhost:11311"),
+        answers=_answers(environ.get("ROS_MASTER_URI", "") or DEFAULT_MASTER_URI),
+        external=(settings.core_master or DEFAULT_MASTER_URI) if settings.core_mode == "external" else "",
     )
 
 
