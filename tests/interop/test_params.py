@@ -207,6 +207,7 @@ def test_time_comes_from_one_simulator(configured: Configured) -> None:
     # Nobody else has it: not who asks one that does not share, whatever that one has itself.
     assert "/clock" not in other.topics()
     assert "time comes from sim here" in json.loads(param(other, "followed", "--json"))[0]["problem"]
+    assert "/use_sim_time is not followed: time comes from sim here" in other.agent.rmpa("peer", "list")[1]
     # A second source is refused, and that is said, on both sides.
     sim.ros.rospy("clock", "__name:=second", start=9000).wait_event("up")
     robot.agent.process.wait_for("time comes from /simulator of sim already, and has one source")

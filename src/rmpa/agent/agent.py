@@ -123,6 +123,7 @@ class Agent:
         self._view.services = ServicesView(self.services)
         self._param_ops = ParamOps(self.params, self.bridge.asks, self._attached)
         self.reloader = Reloader(settings, load, self._take)
+        self._view.parameters = self.params.notes
         self._view.waiting = lambda: self.reloader.waiting
         self._whys = Why(settings, self.core, self.bridge, self.services, self._view)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from rmpa.bridge.param_transfer import QUESTIONS
+from rmpa.core import limits
 from rmpa.core.config_values import did_you_mean
 from rmpa.core.errors import ConfigError
 from rmpa.monitor.snapshot import FollowedInfo
@@ -39,7 +40,8 @@ class ParamOps:
             raise ConfigError("what", f"{what!r} is no question", f"did you mean {near}?" if near else "")
         if not isinstance(inner, dict):
             raise ConfigError("args", f"{inner!r} is no table")
-        return await self._asks.ask(self._attached(str(args.get("peer", ""))), what, inner)
+        attached = self._attached(str(args.get("peer", "")))
+        return await self._asks.ask(attached, what, inner, limits.PARAM_ASK_TIMEOUT)
 
     def followed(self, _args: dict[str, object]) -> tuple[FollowedInfo, ...]:
         """What this module follows, and how that goes."""

@@ -69,6 +69,8 @@ class View:
         self.services: ServicesView | None = None
         self.waiting: Callable[[], tuple[str, ...]] = tuple
         """What the settings say and only a restart brings."""
+        self.parameters: Callable[[], tuple[str, ...]] = tuple
+        """What there is to know of followed parameters."""
 
     def reload(self, settings: Settings) -> None:
         """Other settings hold from now on."""
@@ -102,6 +104,7 @@ class View:
         notes = tuple(self.station.discovery.notes()) if self.station is not None else ()
         notes += self._core.notes()
         notes += tuple(f"{key} waits for a restart" for key in self.waiting())
+        notes += self.parameters()
         missing = refused(self._wishes)
         return (*notes, missing) if missing else notes
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 from rmpa.bridge import param_transfer as transfer
 from rmpa.bridge.params import key_problem, leaves
 from rmpa.cli.master import Master, choose_master
+from rmpa.core import limits
 from rmpa.core.config_values import did_you_mean
 from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.names import is_legal_name
@@ -70,7 +71,7 @@ def open_store(peer: str | None, master: str | None, agent: str | None) -> Store
         return MasterStore(choose_master(master, agent, os.environ))
     if master is not None:
         raise ConfigError("--peer", "a peer is asked through this machine's agent, not at a master", "leave one out")
-    return PeerStore(ControlClient(choose_agent(os.environ, agent).path), peer)
+    return PeerStore(ControlClient(choose_agent(os.environ, agent).path, limits.CONTROL_HANDLER_TIMEOUT), peer)
 
 
 def read_key(text: str, environ: Mapping[str, str], *, root: bool = False) -> str:

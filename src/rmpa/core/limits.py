@@ -478,6 +478,9 @@ PARAM_TRANSFERS: Final = 4
 """Parameters that one peer reads or writes at a time; the one that was begun first gives way."""
 PARAM_TRANSFER_IDLE: Final = 30.0
 """A parameter that is read or written in portions is forgotten when nobody went on for this long."""
+PARAM_ASK_TIMEOUT: Final = 25.0
+"""For a peer's answer about a parameter: its core may need seconds for megabytes of numbers, data going first. Less
+than CONTROL_HANDLER_TIMEOUT, so that the user hears who did not answer."""
 PARAM_LEAVE_TIMEOUT: Final = 1.0
 """For leaving all parameters that the agent was told of, when it ends."""
 PARAM_GATHER: Final = 0.05

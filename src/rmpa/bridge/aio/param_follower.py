@@ -211,7 +211,7 @@ class ParamFollower:
         try:
             question = next(steps)
             while True:
-                question = steps.send(await self._asks.ask(attached, *question))
+                question = steps.send(await self._asks.ask(attached, *question, limits.PARAM_ASK_TIMEOUT))
         except StopIteration as done:
             text = done.value
         except RmpaError:

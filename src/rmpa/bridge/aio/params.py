@@ -51,6 +51,11 @@ class Params(Part):
         """What is followed, and how that goes."""
         return self._follower.following
 
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know of those that are not followed as the settings want it."""
+        found = (e for e in self._follower.following if e.problem and e.peer is not None)
+        return tuple(f"parameter {entry.rule} is not followed: {entry.problem}" for entry in found)
+
     def reload(self, settings: Settings) -> None:
         """Other rules hold from now on; what they do not concern goes on untouched."""
         params, time = settings.params, settings.time
