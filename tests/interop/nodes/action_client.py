@@ -26,11 +26,15 @@ def main() -> None:
         say("done", state=GoalStatus.to_string(state), result=result.result if result else 0)
 
     def obey() -> None:
+        sent = False
         for line in sys.stdin:
             word, *rest = line.split()
             if word == "server":
                 say("server", found=client.wait_for_server(rospy.Duration(float(rest[0]))))
             elif word == "send":
+                if sent:
+                    client.wait_for_result()  # it says "done" before it knows that it is
+                sent = True
                 client.send_goal(
                     TestGoal(int(rest[0])),
                     done_cb=done,
