@@ -24,6 +24,11 @@ _RECENT: Final = 64
 """Large replies whose fate is not known when the bulk lane is lost: they leave within a lease, so some do."""
 
 
+def _text(body: Buffer) -> str:
+    """The text of an error, as far as it is kept."""
+    return bytes(body[: limits.CONTROL_TEXT_MAX]).decode(errors="replace")
+
+
 class Budgets:
     """What the calls of one link may hold.
 
@@ -111,7 +116,7 @@ class Caller(BodyTaker):
         if ok:
             self._stats.latencies.add(now - began)
         else:
-            self._stats.fail(bytes(body[1:]).decode(errors="replace"))
+            self._stats.fail(_text(memoryview(body)[1:]))
         call.reply(ok, memoryview(body)[1:])
 
     def failed(self, sequence: int, reason: str) -> None:
@@ -220,7 +225,7 @@ class Server(BodyTaker):
         if ok:
             stats.latencies.add(self._loop.time() - began)
         else:
-            stats.fail(bytes(body).decode(errors="replace"))
+            stats.fail(_text(body))
         if not self._outgoing.take(len(body)):
             self._reply_failed(sequence, f"more than {self._outgoing.limit >> 20} MiB of replies wait for the link")
         elif not self._send(sequence, ok, body, self._outgoing):
