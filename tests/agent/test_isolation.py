@@ -33,6 +33,7 @@ from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.monitor.aio.control_client import ControlClient
+from rmpa.monitor.diagnosis import Diagnosis
 from rmpa.ros.aio.core import RosCore
 from rmpa.ros.aio.external_core import ExternalCore
 
@@ -238,6 +239,20 @@ async def somebody_looks_at_everything(world: World) -> None:
     await world.beside(work)
 
 
+async def somebody_asks_why(world: World) -> None:
+    """Of topics that nobody listens to and of one with no such name: both agents look at all that they have."""
+    topic = next(iter(world.near.bridge.imports.offered_by(next(world.near.bridge.attached()).peer)))
+
+    def work() -> None:
+        path = next(world.near._control.path.parent.glob("near.sock"))
+        with ControlClient(path, timeout=DEADLINE) as client:
+            for name, peer in ((topic, "far"), (topic, None), (topic + "x", "far"), (topic + "x", None)) * 2:
+                (found,) = client.call("why", tuple[Diagnosis, ...], name=name, peer=peer)
+                assert found.failed is not None
+
+    await world.beside(work)
+
+
 async def plans_are_reconciled(world: World) -> None:
     for _ in range(6):
         for agent in (world.near, world.far):
@@ -295,6 +310,7 @@ PHASES: Final[tuple[Callable[[World], Awaitable[None]], ...]] = (
     tools_ask_the_master,
     parameters_are_large,
     somebody_looks_at_everything,
+    somebody_asks_why,
     plans_are_reconciled,
     other_rules_hold,
     the_link_falls_and_comes_back,
