@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import random
 from collections import deque
 from dataclasses import dataclass, field
@@ -203,6 +204,12 @@ class Map:
         for here, module in self.modules.items():
             expected = sorted((f"/t{m}", f"/rmpa/m{m}/n") for m in self.reachable(here))
             assert module.visible() == expected, f"module {here}"
+            origins = [entry.origin for _, _, entry in module.imports if entry.shown]
+            for whose in (*origins, *(remote.origin for _, remote in module.service_imports if remote.shown)):
+                if whose is not None:
+                    way = [int(text, 16) for text in (whose.instance, *whose.path)] + [here]
+                    steps = all(other in self.modules[one].links for one, other in itertools.pairwise(way))
+                    assert steps, f"module {here} believes in the way {way}"
             assert module.callable() == [(topic.replace("t", "s"), node) for topic, node in expected], (
                 f"module {here}"
             )
