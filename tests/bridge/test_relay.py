@@ -68,12 +68,13 @@ class Module:
         self.look()
 
     @property
-    def topic(self) -> str:
-        return f"/t{self.number}"
+    def topics(self) -> set[str]:
+        """Two, for what goes may go one by one."""
+        return {f"/t{self.number}", f"/u{self.number}"}
 
     @property
-    def service(self) -> str:
-        return f"/s{self.number}"
+    def services(self) -> set[str]:
+        return {f"/s{self.number}", f"/v{self.number}"}
 
     def direct(self, peer: int, node: str) -> Origin:
         """Whose a source is that comes by the link of its own module."""
@@ -82,12 +83,12 @@ class Module:
 
     def look(self) -> list[Any]:
         """The local graph as the agent's driver reads it."""
-        topics = {self.topic, *self.dirty, *(place[0] for place in self.shown.values())}
+        topics = {*self.topics, *self.dirty, *(place[0] for place in self.shown.values())}
         actions: list[Any] = []
-        for service in {self.service, *self.dirty, *(place[0] for place in self.provided.values())}:
+        for service in {*self.services, *self.dirty, *(place[0] for place in self.provided.values())}:
             nodes = {place[1] for place in self.provided.values() if place[0] == service}
             assert len(nodes) <= 1, "a graph has one provider"
-            local = LocalService("/n", "uri") if service == self.service else None
+            local = LocalService("/n", "uri") if service in self.services else None
             for node in nodes:
                 if whose := self.relay.origin((f"service {service}", node)):
                     local = LocalService(node, "uri", whose)
@@ -95,7 +96,7 @@ class Module:
         for topic in topics:
             nodes = {place[1] for place in self.shown.values() if place[0] == topic}
             graph = {n: LocalSource(TYPE, "uri", o) for n in nodes if (o := self.relay.origin((topic, n)))}
-            if topic == self.topic:
+            if topic in self.topics:
                 graph["/n"] = LocalSource(TYPE, "uri")
             actions += self.exports.graph(topic, graph)
         self.dirty = set()
@@ -202,17 +203,15 @@ class Map:
 
     def check(self) -> None:
         for here, module in self.modules.items():
-            expected = sorted((f"/t{m}", f"/rmpa/m{m}/n") for m in self.reachable(here))
-            assert module.visible() == expected, f"module {here}"
+            there = self.reachable(here)
+            assert module.visible() == sorted((f"/{k}{m}", f"/rmpa/m{m}/n") for m in there for k in "tu"), here
+            assert module.callable() == sorted((f"/{k}{m}", f"/rmpa/m{m}/n") for m in there for k in "sv"), here
             origins = [entry.origin for _, _, entry in module.imports if entry.shown]
             for whose in (*origins, *(remote.origin for _, remote in module.service_imports if remote.shown)):
                 if whose is not None:
                     way = [int(text, 16) for text in (whose.instance, *whose.path)] + [here]
                     steps = all(other in self.modules[one].links for one, other in itertools.pairwise(way))
                     assert steps, f"module {here} believes in the way {way}"
-            assert module.callable() == [(topic.replace("t", "s"), node) for topic, node in expected], (
-                f"module {here}"
-            )
 
 
 def test_two_networks_and_two_relays_of_which_one_is_used() -> None:
@@ -241,7 +240,7 @@ def test_who_does_not_relay_passes_nothing_on() -> None:
     world.link(2, 3)
     world.settle()
     world.check()
-    assert world.modules[3].visible() == [("/t2", "/rmpa/m2/n")]
+    assert world.modules[3].visible() == [("/t2", "/rmpa/m2/n"), ("/u2", "/rmpa/m2/n")]
 
 
 def test_a_long_row_ends_at_the_hop_limit() -> None:
