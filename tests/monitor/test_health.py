@@ -7,7 +7,7 @@ import pytest
 
 from rmpa.core import limits
 from rmpa.monitor.health import HERE, Health
-from rmpa.monitor.snapshot import EventInfo, PeerInfo, RouteInfo, Snapshot
+from rmpa.monitor.snapshot import EventInfo, PeerInfo, RouteInfo, ServiceInfo, Snapshot
 from rmpa.ros.diagnostic_array import Level, Status
 from tests.monitor.samples import SNAPSHOT
 
@@ -184,3 +184,23 @@ def test_the_ghost_of_a_peer_that_is_back_is_left_out() -> None:
         "rmpa: joystick": Level.OK,
         "rmpa: joystick (10.0.0.9:40002#1)": Level.OK,
     }
+
+
+def test_services_that_were_called_tell_their_failures_once() -> None:
+    idle = ServiceInfo(name="/add", node="/adder", direction="in", peer="joystick")
+    used = msgspec.structs.replace(idle, calls=3, type="a/Add", state="open")
+    failed = msgspec.structs.replace(used, calls=5, failed=1, problem="it sticks")
+    ours = ServiceInfo(name="/add", node="/mine", direction="out", calls=1)
+
+    def with_services(*services: ServiceInfo) -> Snapshot:
+        return msgspec.structs.replace(SNAPSHOT, topics=(), services=services)
+
+    health, name = Health(), "rmpa: joystick: service /add"
+    assert name not in judged(health, with_services(idle))
+    first = judged(health, with_services(ours, used))
+    assert (first[name].level, first[name].values["calls"]) == (Level.OK, "3")
+    assert first["rmpa: service /add"].level is Level.OK
+    worse = judged(health, with_services(failed))[name]
+    assert (worse.level, worse.message) == (Level.WARN, "1 of 2 calls failed: it sticks")
+    after = judged(health, with_services(failed))[name]
+    assert (after.level, after.message, after.values["failed"]) == (Level.OK, "0 calls", "1")

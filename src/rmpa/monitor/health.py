@@ -9,13 +9,13 @@ from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
-from rmpa.monitor.health_values import agent_values, link_values, number, route_values
+from rmpa.monitor.health_values import agent_values, link_values, number, route_values, service_values
 from rmpa.ros.diagnostic_array import Level, Status
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.monitor.snapshot import PeerInfo, RouteInfo, Snapshot, TopicInfo
+    from rmpa.monitor.snapshot import PeerInfo, RouteInfo, ServiceInfo, Snapshot, TopicInfo
 
 HERE: Final = "rmpa: this module"
 """The agent's own status."""
@@ -43,6 +43,8 @@ class Health:
     def judge(self, snapshot: Snapshot, now: float) -> Iterator[Status]:
         """One status for the agent, one for each peer, one for each topic that comes from one or does not fit there.
 
+        And one for each service that was called across the mesh.
+
         Args:
             snapshot: All of it.
             now: Monotonic seconds.
@@ -64,6 +66,12 @@ class Health:
             self._topics.setdefault(route.peer, set()).add(name)
             yield _route(name, here, topic, route, self._new(name, counts[name]))
         yield from _refused(snapshot, here)
+        for service in snapshot.services:
+            if service.calls:
+                name = f"rmpa: {service.peer}: " if service.peer else "rmpa: "
+                name += f"service {service.name}"
+                counts[name] = Counter(calls=service.calls, failed=service.failed)
+                yield _service(name, here, service, self._new(name, counts[name]))
         yield from self._stale(peers, here, now)
         self._counts = counts
 
@@ -117,6 +125,15 @@ def _refused(snapshot: Snapshot, here: str) -> Iterator[Status]:
     for topic in snapshot.topics:
         if topic.mismatches and not any(route.direction == "in" for route in topic.routes):
             yield Status(Level.ERROR, f"rmpa: {topic.name}", "; ".join(topic.mismatches), here, {})
+
+
+def _service(name: str, here: str, info: ServiceInfo, new: Counter[str]) -> Status:
+    """A service that was called; its failures are told once, for they may be the server's own words."""
+    if new["failed"]:
+        level, text = Level.WARN, f"{new['failed']} of {new['calls']} calls failed: {info.problem}"
+    else:
+        level, text = Level.OK, f"{new['calls']} calls" + (f", {info.active} under way" if info.active else "")
+    return Status(level, name, text, here, service_values(info))
 
 
 def _missing(route: RouteInfo) -> Counter[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rmpa.monitor.snapshot import PeerInfo, RouteInfo, Snapshot
+    from rmpa.monitor.snapshot import PeerInfo, RouteInfo, ServiceInfo, Snapshot
 
 
 def number(value: float | None, scale: float = 1.0) -> str:
@@ -49,6 +49,26 @@ def link_values(info: PeerInfo) -> dict[str, str]:
             "dropped": str(link.dropped),
             "topics in": str(info.topics_in),
             "topics out": str(info.topics_out),
+        }
+    return _known(known)
+
+
+def service_values(info: ServiceInfo) -> dict[str, str]:
+    """A service's calls across the mesh."""
+    known = {
+        "node": info.node,
+        "state": info.state,
+        "type": info.type,
+        "calls": str(info.calls),
+        "failed": str(info.failed),
+        "under way": str(info.active),
+        "last problem": info.problem,
+    }
+    if info.latency is not None:
+        known |= {
+            "latency p50 (ms)": number(info.latency.p50, 1e3),
+            "latency p99 (ms)": number(info.latency.p99, 1e3),
+            "latency max (ms)": number(info.latency.max, 1e3),
         }
     return _known(known)
 
