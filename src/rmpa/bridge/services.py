@@ -320,7 +320,8 @@ class ServiceImports:
         known.nodes[remote.node] -= 1
         if not known.nodes[remote.node]:
             del known.nodes[remote.node]
-        actions = self._end(peer, remote.route, reason) if remote.route else []
+        # Our words may have crossed: what we asked for last is open over there, for another server perhaps.
+        actions = self._release(peer, remote, reason)
         another_way = remote.origin is not None and self.ways.forget(peer, remote.origin)
         if remote.shown:
             remote.shown = False
