@@ -100,6 +100,11 @@ def test_what_a_profile_does_not_offer_falls_short() -> None:
     assert decider(mute).explain(bounds)[0].terms[0].offered is None
 
 
+def test_of_what_no_profile_offers_only_a_measurement_can_tell() -> None:
+    bounds = {"rate": bound(RATE, at_least=1, hard=True)}
+    assert decider(Profile("mute", {})).decide(bounds).feasible
+
+
 def test_every_term_is_explained() -> None:
     bounds = {
         "rate": bound(RATE, at_least="40 Hz", weight=2, hard=True),

@@ -271,7 +271,12 @@ class Adaptation:
         if profile:
             self._decider.profile(profile)
         self._pinned = profile
-        return self._plan(now, f"{profile} was chosen by hand" if profile else "the choice by hand is over")
+        why = f"{profile} was chosen by hand" if profile else "the choice by hand is over"
+        return self._plan(now, why, at_once=True)
+
+    def reconsider(self, why: str, now: float) -> list[Action]:
+        """Take what is best now, however little better it is: the question is another one."""
+        return self._plan(now, why, at_once=True)
 
     # --- what is measured ---------------------------------------------------------------------------------------
 
@@ -295,7 +300,7 @@ class Adaptation:
         short = []
         for name, bound in self._knows.merged.bounds.items():
             value = measured.get(name)
-            if value is not None and not _meets(self._attributes[name], value, bound):
+            if value is not None and not bound.met_by(self._attributes[name], value):
                 short.append(Shortfall(name, bound, value))
         return tuple(short)
 
@@ -466,12 +471,6 @@ class Adaptation:
         # Under it the quality is as asked again: the next disturbance starts with a short cool-down.
         self._knows.troubles.pop(self._profile, None)
         return [Clear(alarm)]
-
-
-def _meets(attribute: Attribute, value: Value, bound: Bound) -> bool:
-    if bound.words:
-        return value in bound.words
-    return bound.low <= attribute.place(value) <= bound.high
 
 
 def _named(short: tuple[Shortfall, ...]) -> str:

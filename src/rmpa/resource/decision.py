@@ -127,6 +127,7 @@ class Decider:
             self._places[name] = places
             span = attribute.tolerated
             self._spans[name] = span if span is not None else (max(known) - min(known) if known else 0.0)
+        self._offered = {name for profile in profiles for name in profile.offers}
         self._best_effort = next((profile.name for profile in profiles if profile.best_effort), "")
 
     @property
@@ -200,6 +201,8 @@ class Decider:
 
     def _deltas(self, name: str, bound: Bound) -> list[float]:
         places, span = self._places[name], self._spans[name]
+        if name not in self._offered:
+            return [0.0] * len(places)  # no profile says anything of it: what is measured will tell
         if bound.words:
             words = self._attributes[name].words
             wanted = {float(words.index(word)) for word in bound.words}
@@ -224,7 +227,7 @@ class Decider:
             Term(
                 name,
                 profile.offers.get(name),
-                _wanted(self._attributes[name], bound),
+                wanted(self._attributes[name], bound),
                 self._deltas(name, bound)[index],
                 bound.weight,
                 bound.hard,
@@ -233,8 +236,8 @@ class Decider:
         )
 
 
-def _wanted(attribute: Attribute, bound: Bound) -> str:
-    """What is asked, for people: ``at least 20 Hz``."""
+def wanted(attribute: Attribute, bound: Bound) -> str:
+    """What is asked of an attribute, for people: ``at least 20 Hz``."""
     if bound.words:
         return " or ".join(word for word in attribute.words if word in bound.words)
     low = attribute.show(attribute.value(bound.low)) if bound.low > -math.inf else ""

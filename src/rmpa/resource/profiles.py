@@ -21,8 +21,8 @@ class Profile:
 
     Args:
         name: Unique within the resource.
-        offers: The value of each attribute under it, in the attribute's unit. What is not offered falls short of
-            every request.
+        offers: The value of each attribute under it, in the attribute's unit. What it does not offer, and another
+            does, falls short of every request.
         cost: What it takes, at least 0, in any unit that all profiles share; decides among nearly equal ones.
         best_effort: Whether this is the one to run when none can serve; at most one of a resource.
         description: For people.

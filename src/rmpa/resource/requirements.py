@@ -18,6 +18,8 @@ from rmpa.resource.units import quantity
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
+    from rmpa.resource.attributes import Value
+
 
 @dataclass(frozen=True, slots=True)
 class Bound:
@@ -36,6 +38,12 @@ class Bound:
     words: frozenset[str] = frozenset()
     weight: float = 1.0
     hard: bool = False
+
+    def met_by(self, attribute: Attribute, value: Value) -> bool:
+        """Whether a value satisfies it."""
+        if self.words:
+            return value in self.words
+        return self.low <= attribute.place(value) <= self.high
 
 
 def bound(

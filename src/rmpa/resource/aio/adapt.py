@@ -1,0 +1,467 @@
+"""Makes a resource smart: measures its quality, takes what clients ask, applies profiles, raises alarms.
+
+Everything goes by plain topics below the resource's node (``docs/smart-resources.md`` lists them), so that it works
+from any node in any module. ``resource.adaptation`` decides; this drives it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from rmpa.core.errors import ConfigError
+from rmpa.resource.adaptation import (
+    Action,
+    Adaptation,
+    AdaptationSettings,
+    Alarm,
+    AlarmKind,
+    Apply,
+    Clear,
+    Raise,
+    Reacted,
+)
+from rmpa.resource.aio.runtime import RuntimePart
+from rmpa.resource.decision import Decider, wanted
+from rmpa.resource.quality import ObservedQuality, TopicQuality
+from rmpa.resource.requirement_text import parse_requirement
+from rmpa.resource.requirements import Requirement
+from rmpa.ros.diagnostic_array import ARRAY_TYPE, Level, Status, frame_array
+from rmpa.ros.tcpros import LENGTH, printable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from rmpa.resource.aio.runtime import Runtime
+    from rmpa.resource.aio.tasks import Tasks
+    from rmpa.resource.attributes import Value
+    from rmpa.resource.declare import Input, Output
+    from rmpa.resource.requirements import Bound
+    from rmpa.ros.aio.topics import Publisher, Received, Subscriber
+
+_log = logging.getLogger(__name__)
+_LOOK: Final = 0.25
+"""Seconds between looks whether clients are still connected."""
+
+
+class Adapter(RuntimePart):
+    """The driver of one resource's loop.
+
+    Args:
+        runtime: Of the resource.
+        tasks: Paused while a profile is applied.
+        window: Seconds of one quality window.
+        settings: How patient the loop is.
+    """
+
+    def __init__(
+        self,
+        runtime: Runtime,
+        tasks: Tasks,
+        *,
+        window: float = 1.0,
+        settings: AdaptationSettings | None = None,
+    ) -> None:
+        resource = runtime.resource
+        self._runtime = runtime
+        self._tasks = tasks
+        self._window = window
+        self._attributes = resource.attributes
+        profiles = [declared.profile for declared in resource.profiles.values()]
+        self.loop = Adaptation(self._attributes, Decider(resource.name, self._attributes, profiles), settings)
+        self._topics: dict[str, TopicQuality] = {}
+        self._observed: dict[str, ObservedQuality] = {}
+        self._answers: dict[str, Status] = {}
+        self._absent: dict[str, int] = {}
+        self._measured: dict[str, Value] = {}
+        self._publishers: dict[str, Publisher] = {}
+        self._sequence = 0
+        self._asking: Subscriber | None = None
+        self._applying: asyncio.Task[None] | None = None
+        self._reports: set[asyncio.Task[None]] = set()
+        self._timers: dict[str, asyncio.TimerHandle] = {}
+        self._context_bars: dict[str, str] = {}
+        self._closed = False
+        self.reaction: float | None = None
+        """Seconds that the last reconfiguration took, from its cause to its completion."""
+        self.listeners: list[Callable[[Action], None]] = []
+        """Called with each action of the loop, for the store and the diagnostics."""
+
+    # --- its life -----------------------------------------------------------------------------------------------
+
+    async def start(self) -> None:
+        """Measure from now on, take the first profile, and hear clients."""
+        self._loop = asyncio.get_running_loop()
+        now = self._loop.time()
+        resource, node = self._runtime.resource, self._runtime.node
+        for name, output in resource.outputs.items():
+            self._topics[name] = TopicQuality(now, stamped=_stamped(output), deadline=output.contract.deadline)
+        for name, item in resource.inputs.items():
+            self._topics[name] = TopicQuality(
+                now, stamped=_stamped(item), numbered=True, deadline=item.contract.deadline
+            )
+        for name, declared in resource.declared_attributes.items():
+            self._observed[name] = ObservedQuality(declared.attribute)
+        for name, latch in (("quality", False), ("alarms", False), ("responses", True)):
+            topic = f"{node.name}/{name}"
+            self._publishers[name] = await node.advertise(topic, ARRAY_TYPE, latch=latch)
+        self._publishers["diagnostics"] = await node.advertise("/diagnostics", ARRAY_TYPE)
+        self._asking = await node.subscribe(f"{node.name}/requirements", ARRAY_TYPE, self._asked)
+        self._bar()
+        self._act(self.loop.start(now))
+        self._respond()
+        self._later("window", self._window, self._end_window)
+        self._later("clients", _LOOK, self._look_at_clients)
+
+    async def close(self) -> None:
+        """Decide nothing any more; a profile that is being applied may end."""
+        self._closed = True
+        for timer in self._timers.values():
+            timer.cancel()
+        tasks = [*self._reports]
+        if self._applying is not None:
+            tasks.append(self._applying)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    # --- measuring ----------------------------------------------------------------------------------------------
+
+    def published(self, output: Output, raw: bytes, now_ns: int) -> None:
+        """Measure an output."""
+        if (quality := self._topics.get(output.name)) is not None:
+            quality.message(raw, self._loop.time(), now_ns)
+
+    def received(self, item: Input, message: Received) -> None:
+        """Measure an input."""
+        if (quality := self._topics.get(item.name)) is not None:
+            quality.message(message.raw, self._loop.time(), message.stamp_ns)
+
+    def observed(self, attribute: str, value: Value) -> None:
+        """Measure an attribute of the user's own."""
+        if (quality := self._observed.get(attribute)) is not None:
+            quality.observe(value)
+
+    @property
+    def measured(self) -> Mapping[str, Value]:
+        """The last window, by attribute."""
+        return self._measured
+
+    def _end_window(self) -> None:
+        self._later("window", self._window, self._end_window)
+        now = self._loop.time()
+        measured: dict[str, Value] = {}
+        for position, (name, topic) in enumerate(self._topics.items()):
+            base = name.rsplit("/", 1)[-1]
+            for key, value in topic.window(now).items():
+                measured[f"{base}.{key}"] = value
+                if position == 0 and self._runtime.resource.outputs:
+                    measured[key] = value
+        for name, quality in self._observed.items():
+            if (seen := quality.window()) is not None:
+                measured[name] = seen
+        self._measured = measured
+        self._bar()
+        self._act(self.loop.window(measured, now))
+        self._publish_quality()
+        self._respond()
+
+    # --- clients ------------------------------------------------------------------------------------------------
+
+    def _asked(self, message: Received) -> None:
+        """A client says what it asks."""
+        client = message.caller_id
+        try:
+            values = [(str(pair.key), str(pair.value)) for status in message.message.status for pair in status.values]
+            self.require(client, values)
+        except ConfigError as error:
+            _log.warning("! %s: %s asks for what cannot be: %s", self._runtime.node.name, printable(client), error)
+            self._answers[client] = self._status(Level.ERROR, client, str(error), {})
+            self._respond()
+
+    def require(self, client: str, values: list[tuple[str, str]]) -> None:
+        """Take what a client asks, in place of what it asked before; nothing: it asks for nothing any more.
+
+        Raises:
+            ConfigError: It cannot be; what it asked before stays.
+        """
+        now = self._loop.time()
+        name = self._runtime.resource.name
+        requirement = parse_requirement(client, values, self._attributes, name, now)
+        self._answers.pop(client, None)
+        if requirement.bounds:
+            self._act(self.loop.require(requirement, now))
+        elif client in self.loop.requirements:
+            self._act(self.loop.release(client, now))
+        self._respond()
+
+    def shift(self, context: str, bounds: Mapping[str, Bound], bars: Mapping[str, str]) -> None:
+        """A context begins: what it requires counts above the clients', and some profiles may not run in it."""
+        now = self._loop.time()
+        self._context_bars = dict(bars)
+        known = [client for client in self.loop.requirements if client.startswith("context ")]
+        name = f"context {context}"
+        self._bar()
+        if bounds:
+            self._act(self.loop.require(Requirement(name, dict(bounds), priority=1 << 30), now))
+        for client in known:
+            if client != name or not bounds:
+                self._act(self.loop.release(client, now))
+        self._act(self.loop.reconsider(f"context {context}" if context else "no context any more", now))
+        self._respond()
+
+    def pin(self, profile: str) -> None:
+        """Choose a profile by hand; an empty name lets the loop decide.
+
+        Raises:
+            ConfigError: There is no such profile.
+        """
+        self._act(self.loop.pin(profile, self._loop.time()))
+        self._respond()
+
+    def _look_at_clients(self) -> None:
+        """Forget those that are gone: killed, unplugged, or simply over."""
+        self._later("clients", _LOOK, self._look_at_clients)
+        callers = self._asking.callers if self._asking is not None else set()
+        for client in {*self.loop.requirements, *self._answers}:
+            if client in callers or client.startswith("context "):
+                self._absent.pop(client, None)
+                continue
+            # Twice in a row: a proxy's subscribers connect anew when its link was gone for a moment.
+            self._absent[client] = self._absent.get(client, 0) + 1
+            if self._absent[client] < 2:
+                continue
+            del self._absent[client]
+            self._answers.pop(client, None)
+            if client in self.loop.requirements:
+                _log.info("= %s: %s is gone, and what it asked for", self._runtime.node.name, printable(client))
+                self._act(self.loop.release(client, self._loop.time()))
+            self._respond()
+
+    # --- acting -------------------------------------------------------------------------------------------------
+
+    def _bar(self) -> None:
+        """Look at the profiles' preconditions."""
+        barred = dict(self._context_bars)
+        for name, declared in self._runtime.resource.profiles.items():
+            if declared.needs is None or name in barred:
+                continue
+            try:
+                needs = declared.needs()
+            except Exception as error:  # noqa: BLE001 - the user's code
+                needs = f"its precondition failed: {type(error).__name__}: {error}"
+            if needs is False:
+                barred[name] = "its precondition does not hold"
+            elif isinstance(needs, str) and needs:
+                barred[name] = needs
+        self._act(self.loop.bar(barred, self._loop.time()))
+
+    def _act(self, actions: list[Action]) -> None:
+        for action in actions:
+            match action:
+                case Apply():
+                    _log.info("= %s: profile %s: %s", self._runtime.node.name, action.profile, action.why)
+                    self._begin(action.profile)
+                case Raise():
+                    _log.warning("! %s: %s", self._runtime.node.name, self._told(action.alarm))
+                    self._publish_alarm(action.alarm, cleared=False)
+                case Clear():
+                    _log.info("= %s: over: %s", self._runtime.node.name, self._told(action.alarm))
+                    self._publish_alarm(action.alarm, cleared=True)
+                case Reacted():
+                    self.reaction = action.reaction
+            for listener in self.listeners:
+                listener(action)
+        if actions:
+            self._say_soon()
+        self._arm()
+
+    def _begin(self, profile: str) -> None:
+        if self._applying is not None and not self._applying.done():
+            self._applying.cancel()  # it hangs
+            self._reports.add(self._applying)
+            self._applying.add_done_callback(self._reports.discard)
+        self._applying = self._loop.create_task(self._apply(profile), name=f"apply {profile}")
+
+    async def _apply(self, profile: str) -> None:
+        """Apply a profile between two runs of the tasks, so that no message mixes two of them."""
+        why = ""
+        try:
+            await self._tasks.pause()
+            self._runtime.hold()
+            function = self._runtime.resource.profiles[profile].apply
+            if inspect.iscoroutinefunction(function):
+                await function()
+            else:
+                outcome = await asyncio.to_thread(function)
+                if outcome is not None:
+                    await outcome
+        except Exception as error:  # noqa: BLE001 - the top of the user's code
+            why = f"{type(error).__name__}: {error}"
+            _log.warning("! %s: profile %s: %s", self._runtime.node.name, profile, why)
+        if self.loop.applying != profile:
+            return  # it took so long that another one is applied; that one opens what is closed
+        self._runtime.release(drop=bool(why))
+        self._tasks.resume()
+        now = self._loop.time()
+        self._act(self.loop.failed(profile, why, now) if why else self.loop.applied(profile, now))
+        self._respond()
+
+    def _arm(self) -> None:
+        due = self.loop.next_timer()
+        if (timer := self._timers.pop("loop", None)) is not None:
+            timer.cancel()
+        if due is not None and not self._closed:
+            self._timers["loop"] = self._loop.call_at(due, self._due)
+
+    def _due(self) -> None:
+        hung = self.loop.applying
+        self._act(self.loop.handle_timer(self._loop.time() + 0.001))
+        if hung and self.loop.applying != hung:
+            if not self.loop.applying:
+                self._runtime.release(drop=True)
+                self._tasks.resume()
+            _log.warning("! %s: profile %s hangs; it is given up", self._runtime.node.name, hung)
+        self._respond()
+
+    def _later(self, name: str, delay: float, function: Callable[[], None]) -> None:
+        if not self._closed:
+            self._timers[name] = self._loop.call_later(delay, function)
+
+    # --- telling ------------------------------------------------------------------------------------------------
+
+    def _say_soon(self) -> None:
+        task = self._loop.create_task(self._say(), name="say the decision")
+        self._reports.add(task)
+        task.add_done_callback(self._reports.discard)
+
+    async def _say(self) -> None:
+        await self._runtime.say("profile", self.loop.profile)
+        await self._runtime.say("decision", msgspec.json.encode(self.decision()).decode())
+
+    def decision(self) -> dict[str, Any]:
+        """How each profile does at this moment, with each term of it, for ``rmpa profile explain``."""
+        return {
+            "profile": self.loop.profile,
+            "applying": self.loop.applying,
+            "reaction": self.reaction,
+            "alarm": self.loop.alarm.kind.value if self.loop.alarm is not None else "",
+            "conflicts": [str(conflict) for conflict in self.loop.asked.conflicts],
+            "clients": sorted(self.loop.requirements),
+            "scores": [
+                {
+                    "profile": score.profile,
+                    "distance": score.distance,
+                    "hard_shortfall": score.hard_shortfall,
+                    "feasible": score.feasible,
+                    "excluded": score.excluded,
+                    "terms": [
+                        {
+                            "attribute": term.attribute,
+                            "wanted": term.wanted,
+                            "offered": term.offered,
+                            "delta": term.delta,
+                            "weight": term.weight,
+                            "hard": term.hard,
+                        }
+                        for term in score.terms
+                    ],
+                }
+                for score in self.loop.explain(self._loop.time())
+            ],
+        }
+
+    def _publish_quality(self) -> None:
+        level, message = self._health()
+        values = {
+            name: self._attributes[name].show(v) for name, v in self._measured.items() if name in self._attributes
+        }
+        values["profile"] = self.loop.profile
+        if self.reaction is not None:
+            values["reaction"] = f"{self.reaction:.6g} s"
+        status = self._status(level, self._runtime.resource.name, message, values)
+        self._publish("quality", [status])
+        self._publish("diagnostics", [status])
+
+    def _health(self) -> tuple[Level, str]:
+        alarm = self.loop.alarm
+        if alarm is None:
+            return Level.OK, f"profile {self.loop.profile}" if self.loop.profile else "no profile runs"
+        return _LEVELS[alarm.kind], self._told(alarm)
+
+    def _publish_alarm(self, alarm: Alarm, *, cleared: bool) -> None:
+        values = {"before": alarm.before, "after": alarm.after, "cleared": str(cleared).lower()}
+        for short in alarm.shortfalls:
+            attribute = self._attributes[short.attribute]
+            given = attribute.show(short.given) if short.given is not None else "nothing"
+            values[short.attribute] = f"wanted {wanted(attribute, short.wanted)}, given {given}"
+        level = Level.OK if cleared else _LEVELS[alarm.kind]
+        text = f"over: {self._told(alarm)}" if cleared else self._told(alarm)
+        self._publish("alarms", [self._status(level, self._runtime.resource.name, text, values)])
+
+    def _told(self, alarm: Alarm) -> str:
+        names = ", ".join(short.attribute for short in alarm.shortfalls) or "the quality"
+        if alarm.kind is AlarmKind.ADAPTATION:
+            return f"adaptation: {names} fell short under {alarm.before}; {alarm.after} takes over"
+        return f"non-adaptable: no profile gives {names} as asked; {alarm.after} is the best there is"
+
+    def _respond(self) -> None:
+        """Tell each client what it asked and what it is given."""
+        statuses = []
+        for client, requirement in self.loop.requirements.items():
+            lost = [c for c in self.loop.asked.conflicts if c.client == client]
+            values, short = {}, []
+            for name, bound in requirement.bounds.items():
+                attribute = self._attributes[name]
+                given = self._measured.get(name)
+                shown = attribute.show(given) if given is not None else "not measured yet"
+                values[name] = f"wanted {wanted(attribute, bound)}, given {shown}"
+                if given is not None and not bound.met_by(attribute, given):
+                    short.append(name)
+            level, message = self._judged(short, bool(lost))
+            if lost:
+                message = "; ".join(map(str, lost))
+            if (answer := self._answers.get(client)) is not None:
+                level, message = answer.level, f"{answer.message}; what was asked before stays"
+            statuses.append(self._status(level, client, message, values))
+        statuses += [answer for client, answer in self._answers.items() if client not in self.loop.requirements]
+        if (publisher := self._publishers.get("responses")) is not None and not self._closed:
+            known = [status.serialize() for status in statuses]
+            if known != getattr(self, "_responded", None):
+                self._responded = known
+                publisher.publish_raw(self._frame(statuses))
+
+    def _judged(self, short: list[str], lost: bool) -> tuple[Level, str]:
+        alarm = self.loop.alarm
+        if alarm is not None and alarm.kind is AlarmKind.NON_ADAPTABLE:
+            return Level.ERROR, self._told(alarm)
+        if short or lost:
+            return Level.WARN, f"{', '.join(short)} fall short" if len(
+                short
+            ) > 1 else f"{', '.join(short)} falls short"
+        return Level.OK, f"profile {self.loop.profile}"
+
+    def _status(self, level: Level, name: str, message: str, values: Mapping[str, str]) -> Status:
+        return Status(level, name, message, self._runtime.resource.name, values)
+
+    def _publish(self, topic: str, statuses: list[Status]) -> None:
+        publisher = self._publishers.get(topic)
+        if publisher is not None and not self._closed:
+            publisher.publish_raw(self._frame(statuses))
+
+    def _frame(self, statuses: list[Status]) -> bytes:
+        self._sequence += 1
+        return frame_array(self._sequence, time.time_ns(), [s.serialize() for s in statuses])[LENGTH.size :]
+
+
+_LEVELS: Final = {AlarmKind.ADAPTATION: Level.WARN, AlarmKind.NON_ADAPTABLE: Level.ERROR}
+
+
+def _stamped(topic: Output | Input) -> bool:
+    fields = topic.type.fields
+    return bool(fields) and fields[0].name == "header"
