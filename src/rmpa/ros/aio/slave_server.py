@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import logging
 import os
@@ -115,8 +116,7 @@ class SlaveNode:
             subscription.close()
         self._tcpros.close()
         await self._http.close()
-        for endpoint in services:
-            await endpoint.closed()
+        await asyncio.gather(*(endpoint.closed() for endpoint in services))
         for subscription in subscriptions.values():
             await subscription.closed()
         # We and our servers know each other, and wait for the collector; what our owner knows must not.
