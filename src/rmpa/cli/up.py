@@ -8,7 +8,6 @@ import os
 import socket
 import sys
 from functools import partial
-from pathlib import Path
 
 import click
 
@@ -95,7 +94,7 @@ def up(
         log_json,
         realtime,
     )
-    load = partial(load_settings, flags, dict(os.environ), host_name=socket.gethostname(), cwd=Path.cwd())
+    load = partial(load_settings, flags, dict(os.environ), host_name=socket.gethostname())
     loaded = load()
     writer = LogWriter(sys.stderr.fileno())
     configure_logging(loaded.settings.log_level, writer, as_json=loaded.settings.log_json)
