@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -178,3 +179,15 @@ async def test_services(settings: Callable[..., Settings]) -> None:  # noqa: F81
         (own,) = await ask(a, "/ask")
         assert own.failed is not None
         assert "of this module provides /ask" in own.failed.text
+
+
+async def test_a_server_that_is_stuck(settings: Callable[..., Settings], monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+    monkeypatch.setattr(limits, "WHY_PROBE", 0.3)
+    async with running(settings("a"), settings("b")) as (a, b):
+        with socket.create_server(("127.0.0.1", 0)) as stuck:  # takes connections, and says nothing
+            uri = f"rosrpc://127.0.0.1:{stuck.getsockname()[1]}"
+            a.core.call("registerService", "/stuck", "/ask", uri, "http://127.0.0.1:1/")
+            await until(lambda: b.core.state().services.get("/ask"))
+            stage, text = stopped_at(await ask(b, "/ask", "a"))
+        assert stage == "server"
+        assert text.startswith("/stuck on a is registered for it, and does not answer: ")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+from dataclasses import replace
 
 import pytest
 
@@ -43,6 +44,18 @@ def test_doctor_hears_itself_and_says_on_which_interface_not() -> None:
     assert 0 < lo.after < limits.DOCTOR_HEAR
     assert other.after is None
     assert "No such device" in other.problem
+
+
+def test_what_comes_in_elsewhere_says_nothing_of_an_interface(monkeypatch: pytest.MonkeyPatch) -> None:
+    wait = GroupReceiver.wait
+
+    def elsewhere(self: GroupReceiver, timeout: float | None = None) -> object:
+        packet = wait(self, timeout)
+        return None if packet is None else replace(packet, interface="eth9")
+
+    monkeypatch.setattr(GroupReceiver, "wait", elsewhere)
+    monkeypatch.setattr(limits, "DOCTOR_HEAR", 0.2)
+    assert [heard.after for heard in hear_ourselves([LO], GROUP, PORT)] == [None]
 
 
 def test_an_agent_passes_the_doctors_packet_over(monkeypatch: pytest.MonkeyPatch) -> None:

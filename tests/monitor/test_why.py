@@ -353,6 +353,11 @@ def test_what_is_worth_knowing_though_it_flows(case: Case, stage: str, text: str
     assert text in warned[0].text
 
 
+def test_bytes_that_wait_at_one_look_alone_are_on_their_way() -> None:
+    found = one(Case(readers_later=(Reader(number=1, node="/base", waiting=70_000),)))
+    assert found.stages[-1].verdict is Verdict.OK
+
+
 def test_an_agent_that_does_not_tell_leaves_stages_open() -> None:
     found = one(Case(far=None, refusal="it is older"))
     assert found.flows
