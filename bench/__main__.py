@@ -21,6 +21,7 @@ from bench import (
     peers,
     period,
     profile,
+    roscore,
     scale,
     services,
     startup,
@@ -77,6 +78,9 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
         "how soon modules and their graphs are joined, and what a mesh costs while nothing happens", joining.measure
     ),
     "services": Measurement("a service call through two agents, and a direct one", services.measure),
+    "roscore": Measurement(
+        "what it costs to follow a real roscore, and how soon changes are seen", roscore.measure, (bed.why_no_ros,)
+    ),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),
 }
 
