@@ -6,13 +6,16 @@ import contextlib
 from pathlib import Path
 
 from rmpa.bridge.messages import Open, decode, encode
+from rmpa.bridge.naming import PeerNames
 from rmpa.core import config_values as values
 from rmpa.core import limits
 from rmpa.core.config_contract import read_contracts, read_duration, read_rate
 from rmpa.core.config_file import known_keys, parse_config
 from rmpa.core.config_param import overlap, read_follow_rules, untouchable
+from rmpa.core.config_peer import read_peers
 from rmpa.core.contract import Contracts
 from rmpa.core.errors import ConfigError
+from rmpa.core.names import is_global_name
 
 _EXAMPLE = Path(__file__).parents[2] / "examples" / "rmpa.toml"
 _READERS = (
@@ -52,6 +55,10 @@ SEEDS: list[bytes] = [
     b"[[contract]]\ntopics = ['/**']\ndeadline = 1e-9\nlifespan = 1e9\nmax_rate = 1e-9\ndepth = 0\n",
     b"[[contract]]\ntopics = ['/**']\nlifespan = '86401 s'\n",
     b'[[param]]\nkey = "/a/b"\nfrom = "base"\nto = "/c"\n[[param]]\nkey = "c/d"\nfrom = "arm"\n[time]\nfollow = ""\n',
+    b'[[peer]]\nname = "robot*"\nprefix = "/{peer}"\nremap_in = {"/tf" = "/tf", "/arm/**" = "/{peer}/left/**"}\n',
+    b'[[peer]]\nname = "a"\n[[peer.remap]]\ndirection = "out"\nfrom = "/a"\nto = "/b"\ntypes = ["a/*"]\n',
+    b'[[peer]]\nname = "*"\nallow = ["/{peer}/**"]\nremap_out = {"/a" = "/b", "/b" = "/a"}\n',
+    b'[[peer]]\nname = "*"\n[peer.remap_in]\n"/**" = "/a/**"\n"/b/**" = "/**"\n',
     b"100 ms",
     b"86400.000000000 s",
     b"infinite",
@@ -65,6 +72,7 @@ def fuzz(data: bytes) -> None:
         found = parse_config(data, Path("rmpa.toml"))
         rules = found.pop(("contract",), [])
         _check_follow_rules(found.pop(("param",), []))
+        _check_peers(found.pop(("peer",), []))
         if not set(found) <= set(known_keys()):
             raise AssertionError(f"unknown keys came through: {set(found) - set(known_keys())}")
         _check_contracts(rules)
@@ -89,6 +97,22 @@ def _check_follow_rules(raw: object) -> None:
     for index, rule in enumerate(rules):
         if untouchable(rule.to) or any(overlap(rule.to, other.to) for other in rules[:index]):
             raise AssertionError(f"{rule} must not be")
+
+
+def _check_peers(raw: object) -> None:
+    """Rules that make names of names, never two of one list the same, or a BadValue that says where."""
+    try:
+        read = read_peers(raw)
+    except values.BadValue as error:
+        if not error.at or not isinstance(error.at[0], int):
+            raise AssertionError(f"a wrong peer, but nothing says which: {error.at}") from error
+        return
+    for peer in ("robot1", "base", "r"):
+        names = PeerNames(peer, read.rules)
+        for way in (names.local_name, names.wire_name):
+            for name in ("/a", "/a/b", "/arm/joints", "/tf", "/robot1/odom"):
+                if not is_global_name(way(name)):
+                    raise AssertionError(f"{name} becomes {way(name)!r}")
 
 
 def _check_contracts(raw: object) -> None:
