@@ -521,8 +521,8 @@ class Bridge:
         if self._forgetting and not tuple(islice(self._forgetting[0], limits.LEARNT_AT_ONCE)):
             self._forgetting.popleft()
         rejudged = tuple(islice(self._rejudging, limits.LEARNT_AT_ONCE))
-        for actions in rejudged:
-            self._act(actions)
+        # In one: what data brings in between belongs behind all of it.
+        self._act([action for actions in rejudged for action in actions])
         if self._changed or self._learning or self._forgetting or rejudged or self._exports.untold:
             self._schedule()
         elif self._mismatches:
