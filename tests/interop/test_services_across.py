@@ -126,7 +126,7 @@ def test_a_killed_server_is_gone_everywhere_within_a_second_though_nobody_calls(
     began = time.monotonic()
     worker.send(signal.SIGKILL)
     gone = float(watch.wait_for(r"gone ([\d.]+)").group(1))
-    assert gone - began < 3.0, "1 s, and what a shared machine adds"
+    assert gone - began < 4.0, "1 s, and what a shared machine adds"
 
 
 def test_a_server_that_hangs_costs_one_deadline(modules: ModuleFactory) -> None:

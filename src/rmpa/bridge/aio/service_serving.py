@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.aio.service_calls import Budgets, CallStats, Server
@@ -23,17 +24,18 @@ from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.names import is_type_name
 from rmpa.ros.aio.http_client import is_own_name
 from rmpa.ros.aio.liveness import listening_ports
+from rmpa.ros.aio.local_addresses import local_addresses
 from rmpa.ros.services import parse_service_uri
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Mapping
+    from collections.abc import Callable, Collection, Coroutine, Mapping
 
     from rmpa.bridge.aio.bridge import Attached
     from rmpa.ros.aio.core_api import Core
 
 _MD5_LENGTH: Final = 32
 _LOOK_SHARE: Final = 50
-"""A look at the servers' ports takes at most one of so many parts of the time."""
+"""A look at the servers' ports takes at most one of so many parts of a processor."""
 
 
 class Serving:
@@ -159,22 +161,28 @@ class Serving:
 
     async def _look_after(self) -> None:
         """Notice servers that were killed: who provides a service and does not listen any more is suspected."""
-        loop = asyncio.get_running_loop()
         while True:
-            began = loop.time()
             servers = dict(self._exports.offered)
-            ports = await asyncio.to_thread(listening_ports) if servers else None
-            if ports is not None:
+            cost = 0.0
+            if servers:
+                ports, here, cost = await asyncio.to_thread(_listening)
                 for service, server in breathing(list(servers.items())):
-                    if self._exports.offered.get(service) == server and _is_deaf(server, ports):
+                    if self._exports.offered.get(service) == server and _is_deaf(server, ports, here):
                         self._core.suspect(server.node)
-            await asyncio.sleep(max(limits.SERVER_LOOK, _LOOK_SHARE * (loop.time() - began)))
+            await asyncio.sleep(max(limits.SERVER_LOOK, _LOOK_SHARE * cost))
 
 
-def _is_deaf(server: LocalService, ports: set[int]) -> bool:
+def _listening() -> tuple[set[int] | None, frozenset[str], float]:
+    """Ports that somebody listens at, this machine's addresses, and the processor's seconds; for a thread."""
+    began = time.thread_time()
+    return listening_ports(), frozenset(local_addresses()), time.thread_time() - began
+
+
+def _is_deaf(server: LocalService, ports: set[int] | None, here: Collection[str]) -> bool:
     """Whether a server of this machine does not listen; of others nothing is known."""
     try:
         host, port = parse_service_uri(server.uri)
     except ConfigError:
         return False
-    return (is_own_name(host) or host.startswith("127.")) and port not in ports
+    local = is_own_name(host) or host.startswith("127.") or host in here
+    return local and ports is not None and port not in ports
