@@ -187,6 +187,32 @@ def test_what_is_no_angle_and_no_yaml(text: str) -> None:
         read_yaml(text, "x")
 
 
+LONG = "it's a text, longer than a line of YAML may be, so that it is broken where a space stands in it"
+MARKUP = '<a b="c">\n  <d e=\'f\'/>  <!-- it\'s "here" & <there> \u00e9 and so on, up to the next line -->\n</a>\n'
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        ({"k": LONG}, f"k: {LONG[:82]}\n  {LONG[83:]}\n"),
+        (
+            {"k": MARKUP},
+            (
+                'k: "<a b=\\"c\\">\\n  <d e=\'f\'/>  <!-- it\'s \\"here\\" & <there> \\xE9 and so on, up to\\\n'
+                '  \\ the next line -->\\n</a>\\n"\n'
+            ),
+        ),
+        ("two\n lines\n", '"two\\n lines\\n"\n'),
+        ("one\ntwo", "'one\n\n  two'\n"),
+        (1e17, "1.0e+17\n...\n"),
+        ({"b": [[1, []], {"b": {}}], "a": "on"}, "a: 'on'\nb:\n- - 1\n  - []\n- b: {}\n"),
+    ],
+    ids=repr,
+)
+def test_yaml_as_pyyaml_writes_it(value: Any, text: str) -> None:
+    assert write_yaml(value) == text
+
+
 def test_documents() -> None:
     assert read_documents("a: 1\n---\nb: 2001-01-01\n", "x") == [
         {"a": 1},

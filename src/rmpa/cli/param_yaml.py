@@ -63,6 +63,8 @@ _RULES: Final = (
     ("!degrees", "d", r"deg\([^)]*\)"),
     ("!radians", "r", r"rad\([^)]*\)"),
 )
+_SAFE: Final = r"[ !#-\[\]-~]"
+"""What stands between double quotes as it is."""
 _OPERATORS: Final[dict[type[ast.AST], Callable[..., float]]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
@@ -151,6 +153,19 @@ class _Representer(SafeRepresenter):
 _Representer.add_representer(float, _Representer.represent_float)
 
 
+def _safe(character: str) -> bool:
+    return re.fullmatch(_SAFE, character) is not None
+
+
+def _escape(character: str) -> str:
+    """As PyYAML writes it between double quotes."""
+    short = Emitter.ESCAPE_REPLACEMENTS.get(character)
+    if short is not None:
+        return f"\\{short}"
+    code = ord(character)
+    return f"\\x{code:02X}" if code < 0x100 else f"\\u{code:04X}" if code < 0x10000 else f"\\U{code:08X}"
+
+
 class _Emitter(Emitter):
     """Chooses quotes and indents as PyYAML does."""
 
@@ -161,9 +176,52 @@ class _Emitter(Emitter):
         if top and flow:
             self.indent = self.best_map_indent
 
-    def write_double_quoted(self, text: Any, split: Any = True) -> None:  # noqa: ARG002 - ruamel's signature
-        """In one line: where ruamel breaks it, a space comes in."""
-        super().write_double_quoted(text, split=False)
+    def write_plain(self, text: Any, split: Any = True) -> None:
+        """Broken at a single space, once the line is long enough."""
+        if self.root_context:
+            self.open_ended = True
+        if text and not self.whitespace:
+            self._put(" ")
+        self.whitespace = self.indention = False
+        for piece in re.split("( +)", text):
+            if piece == " " and self.column > self.best_width and split:
+                self.write_indent()
+                self.whitespace = self.indention = False
+            else:
+                self._put(piece)
+
+    def write_double_quoted(self, text: Any, split: Any = True) -> None:
+        """Broken before a space or behind what is escaped; ruamel's own breaks would bring spaces in."""
+        self.write_indicator('"', True)
+        last = len(text) - 1
+        for piece in re.finditer(rf"{_SAFE}+|(.)", text, re.DOTALL):
+            if piece[1]:
+                self._put(_escape(piece[1]))
+                rest = piece.end()
+                far = self.column - self.best_width
+                if split and ((far > 1 and 1 < rest <= last) or (far > 0 and rest < last and _safe(text[rest]))):
+                    self._break(text, rest)
+                continue
+            begin = piece.start()
+            for space in re.finditer(" ", piece[0]):
+                at = piece.start() + space.start()
+                if split and 0 < at < last and self.column + at - begin > self.best_width:
+                    self._put(text[begin:at])
+                    self._break(text, at)
+                    begin = at
+            self._put(text[begin : piece.end()])
+        self.write_indicator('"', False)
+
+    def _break(self, text: str, rest: int) -> None:
+        self._put("\\")
+        self.write_indent()
+        self.whitespace = self.indention = False
+        if text[rest] == " ":
+            self._put("\\")
+
+    def _put(self, data: str) -> None:
+        self.column += len(data)
+        self.stream.write(data.encode(self.encoding) if self.encoding else data)
 
     def choose_scalar_style(self) -> Any:
         """Without quotes where possible, then single ones, then double ones."""
