@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 ARRAY = "diagnostic_msgs/DiagnosticArray"
 OK, WARN, ERROR = 0, 1, 2
-QUICK = AdaptationSettings(violations=2, windows=3, dwell=0.3, cool_down=2.0, apply_timeout=1.0)
+QUICK = AdaptationSettings(violations=2, windows=3, dwell=0.3, cool_down=2.0, apply_timeout=4.0)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -91,6 +91,8 @@ class Adapter(RuntimePart):
         """Seconds that the last reconfiguration took, from its cause to its completion."""
         self.listeners: list[Callable[[Action], None]] = []
         """Called with each action of the loop, for the store and the diagnostics."""
+        self.troubles: Callable[[], tuple[list[str], list[str]]] = lambda: ([], [])
+        """What is wrong beside the quality: (what is missing, what does not work), each ready to read."""
 
     # --- its life -----------------------------------------------------------------------------------------------
 
@@ -111,6 +113,8 @@ class Adapter(RuntimePart):
             topic = f"{node.name}/{name}"
             self._publishers[name] = await node.advertise(topic, ARRAY_TYPE, latch=latch)
         self._publishers["diagnostics"] = await node.advertise("/diagnostics", ARRAY_TYPE)
+        for name in ("profile", "decision"):
+            await self._runtime.say(name, "")
         self._asking = await node.subscribe(f"{node.name}/requirements", ARRAY_TYPE, self._asked)
         self._bar()
         self._act(self.loop.start(now))
@@ -278,7 +282,7 @@ class Adapter(RuntimePart):
             for listener in self.listeners:
                 listener(action)
         if actions:
-            self._say_soon()
+            self._say()
         self._arm()
 
     def _begin(self, profile: str) -> None:
@@ -335,14 +339,9 @@ class Adapter(RuntimePart):
 
     # --- telling ------------------------------------------------------------------------------------------------
 
-    def _say_soon(self) -> None:
-        task = self._loop.create_task(self._say(), name="say the decision")
-        self._reports.add(task)
-        task.add_done_callback(self._reports.discard)
-
-    async def _say(self) -> None:
-        await self._runtime.say("profile", self.loop.profile)
-        await self._runtime.say("decision", msgspec.json.encode(self.decision()).decode())
+    def _say(self) -> None:
+        self._runtime.say_again("profile", self.loop.profile)
+        self._runtime.say_again("decision", msgspec.json.encode(self.decision()).decode())
 
     def decision(self) -> dict[str, Any]:
         """How each profile does at this moment, with each term of it, for ``rmpa profile explain``."""
@@ -389,10 +388,18 @@ class Adapter(RuntimePart):
         self._publish("diagnostics", [status])
 
     def _health(self) -> tuple[Level, str]:
+        missing, broken = self.troubles()
         alarm = self.loop.alarm
-        if alarm is None:
-            return Level.OK, f"profile {self.loop.profile}" if self.loop.profile else "no profile runs"
-        return _LEVELS[alarm.kind], self._told(alarm)
+        if alarm is not None and alarm.kind is AlarmKind.NON_ADAPTABLE:
+            return Level.ERROR, self._told(alarm)
+        if missing:
+            return Level.STALE, "; ".join((*missing, *broken))
+        if not self.loop.profile:
+            return Level.ERROR, "; ".join(("no profile runs", *broken))
+        if alarm is not None or broken:
+            told = [self._told(alarm)] if alarm is not None else []
+            return Level.WARN, "; ".join((*told, *broken))
+        return Level.OK, f"profile {self.loop.profile}"
 
     def _publish_alarm(self, alarm: Alarm, *, cleared: bool) -> None:
         values = {"before": alarm.before, "after": alarm.after, "cleared": str(cleared).lower()}

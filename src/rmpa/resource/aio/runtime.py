@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rmpa.resource.attributes import Value
     from rmpa.resource.declare import Input, Output, Parameter, ParameterValue, Resource
     from rmpa.ros.aio.node import Node
-    from rmpa.ros.aio.topics import Publisher, Received
+    from rmpa.ros.aio.topics import Publisher, Received, Subscriber
 
 _log = logging.getLogger(__name__)
 
@@ -63,7 +63,8 @@ class Runtime:
         self.descriptor = describe(resource, node.name)
         self.parts: list[RuntimePart] = []
         self._publishers: dict[str, Publisher] = {}
-        self._texts: dict[str, tuple[Publisher, str]] = {}
+        self._subscribers: dict[str, Subscriber] = {}
+        self._texts: dict[str, tuple[Publisher, str | None]] = {}
         self._held: list[tuple[Output, bytes]] | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread = 0
@@ -101,15 +102,17 @@ class Runtime:
 
     async def say(self, name: str, text: str) -> None:
         """Publish a text on a latched topic ``std_msgs/String`` of the resource's own; the same text is said once."""
-        known = self._texts.get(name)
-        if known is not None and known[1] == text:
-            return
-        if known is None:
+        if name not in self._texts:
             publisher = await self.node.advertise(f"{self.node.name}/{name}", "std_msgs/String", latch=True)
-        else:
-            publisher = known[0]
-        self._texts[name] = (publisher, text)
-        publisher.publish(publisher.make({"data": text}))
+            self._texts[name] = (publisher, None)
+        self.say_again(name, text)
+
+    def say_again(self, name: str, text: str) -> None:
+        """Publish another text on a topic that ``say`` has made."""
+        publisher, before = self._texts[name]
+        if text != before:
+            self._texts[name] = (publisher, text)
+            publisher.publish(publisher.make({"data": text}))
 
     def set_parameter(self, name: str, value: ParameterValue) -> None:
         """Set a parameter, and let the parts know.
@@ -122,6 +125,11 @@ class Runtime:
         parameter.value = parameter.check(value)
         for part in self.parts:
             part.parameter_changed(parameter)
+
+    def publishers_of(self, item: Input) -> int:
+        """How many publish what an input needs, here or in other modules."""
+        subscriber = self._subscribers.get(item.name)
+        return subscriber.publishers if subscriber is not None else 0
 
     def hold(self) -> None:
         """Keep what is published from now on: a profile is being applied, and no output may mix two of them."""
@@ -149,7 +157,8 @@ class Runtime:
             for part in self.parts:
                 part.received(item, message)
 
-        await self.node.subscribe(topic_of(item.name, self.node.name), item.type, received)
+        topic = topic_of(item.name, self.node.name)
+        self._subscribers[item.name] = await self.node.subscribe(topic, item.type, received)
 
     def send(self, output: Output, raw: bytes) -> None:
         """Send one message of an output, or keep it while a profile is being applied."""

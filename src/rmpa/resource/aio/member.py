@@ -1,0 +1,207 @@
+"""A whole resource: its node, its tasks, its loop, and its life cycle."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+from typing import TYPE_CHECKING
+
+from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
+from rmpa.resource.aio.adapt import Adapter
+from rmpa.resource.aio.runtime import Runtime, RuntimePart
+from rmpa.resource.aio.tasks import Tasks
+from rmpa.resource.lifecycle import LifeCycle, State, Transition
+from rmpa.ros.aio.http_client import call_api
+from rmpa.ros.aio.node import Node
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.resource.adaptation import AdaptationSettings
+    from rmpa.resource.aio.tasks import TaskProblem
+    from rmpa.resource.declare import Resource
+
+_log = logging.getLogger(__name__)
+
+
+class Member:
+    """Runs one resource on the core of its module.
+
+    Args:
+        resource: Declared completely.
+        master_uri: The core's.
+        window: Seconds of one quality window.
+        settings: How patient its loop is.
+
+    Raises:
+        ConfigError: It declares no profile: there would be nothing to decide.
+    """
+
+    def __init__(
+        self,
+        resource: Resource,
+        master_uri: str,
+        *,
+        window: float = 1.0,
+        settings: AdaptationSettings | None = None,
+    ) -> None:
+        if not resource.profiles:
+            remedy = "declare one: @NAME.profile(offers={…})"
+            raise ConfigError(f"resource {resource.name}", "it has no System Profile", remedy)
+        self.resource = resource
+        self.life = LifeCycle()
+        self.ended = asyncio.Event()
+        """Set when the resource is finalized, by whomever."""
+        node = Node(resource.name, master_uri=master_uri, on_shutdown=lambda _reason: self.ended.set())
+        self.runtime = Runtime(resource, node)
+        self.tasks = Tasks(self.runtime, on_problem=self._problem, on_deactivate=self._deactivate_soon)
+        self.adapter = Adapter(self.runtime, self.tasks, window=window, settings=settings)
+        self.adapter.troubles = self._troubles
+        self.runtime.parts += [self.tasks, self.adapter]
+        self._last_problem: dict[str, str] = {}
+        self._deactivating: asyncio.Task[None] | None = None
+
+    def add(self, part: RuntimePart) -> None:
+        """Let a further part hear of everything; before ``start()``."""
+        self.runtime.parts.append(part)
+
+    async def start(self) -> None:
+        """Configure and activate it.
+
+        Raises:
+            PeerRefused: A node of its name is on this core already, or one of its hooks raised.
+            UnreachableError: The core does not answer.
+        """
+        await self._refuse_twin()
+        await self.runtime.start()
+        try:
+            await self._turn(Transition.CONFIGURE)
+            await self._turn(Transition.ACTIVATE)
+        except RmpaError:
+            await self.close()
+            raise
+
+    async def activate(self) -> None:
+        """Let it work again.
+
+        Raises:
+            PeerRefused: Its hook raised.
+        """
+        await self._turn(Transition.ACTIVATE)
+
+    async def deactivate(self) -> None:
+        """Let it rest: no task runs."""
+        await self._turn(Transition.DEACTIVATE)
+
+    async def close(self) -> None:
+        """Finalize it, whatever its state."""
+        if self.life.state is State.FINALIZED:
+            return
+        if self._deactivating is not None:
+            await asyncio.wait([self._deactivating])
+        if self.life.state is State.ACTIVE:
+            await self._turn(Transition.DEACTIVATE)
+        await self._turn(Transition.FINALIZE)
+        await self.runtime.close()
+        self.ended.set()
+
+    # --- inside -------------------------------------------------------------------------------------------------
+
+    async def _refuse_twin(self) -> None:
+        """A second node of one name would end the first one."""
+        node = self.runtime.node
+        reply = await call_api(node.master_uri, "lookupNode", node.name, node.name)
+        if reply.code != 1:
+            return
+        try:
+            other = await call_api(str(reply.value), "getPid", node.name, timeout=1.0)
+        except RmpaError:
+            return  # a leftover of one that is dead
+        text = f"a node {node.name} runs there already (process {other.value})"
+        raise PeerRefused(f"the core at {node.master_uri}", text, "end it, or name this resource otherwise")
+
+    async def _turn(self, transition: Transition) -> None:
+        self.life.begin(transition)
+        if transition is Transition.DEACTIVATE:
+            await self.tasks.deactivate()
+        why = ""
+        hook = self.resource.hooks.get(transition.value)
+        try:
+            if inspect.iscoroutinefunction(hook):
+                await hook()
+            elif hook is not None:
+                outcome = await asyncio.to_thread(hook)
+                if outcome is not None:
+                    await outcome
+        except Exception as error:  # noqa: BLE001 - the top of the user's code
+            why = f"{type(error).__name__}: {error}"
+            _log.warning("! %s: %s: %s", self.runtime.node.name, transition, why)
+        state = self.life.failed(why) if why else self.life.succeeded()
+        if transition is Transition.ACTIVATE and not why:
+            self.tasks.activate()
+        await self.runtime.say("state", state.value)
+        if why and transition in (Transition.CONFIGURE, Transition.ACTIVATE):
+            raise PeerRefused(f"resource {self.resource.name}", f"{transition}: {why}")
+
+    def _problem(self, problem: TaskProblem) -> None:
+        _log.warning("! %s: %s", self.runtime.node.name, problem)
+        self._last_problem[problem.task.name] = str(problem)
+
+    def _deactivate_soon(self, why: str) -> None:
+        if self._deactivating is None and self.life.state is State.ACTIVE:
+            _log.error("! %s is deactivated: %s", self.runtime.node.name, why)
+            self._deactivating = asyncio.get_running_loop().create_task(self.deactivate(), name="deactivate")
+
+    def _troubles(self) -> tuple[list[str], list[str]]:
+        """What is wrong beside the quality: inputs that nobody publishes, and tasks that do not work."""
+        missing = [
+            f"nobody publishes {name}"
+            for name, item in self.resource.inputs.items()
+            if item.required and not self.runtime.publishers_of(item)
+        ]
+        tasks = []
+        for name, state in self.tasks.running.items():
+            if state != "running":
+                tasks.append(f"task {name} {state}: {self._last_problem.get(name, '')}".rstrip(": "))
+        if self.life.state is not State.ACTIVE:
+            tasks.append(f"it is {self.life.state}")
+        return missing, tasks
+
+
+async def run_all(resources: list[Resource], master_uri: str, stop: asyncio.Event, ready: Callable[[], None]) -> None:
+    """Run resources until ``stop`` is set or all of them have ended.
+
+    Args:
+        resources: Of one module, of different names.
+        master_uri: Its core's.
+        stop: Set by the caller.
+        ready: Called when all are active.
+
+    Raises:
+        RmpaError: One of them cannot start; those that have are closed.
+    """
+    members: list[Member] = []
+    try:
+        for resource in resources:
+            member = Member(resource, master_uri)
+            await member.start()
+            members.append(member)
+        ready()
+        over = [asyncio.create_task(_all_ended(members)), asyncio.create_task(_stopped(stop))]
+        await asyncio.wait(over, return_when=asyncio.FIRST_COMPLETED)
+        for task in over:
+            task.cancel()
+        await asyncio.gather(*over, return_exceptions=True)
+    finally:
+        for member in reversed(members):
+            await member.close()
+
+
+async def _all_ended(members: list[Member]) -> None:
+    for member in members:
+        await member.ended.wait()
+
+
+async def _stopped(stop: asyncio.Event) -> None:
+    await stop.wait()

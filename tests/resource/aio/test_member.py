@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from rmpa.core.errors import ConfigError, PeerRefused
+from rmpa.resource.aio.member import Member, run_all
+from rmpa.resource.declare import Resource
+from rmpa.ros.aio.core import RosCore
+from rmpa.ros.aio.node import Node
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from rmpa.ros.aio.topics import Subscriber
+
+OK, WARN, ERROR, STALE = range(4)
+
+
+@pytest.fixture
+async def core() -> AsyncIterator[RosCore]:
+    one = RosCore(port=0)
+    await one.start()
+    yield one
+    await one.close()
+
+
+def echo(**options: Any) -> Resource:
+    one = Resource("echo", role="controlling")
+    heard = one.input("/orders", "std_msgs/String")
+    said = one.output("said", "std_msgs/String")
+
+    @one.profile(offers={"rate": 1})
+    def plain() -> None: ...
+
+    @one.task(on=heard, **options)
+    def repeat(message: Any) -> None:
+        if message.data == "fail":
+            raise ValueError("no voice")
+        said.publish(data=message.data)
+
+    return one
+
+
+async def health(topic: Subscriber, level: int) -> str:
+    async with asyncio.timeout(30):
+        async for received in topic:
+            for status in received.message.status:
+                if status.name == "echo" and status.level == level:
+                    return str(status.message)
+    raise AssertionError
+
+
+async def test_a_resource_lives_and_says_what_it_lacks(core: RosCore) -> None:
+    events: list[str] = []
+    one = echo(on_failure="deactivate")
+    for event in ("configure", "activate", "deactivate", "finalize"):
+        one.on(event)(lambda event=event: events.append(event))
+    member = Member(one, core.uri, window=0.1)
+    await member.start()
+    assert events == ["configure", "activate"]
+    async with Node("watcher", master_uri=core.uri) as node:
+        diagnostics = await node.subscribe("/diagnostics", "diagnostic_msgs/DiagnosticArray")
+        said = await node.subscribe("/echo/said", "std_msgs/String")
+        assert await health(diagnostics, STALE) == "nobody publishes /orders"
+        orders = await node.advertise("/orders", "std_msgs/String")
+        await orders.wait_for_subscriber()
+        assert await health(diagnostics, OK) == "profile plain"
+        async with asyncio.timeout(30):
+            while not member.runtime._publishers["said"].subscribers:
+                await asyncio.sleep(0.02)
+        orders.publish(orders.make({"data": "hello"}))
+        async with asyncio.timeout(30):
+            async for received in said:
+                assert received.message.data == "hello"
+                break
+        orders.publish(orders.make({"data": "fail"}))
+        assert "it is inactive" in await health(diagnostics, WARN)
+        await orders.close()
+        assert "nobody publishes /orders" in await health(diagnostics, STALE)
+    await member.close()
+    assert events == ["configure", "activate", "deactivate", "finalize"]
+    assert core.state().nodes.keys() <= {"/rosout"}
+
+
+async def test_a_second_one_of_its_name_is_refused_and_the_first_lives_on(core: RosCore) -> None:
+    member = Member(echo(), core.uri)
+    await member.start()
+    with pytest.raises(PeerRefused, match="a node /echo runs there already"):
+        await Member(echo(), core.uri).start()
+    assert not member.ended.is_set()
+    await member.close()
+
+
+async def test_a_hook_that_raises_is_why_it_does_not_start(core: RosCore) -> None:
+    one = echo()
+
+    @one.on("activate")
+    def activate() -> None:
+        raise OSError("no such device")
+
+    with pytest.raises(PeerRefused, match="activate: OSError: no such device"):
+        await Member(one, core.uri).start()
+    assert "/echo" not in core.state().nodes
+
+
+def test_a_resource_without_a_profile_is_refused() -> None:
+    async def make() -> None:
+        Member(Resource("bare", role="sensing"), "http://127.0.0.1:1/")
+
+    with pytest.raises(ConfigError, match="it has no System Profile; declare one"):
+        asyncio.run(make())
+
+
+async def test_several_run_until_they_are_told_to_stop(core: RosCore) -> None:
+    stop, ready = asyncio.Event(), asyncio.Event()
+    other = Resource("other", role="sensing")
+    other.profile(offers={}, name="plain")(lambda: None)
+    running = asyncio.create_task(run_all([echo(), other], core.uri, stop, ready.set))
+    async with asyncio.timeout(30):
+        await ready.wait()
+        assert {"/echo", "/other"} <= core.state().nodes.keys()
+        stop.set()
+        await running
+    assert not {"/echo", "/other"} & core.state().nodes.keys()
