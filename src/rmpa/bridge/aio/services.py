@@ -152,9 +152,13 @@ class Services(Part):
         self.rules = rules
         self._act(self.exports.obey(rules))
         self._act(self.imports.obey(rules))
-        for shown in self._shown.values():
-            if shown.endpoint is not None:
-                shown.endpoint.timeout = rules.timeout(shown.service)
+        for shown in list(self._shown.values()):
+            timeout, endpoint = rules.timeout(shown.service), shown.endpoint
+            if endpoint is not None and endpoint.timeout != timeout:
+                endpoint.timeout = timeout
+                if shown.caller is not None and not shown.caller.active:
+                    # The next call opens it anew, and tells how long it waits now.
+                    self._act(self.imports.release(shown.peer, shown.service, "its timeout has changed"))
         self._schedule()
 
     # --- the bridge's part -------------------------------------------------------------------------------------
