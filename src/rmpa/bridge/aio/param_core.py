@@ -30,16 +30,16 @@ async def write_text(what: str, value: XmlRpcValue) -> str:
     Raises:
         LocalProtocolError: It cannot be said, or is too large.
     """
-    parts: list[bytes] = []
+    parts: list[str] = []
     size = 0
     for number, piece in enumerate(breathing(response_pieces(value), every=1), start=1):
-        parts.append(piece)
+        parts.append(piece.decode())  # pieces end between characters
         size += len(piece)
         if size > limits.PARAM_TEXT_MAX:
             raise LocalProtocolError(too_large(what, size))
         if number % _PIECES == 0:
             await asyncio.sleep(0)
-    return b"".join(parts).decode()
+    return "".join(parts)
 
 
 async def read_text(text: str) -> XmlRpcValue:
@@ -50,12 +50,8 @@ async def read_text(text: str) -> XmlRpcValue:
     """
     reader = ResponseReader()
     try:
-        data = text.encode()
-    except UnicodeEncodeError as error:
-        raise RemoteProtocolError(f"a parameter's text is not Unicode: {error.reason}") from None
-    try:
-        for begin in range(0, len(data), limits.XMLRPC_SLICE):
-            reader.feed(data[begin : begin + limits.XMLRPC_SLICE])
+        for begin in range(0, len(text), limits.XMLRPC_SLICE):
+            reader.feed(text[begin : begin + limits.XMLRPC_SLICE].encode())
             if begin >= limits.HTTP_BODY_INLINE:
                 await asyncio.sleep(0)
             else:
@@ -63,6 +59,9 @@ async def read_text(text: str) -> XmlRpcValue:
     except asyncio.CancelledError:
         reader.abandon()
         raise
+    except UnicodeEncodeError as error:
+        reader.abandon()
+        raise RemoteProtocolError(f"a parameter's text is not Unicode: {error.reason}") from None
     value = reader.close()
     if holds_nil(value, breathing):
         raise RemoteProtocolError("the value is nil or contains one, which ROS does not have; leave it out")
