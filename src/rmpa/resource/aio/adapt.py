@@ -447,6 +447,8 @@ class Adapter(RuntimePart):
         alarm = self.loop.alarm
         if alarm is not None and alarm.kind is AlarmKind.NON_ADAPTABLE:
             return Level.ERROR, self._told(alarm)
+        if not self.loop.profile:
+            return Level.WARN, "no profile runs yet"
         if short or lost:
             return Level.WARN, f"{', '.join(short)} fall short" if len(
                 short
