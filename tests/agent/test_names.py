@@ -66,6 +66,24 @@ async def test_topics_have_each_sides_names_both_ways(agents: tuple[Agent, Agent
         assert [(r.direction, r.wire) for r in info(robot, "/odom").routes] == [("out", "")]
 
 
+async def test_a_peer_is_told_of_no_more_than_its_rules_allow(settings: Callable[..., Settings]) -> None:
+    guest = PeerRule("guest", policy=PolicySettings(allow=("/pose",)))
+    async with (
+        running(replace(settings("pc"), peers=(guest,)), settings("guest"), settings("friend")) as (
+            pc,
+            other,
+            friend,
+        ),
+        node("n", pc) as ours,
+    ):
+        for topic in ("/pose", "/secret"):
+            await ours.advertise(topic, "std_msgs/String")
+        await until(lambda: publishers(other, "/pose") and publishers(friend, "/secret"))
+        assert not publishers(other, "/secret")
+        counts = {peer.name: peer.topics_out for peer in pc._view.snapshot().peers}
+        assert counts == {"guest": 1, "friend": 2}
+
+
 async def test_a_mismatch_is_told_under_each_sides_name(agents: tuple[Agent, Agent]) -> None:
     pc, robot = agents
     async with node("base", robot) as base, node("driver", pc) as driver:

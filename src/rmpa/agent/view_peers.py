@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from rmpa.core.aio.clock import SystemClock
+from rmpa.core.aio.loop import breathe
 from rmpa.monitor.snapshot import LinkInfo, PeerInfo
 
 if TYPE_CHECKING:
@@ -36,13 +37,14 @@ class PeersView:
         links = {attached.link.guid: attached for attached in self._bridge.attached()}
         roster = {view.identity.guid: view for view in station.discovery.peers()}
         statuses = {status.identity.guid: status for status in station.mesh.peers()}
-        ours = len({source.topic for source in self._bridge.exports.offered})
         infos = []
         for guid in {*roster, *statuses, *links}:
             attached = links.get(guid)
             info = self._peer(roster.get(guid), statuses.get(guid), attached, now)
             if attached is not None:
                 theirs = len(self._bridge.imports.offered_by(attached.peer))
+                ours = self._bridge.exports.topics_for(attached.peer)
+                breathe()
                 info = msgspec.structs.replace(info, topics_in=theirs, topics_out=ours)
             infos.append(info)
         relayed = self._relayed({info.instance: info for info in infos})

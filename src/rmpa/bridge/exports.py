@@ -174,6 +174,12 @@ class Exports:
         """What a peer was told of a source, by the name that it has over there."""
         return known.told.get(source) if (known := self._peers.get(peer)) is not None else None
 
+    def topics_for(self, peer: int) -> int:
+        """How many topics a peer may have."""
+        known = self._peers.get(peer)
+        sources = known.told if known is not None and known.ruled else self._local
+        return len({source.topic for source in sources})
+
     def local(self, peer: int, wire: Source) -> Source | None:
         """The source that a peer knows by a name, or ``None`` if it may know none by it."""
         known = self._peers.get(peer)
