@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from shutil import which
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from tests.interop.modules import Module, flows
-from tests.interop.processes import eventually
+from tests.interop.processes import eventually, run
 
 if TYPE_CHECKING:
     from tests.interop.agents import Agent
@@ -150,6 +151,25 @@ def test_multicast_by_hand_and_the_doctor_of_a_host(modules: ModuleFactory) -> N
     assert ("multicast", b.host.cables[0].interface) not in found
     assert found["interface", ""]["level"] == "warn"
     b.host.switch_on()
+
+
+@pytest.mark.skipif(which("nft") is None, reason="nftables is not installed (scripts/install-ros installs it)")
+def test_the_doctor_finds_the_firewall_of_a_host(lab: Lab, agent: AgentFactory) -> None:
+    (host,) = lab.hosts("a")
+    here = agent(host)
+    name = host.cables[0].interface
+
+    def looked(rule: str) -> tuple[str, str]:
+        run(host.command(["nft", rule]))
+        found = json.loads(here.rmpa("doctor", "--json")[1])
+        by_check = {(answer["check"], answer["subject"]): answer["level"] for answer in found}
+        return by_check["firewall", "nft"], by_check["multicast", name]
+
+    run(host.command(["nft", "add table inet filter"]))
+    chain = "add chain inet filter input { type filter hook input priority 0; policy drop; }"
+    assert looked(chain) == ("warn", "fail"), "nothing names our port, and what we send is not heard"
+    assert looked("add rule inet filter input udp dport 11400-11450 accept") == ("ok", "ok")
+    assert looked("insert rule inet filter input udp dport 11411 drop") == ("fail", "fail")
 
 
 def _rmpa() -> list[str]:
