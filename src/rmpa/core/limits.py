@@ -575,6 +575,8 @@ TASK_PAUSE_TIMEOUT: Final = 1.0
 """How long a profile that is to be applied waits for the runs under way; one that takes longer is stuck or slow."""
 TASK_END_TIMEOUT: Final = 2.0
 """How long an ending resource waits for a task's last run; a thread that is stuck is left behind."""
+RESOURCE_ANSWER_TIMEOUT: Final = 10.0
+"""For a resource's answer to a requirement; it may be in another module, and its route has to open first."""
 REQUIREMENT_BOUNDS_MAX: Final = 256
 """Attributes that one client asks for."""
 

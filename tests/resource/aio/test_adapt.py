@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
+from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.resource.adaptation import AdaptationSettings
 from rmpa.resource.aio.adapt import Adapter
+from rmpa.resource.aio.client import ResourceClient
 from rmpa.resource.aio.runtime import Runtime
 from rmpa.resource.aio.tasks import Tasks
-from rmpa.resource.declare import Resource
+from rmpa.resource.declare import Resource, at_least, at_most
 from rmpa.ros.aio.core import RosCore
 from rmpa.ros.aio.node import Node
+from rmpa.ros.diagnostic_array import Level
 from rmpa.ros.messages import MessageType
 
 if TYPE_CHECKING:
@@ -242,3 +245,30 @@ async def test_a_profile_chosen_by_hand_and_a_context(sonar: Sonar) -> None:
     await until("fine")
     sonar.adapter.shift("", {}, {})
     await until("coarse")
+
+
+async def test_the_client_api_asks_and_is_told(sonar: Sonar, client: Node) -> None:
+    async with ResourceClient(client, "sonar") as one:
+        answer = await one.require(noise=at_most("5 cm", hard=True), timeout=30)
+        assert answer.values["noise"].startswith("wanted at most 0.05 m")
+        async with asyncio.timeout(30):
+            if answer.message != "profile fine":
+                async for answer in one.answers():
+                    if answer.message == "profile fine":
+                        break
+        with pytest.raises(PeerRefused, match="less is better"):
+            await one.require(noise=at_least("5 cm"), timeout=30)
+        answer = await one.require(noise=at_most("1 mm", hard=True), timeout=30)
+        assert answer.level is Level.ERROR
+        assert "non-adaptable" in answer.message
+        answer = await one.require(words__rate=at_least("1 Hz"), timeout=30)
+        assert answer.values.keys() == {"words.rate"}
+    async with asyncio.timeout(30):
+        while sonar.adapter.loop.requirements:
+            await asyncio.sleep(0.05)
+
+
+async def test_a_resource_that_is_not_there_is_said(client: Node) -> None:
+    async with ResourceClient(client, "nowhere") as one:
+        with pytest.raises(UnreachableError, match="/nowhere"):
+            await one.require(noise=at_most(1), timeout=0.2)

@@ -77,6 +77,7 @@ class Adapter(RuntimePart):
         self._topics: dict[str, TopicQuality] = {}
         self._observed: dict[str, ObservedQuality] = {}
         self._answers: dict[str, Status] = {}
+        self._marks: dict[str, str] = {}
         self._absent: dict[str, int] = {}
         self._measured: dict[str, Value] = {}
         self._publishers: dict[str, Publisher] = {}
@@ -180,12 +181,13 @@ class Adapter(RuntimePart):
     def _asked(self, message: Received) -> None:
         """A client says what it asks."""
         client = message.caller_id
+        self._marks[client] = next((str(s.hardware_id) for s in message.message.status), "")
         try:
             values = [(str(pair.key), str(pair.value)) for status in message.message.status for pair in status.values]
             self.require(client, values)
         except ConfigError as error:
             _log.warning("! %s: %s asks for what cannot be: %s", self._runtime.node.name, printable(client), error)
-            self._answers[client] = self._status(Level.ERROR, client, str(error), {})
+            self._answers[client] = self._answer(Level.ERROR, client, str(error), {})
             self._respond()
 
     def require(self, client: str, values: list[tuple[str, str]]) -> None:
@@ -242,6 +244,7 @@ class Adapter(RuntimePart):
                 continue
             del self._absent[client]
             self._answers.pop(client, None)
+            self._marks.pop(client, None)
             if client in self.loop.requirements:
                 _log.info("= %s: %s is gone, and what it asked for", self._runtime.node.name, printable(client))
                 self._act(self.loop.release(client, self._loop.time()))
@@ -435,7 +438,7 @@ class Adapter(RuntimePart):
                 message = "; ".join(map(str, lost))
             if (answer := self._answers.get(client)) is not None:
                 level, message = answer.level, f"{answer.message}; what was asked before stays"
-            statuses.append(self._status(level, client, message, values))
+            statuses.append(self._answer(level, client, message, values))
         statuses += [answer for client, answer in self._answers.items() if client not in self.loop.requirements]
         if (publisher := self._publishers.get("responses")) is not None and not self._closed:
             known = [status.serialize() for status in statuses]
@@ -454,6 +457,10 @@ class Adapter(RuntimePart):
                 short
             ) > 1 else f"{', '.join(short)} falls short"
         return Level.OK, f"profile {self.loop.profile}"
+
+    def _answer(self, level: Level, client: str, message: str, values: Mapping[str, str]) -> Status:
+        """A client's status; the mark on its request comes back, so that it knows which one it is about."""
+        return Status(level, client, message, self._marks.get(client) or self._runtime.resource.name, values)
 
     def _status(self, level: Level, name: str, message: str, values: Mapping[str, str]) -> Status:
         return Status(level, name, message, self._runtime.resource.name, values)
