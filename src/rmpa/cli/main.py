@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 COMMANDS = {
     "up": ("rmpa.cli.up", "Run this machine's agent: ROS core, discovery, mesh and bridge."),
     "core": ("rmpa.cli.core", "Run the ROS core alone: a drop-in for roscore."),
+    "run": ("rmpa.cli.run", "Run the Smart Resources of a Python file, with the agent of their module."),
     "peer": ("rmpa.cli.peer", "See the peers that the agent knows."),
     "topic": ("rmpa.cli.topic", "See topics, listen to them, publish on them."),
     "service": ("rmpa.cli.service", "See services, and call them."),

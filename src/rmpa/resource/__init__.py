@@ -1,1 +1,28 @@
-"""Smart Resources: modules that offer services with a quality, and adapt (paper, section 3)."""
+"""Smart Resources: modules that offer services with a quality, and adapt (paper, section 3).
+
+::
+
+    from rmpa.resource import Resource, at_least
+
+``docs/tutorials/resources.md`` shows how to write one, ``docs/smart-resources.md`` what it offers to others.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rmpa.resource.declare import Resource, Wish, at_least, at_most, between, exactly
+
+if TYPE_CHECKING:
+    from rmpa.resource.aio.client import Answer, ResourceClient
+
+__all__ = ["Answer", "Resource", "ResourceClient", "Wish", "at_least", "at_most", "between", "exactly"]
+
+
+def __getattr__(name: str) -> object:
+    """Load the client only where it is used: it brings asyncio and sockets."""
+    if name in ("Answer", "ResourceClient"):
+        from rmpa.resource.aio import client  # noqa: PLC0415 - as said
+
+        return getattr(client, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
