@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from ipaddress import IPv4Address
 
 import pytest
@@ -42,6 +43,20 @@ def test_text_is_short_and_safe() -> None:
     assert str(BEACON) == "answer 42 of base (10.0.0.1:40001#7), 2 gossiped"
 
 
+def test_where_gossiped_peers_are_heard_follows_if_it_is_said() -> None:
+    elsewhere = replace(BEACON, elsewhere=(("192.168.7.3", 40003), ("10.9.0.2", 1)))
+    wire = GOLDEN + bytes.fromhex("02 c0a807039c43 0a0900020001")
+    assert elsewhere.serialize() == wire
+    assert Beacon.parse(wire, 5) == elsewhere
+    assert Beacon.parse(wire + b"later", 5) == elsewhere
+    for length in range(len(GOLDEN) + 1, len(wire)):
+        with pytest.raises(BeaconMalformed):
+            Beacon.parse(wire[:length], 5)
+    for damaged in ("41 c0a807039c43", "01 e0a807039c43", "01 c0a807030000", "01 000000019c43"):
+        with pytest.raises(BeaconMalformed):
+            Beacon.parse(GOLDEN + bytes.fromhex(damaged), 5)
+
+
 def test_bytes_behind_are_left_for_later_versions() -> None:
     assert Beacon.parse(GOLDEN + b"\x00later", 5) == BEACON
 
@@ -56,7 +71,8 @@ def test_the_largest_beacon_fits_a_packet() -> None:
     identity = Identity(
         Guid.of("10.0.0.1", 1), bytes(16), "n" * limits.PEER_NAME_MAX, 0, (IPv4Address("10.0.0.2"),) * 8
     )
-    largest = Beacon(BeaconKind.ANSWER, identity, 1, 1, (Guid.of("10.0.0.3", 1),) * limits.BEACON_GOSSIP_MAX)
+    most = limits.BEACON_GOSSIP_MAX
+    largest = Beacon(BeaconKind.ANSWER, identity, 1, 1, (Guid.of("10.0.0.3", 1),) * most, (("10.0.0.3", 1),) * most)
     wire = largest.serialize()
     assert len(wire) <= limits.BEACON_MAX_BYTES
     assert Beacon.parse(wire, 0) == largest
@@ -111,7 +127,14 @@ def test_malformed(offset: int, replacement: bytes, problem: str) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"lease_ms": -1}, {"lease_ms": 1 << 32}, {"sequence": 1 << 32}, {"gossip": (Guid.of("10.0.0.1", 1),) * 65}],
+    [
+        {"lease_ms": -1},
+        {"lease_ms": 1 << 32},
+        {"sequence": 1 << 32},
+        {"gossip": (Guid.of("10.0.0.1", 1),) * 65},
+        {"elsewhere": (("10.0.0.1", 1),) * 65},
+        {"elsewhere": (("224.0.0.1", 1),)},
+    ],
 )
 def test_what_cannot_be_written_is_not_made(change: dict[str, object]) -> None:
     values = {"kind": BEACON.kind, "identity": BEACON.identity, "lease_ms": 1, "sequence": 1, "gossip": ()} | change
@@ -132,7 +155,13 @@ identities = st.builds(
     st.lists(unicast, max_size=8).map(tuple),
 )
 beacons = st.builds(
-    Beacon, st.sampled_from(BeaconKind), identities, u32, u32, st.lists(guids, max_size=64).map(tuple)
+    Beacon,
+    st.sampled_from(BeaconKind),
+    identities,
+    u32,
+    u32,
+    st.lists(guids, max_size=64).map(tuple),
+    st.lists(st.tuples(unicast.map(str), st.integers(1, 0xFFFF)), max_size=64).map(tuple),
 )
 
 

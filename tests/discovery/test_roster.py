@@ -493,6 +493,28 @@ def test_a_lost_peer_that_multicast_cannot_bring_back_is_greeted_again(one: Harn
     assert unicasts(sent, BeaconKind.ANNOUNCE).count(("10.0.0.2", 40002)) >= 3
 
 
+def test_a_peer_that_is_heard_elsewhere_is_passed_on_with_where(one: Harness) -> None:
+    """Its GUID's address may be of a network that whoever is told cannot reach."""
+    one.hear(Speaker(who(2))(), source=("172.16.0.2", 40002))
+    one.hear(Speaker(who(3))(BeaconKind.ANNOUNCE), multicast=False)
+    answers = [o.beacon for o in one.roster.outputs() if isinstance(o, SendUnicast) and o.address[0] == "10.0.0.3"]
+    assert [(b.gossip, b.elsewhere) for b in answers] == [((who(2).guid,), (("172.16.0.2", 40002),))]
+
+
+def test_whoever_is_told_of_an_address_greets_it_unless_it_knows_who_is_there(one: Harness) -> None:
+    known = replace(who(4), addresses=(IPv4Address("172.16.0.4"),))
+    one.hear(Speaker(known)())
+    one.roster.outputs()
+    places = (("172.16.0.2", 40002), ("172.16.0.4", 40004), ("10.0.0.1", 40001), ("127.0.0.1", 40005))
+    one.hear(replace(Speaker(who(3))(BeaconKind.ANSWER, who(2).guid), elsewhere=places), multicast=False)
+    sent = one.roster.outputs() + one.run(1)
+    assert set(unicasts(sent, BeaconKind.ANNOUNCE)) == {("10.0.0.2", 40002), ("172.16.0.2", 40002)}
+    one.hear(Speaker(who(2))(BeaconKind.ANSWER), multicast=False, source=("172.16.0.2", 40002))
+    assert "peer2" in one.present()
+    one.roster.outputs()
+    assert unicasts(one.run(limits.GREETING_FORGET / 2), BeaconKind.ANNOUNCE) == []
+
+
 def test_gossip_is_bounded(one: Harness) -> None:
     speaker = Speaker(who(2))
     for i in range(10):

@@ -14,6 +14,9 @@ SEEDS: list[bytes] = [
     b"RMPA",
     Beacon(BeaconKind.ANNOUNCE, _IDENTITY, 16000, 1).serialize(),
     Beacon(BeaconKind.ANSWER, _IDENTITY, 16000, 2, (Guid.of("10.0.0.2", 40002), Guid.of("10.0.0.3", 1))).serialize(),
+    Beacon(
+        BeaconKind.HEARTBEAT, _IDENTITY, 16000, 3, (Guid.of("10.0.0.2", 40002),), (("192.168.0.9", 40002),)
+    ).serialize(),
     Beacon(BeaconKind.GOODBYE, _IDENTITY, 0, 0xFFFFFFFF).serialize() + b"later versions",
 ]
 

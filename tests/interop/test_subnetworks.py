@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.monitor.aio.control_client import ControlClient
 from tests.interop.modules import Module, flows
 from tests.interop.processes import eventually
 from tests.interop.ros import lacks
@@ -22,12 +24,18 @@ def full_mesh(*modules: Module) -> None:
     """Wait until each of these is linked with all others."""
     for module in modules:
         names = {other.name for other in modules if other is not module}
-        eventually(lambda m=module, n=names: n <= linked(m), what=f"{module.name} linked with {names}", every=0.2)
+        eventually(partial(all_linked, module, names), what=f"{module.name} linked with {names}", every=0.2)
+
+
+def all_linked(module: Module, names: set[str]) -> bool:
+    """Whether a module has a link to each of these."""
+    return names <= linked(module)
 
 
 def linked(module: Module) -> set[str]:
-    """The peers that a module has live links to."""
-    return {name for name, row in module.agent.peers().items() if row["state"] == "linked"}
+    """The peers that a module has live links to; asked by its socket, for many looks are needed."""
+    with ControlClient(module.agent.sockets()[0]) as client:
+        return {peer.name for peer in client.snapshot().peers if peer.state == "linked"}
 
 
 def test_one_seed_and_gossip_join_two_networks_behind_a_router(
@@ -92,6 +100,18 @@ def test_a_module_whose_first_cable_leads_nowhere_is_found_by_its_second(
     full_mesh(a, b)
     a.ros.roscpp("talker", topic="/chatter", rate=100)
     flows(b.ros.roscpp("listener", topic="/chatter"))
+
+
+def test_gossip_across_a_router_says_where_peers_are_heard(
+    lab: Lab, agent: AgentFactory, shell: ShellFactory
+) -> None:
+    """The first cables of two modules, whose addresses are in their GUIDs, lead to networks of their own."""
+    router = lab.router(0, 1)
+    hosts = [lab.host("a", 2, 0), lab.host("b", 1), lab.host("c", 3, 1)]
+    for host in hosts:
+        lab.route(host, router)
+    flags = {"a": ["--seed", f"{hosts[1].address}:45000"], "b": ["--port", "45000"]}
+    full_mesh(*(Module(h, agent(h, name=h.name, flags=flags.get(h.name, [])), shell(h)) for h in hosts))
 
 
 RELAY = "[relay]\nenabled = true\n"

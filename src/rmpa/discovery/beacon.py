@@ -24,12 +24,16 @@ from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.guid import Guid, dialable
 from rmpa.core.identity import Identity
 
+Endpoint = tuple[str, int]
+"""A numeric address and a port."""
+
 MAGIC: Final = b"RMPA"
 VERSION: Final = 1
 
 _PREFIX: Final = struct.Struct(">4sBBH")
 _FIXED: Final = struct.Struct(">4sBBHQ16sIIB")
 _GUID: Final = struct.Struct(">Q")
+_ENDPOINT: Final = struct.Struct(">4sH")
 _U32: Final = 0xFFFF_FFFF
 
 
@@ -89,6 +93,7 @@ class Beacon:
         lease_ms: Milliseconds after which the sender is gone if it is silent and has no link; 32 bits.
         sequence: Counts the beacons of this instance; 32 bits, wraps.
         gossip: Peers that the sender knows to be alive, at most ``limits.BEACON_GOSSIP_MAX``.
+        elsewhere: Where the sender hears some of these, if not at their GUIDs' own addresses; at most as many.
 
     Raises:
         ValueError: A part is out of its range.
@@ -99,13 +104,14 @@ class Beacon:
     lease_ms: int
     sequence: int
     gossip: tuple[Guid, ...] = ()
+    elsewhere: tuple[Endpoint, ...] = ()
 
     def __post_init__(self) -> None:
         if not (0 <= self.lease_ms <= _U32 and 0 <= self.sequence <= _U32):
             raise ValueError("lease and sequence have 32 bits")
         if len(self.identity.addresses) > limits.BEACON_ADDRESSES_MAX:
             raise ValueError(f"a beacon carries at most {limits.BEACON_ADDRESSES_MAX} addresses")
-        if len(self.gossip) > limits.BEACON_GOSSIP_MAX:
+        if max(len(self.gossip), len(self.elsewhere)) > limits.BEACON_GOSSIP_MAX:
             raise ValueError(f"a beacon carries at most {limits.BEACON_GOSSIP_MAX} gossiped peers")
         port = self.identity.guid.port
         for address in (self.identity.guid.address, *self.identity.addresses):
@@ -114,6 +120,9 @@ class Beacon:
         for guid in self.gossip:
             if not guid.dialable:
                 raise ValueError(f"no gossiped peer can be reached at {guid}")
+        for host, at in self.elsewhere:
+            if not dialable(IPv4Address(host), at):
+                raise ValueError(f"no gossiped peer can be reached at {host}:{at}")
 
     @classmethod
     def parse(cls, data: bytes, domain: int) -> Beacon:
@@ -141,7 +150,11 @@ class Beacon:
         count, offset = _take(data, offset, 1, "number of gossiped peers")
         if count[0] > limits.BEACON_GOSSIP_MAX:
             raise BeaconMalformed(f"{count[0]} gossiped peers")
-        gossip, _ = _take(data, offset, 8 * count[0], "gossip")
+        gossip, offset = _take(data, offset, 8 * count[0], "gossip")
+        number = data[offset] if offset < len(data) else 0  # a beacon without it ends here
+        if number > limits.BEACON_GOSSIP_MAX:
+            raise BeaconMalformed(f"{number} further addresses of gossiped peers")
+        elsewhere, _ = _take(data, offset + 1, _ENDPOINT.size * number, "gossiped addresses") if number else (b"", 0)
         try:
             return cls(
                 BeaconKind(kind),
@@ -155,6 +168,7 @@ class Beacon:
                 lease,
                 sequence,
                 tuple(Guid(value) for (value,) in _GUID.iter_unpack(gossip)),
+                tuple((str(IPv4Address(host)), at) for host, at in _ENDPOINT.iter_unpack(elsewhere)),
             )
         except ValueError as error:
             raise BeaconMalformed(str(error)) from error
@@ -181,6 +195,8 @@ class Beacon:
                 *(address.packed for address in identity.addresses),
                 bytes((len(self.gossip),)),
                 *(_GUID.pack(guid.value) for guid in self.gossip),
+                bytes((len(self.elsewhere),)) if self.elsewhere else b"",
+                *(_ENDPOINT.pack(IPv4Address(host).packed, at) for host, at in self.elsewhere),
             )
         )
 

@@ -421,7 +421,17 @@ class Roster:
 
     def _beacon(self, kind: BeaconKind, gossip: tuple[Guid, ...] = ()) -> Beacon:
         self._sequence = (self._sequence + 1) & 0xFFFF_FFFF
-        return Beacon(kind, self._own, self._lease_ms, self._sequence, gossip)
+        return Beacon(kind, self._own, self._lease_ms, self._sequence, gossip, self._elsewhere(gossip))
+
+    def _elsewhere(self, gossip: tuple[Guid, ...]) -> tuple[Address, ...]:
+        """Where we hear those that are not at their GUID's address: whoever hears of them may only reach that."""
+        found = []
+        for guid in gossip:
+            voice = self._seats[guid.place].current
+            source = voice.source if voice is not None else None
+            if source is not None and source != guid.endpoint and not source[0].startswith("127."):
+                found.append(source)
+        return tuple(found)
 
     def _send(self, kind: BeaconKind, address: Address, gossip: tuple[Guid, ...] = ()) -> None:
         if not self._closed:
@@ -486,8 +496,21 @@ class Roster:
                 continue
             if not self._greetings.learn(guid.endpoint, now):
                 self.counters.add("gossip.full")
+        for address in self._unmet(beacon.elsewhere):
+            if not self._greetings.learn(address, now):
+                self.counters.add("gossip.full")
         for address in self._greetings.due(now):
             self._send(BeaconKind.ANNOUNCE, address)
+
+    def _unmet(self, addresses: tuple[Address, ...]) -> list[Address]:
+        """Those of some addresses at which nobody is whom we know, ourselves included."""
+        if not addresses:
+            return []
+        met = {*self._own.endpoints}
+        for voice in self._present():
+            met.update(voice.identity.endpoints, _addresses(voice))
+        near = self._own.guid.address.is_loopback
+        return [a for a in addresses if a not in met and (near or not a[0].startswith("127."))]
 
     def _gossip(self, voices: list[Voice], to: Voice | None) -> tuple[Guid, ...]:
         """GUIDs to pass on, in order; where they are too many for one beacon, in turn."""
