@@ -289,6 +289,7 @@ async def test_an_owner_that_comes_back_without_it_takes_nothing_away(sides: Any
     await until(lambda: pad.states() == {"/base/robot_description": "followed"})
     await again.look()
     await pad.look()
+    await until(lambda: not pad.params._follower._working)
     assert pad.core.get("/base/robot_description") == "one"
     again.core.set("/robot_description", "two")
     await until(lambda: pad.core.get("/base/robot_description") == "two")
