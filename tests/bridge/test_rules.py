@@ -120,6 +120,17 @@ def test_a_peer_gets_no_more_than_its_rules_allow() -> None:
     assert closed == Send(1, Closed(1, "/secret from /n: not published here, or policy keeps it home"))
 
 
+def test_peers_with_rules_are_told_in_turn_and_all_others_at_once() -> None:
+    exports = Side(ROBOT).exports()
+    for number, name in enumerate(("robot1", "robot2", "base", "pc"), 1):
+        exports.link_up(number, name)
+    exports.graph("/a", {"/n": LocalSource(TYPE, "http://127.0.0.1:4000/")})
+    told = []
+    while exports.untold:
+        told.append([action.peer for action in exports.tell() if isinstance(action, Send)])
+    assert told == [[1, 3, 4], [2]]
+
+
 def test_no_name_over_there_is_one_that_never_crosses() -> None:
     exports = Side(ROBOT).exports()
     say(exports, "/robot1/rosout", "/robot1/clock", "/robot1/rmpa/x", "/robot1/ok")

@@ -300,12 +300,19 @@ class Exports:
             peer.news.setdefault(source)
 
     def tell(self) -> list[Action]:
-        """One message for each peer that has not heard everything; call again while ``untold``."""
+        """One message for each peer that has not heard everything; call again while ``untold``.
+
+        Of those that have rules of their own only one is told at a time, in turn: each source is judged for it.
+        """
         actions: list[Action] = []
-        for number, peer in self._peers.items():
+        judged = False
+        for number, peer in list(self._peers.items()):
             begins = peer.beginning
-            if not peer.news:
+            if not peer.news or (peer.ruled and judged):
                 continue
+            if peer.ruled:
+                judged = True
+                self._peers[number] = self._peers.pop(number)
             message, ends = self._next(number, peer)
             actions += ends
             if message.added or message.removed or begins is not message.more:
