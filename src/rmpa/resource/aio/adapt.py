@@ -74,6 +74,9 @@ class Adapter(RuntimePart):
         self._attributes = resource.attributes
         profiles = [declared.profile for declared in resource.profiles.values()]
         self.loop = Adaptation(self._attributes, Decider(resource.name, self._attributes, profiles), settings)
+        first = next(iter(resource.outputs), "")
+        self._primary = first.rsplit("/", 1)[-1]
+        """The output whose qualities are also named without it; they are shown once."""
         self._topics: dict[str, TopicQuality] = {}
         self._observed: dict[str, ObservedQuality] = {}
         self._answers: dict[str, Status] = {}
@@ -381,7 +384,9 @@ class Adapter(RuntimePart):
     def _publish_quality(self) -> None:
         level, message = self._health()
         values = {
-            name: self._attributes[name].show(v) for name, v in self._measured.items() if name in self._attributes
+            name: self._attributes[name].show(value)
+            for name, value in self._measured.items()
+            if name in self._attributes and not (self._primary and name.startswith(f"{self._primary}."))
         }
         values["profile"] = self.loop.profile
         if self.reaction is not None:
