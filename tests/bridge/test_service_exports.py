@@ -25,7 +25,7 @@ from rmpa.bridge.service_exports import (
 from rmpa.core import limits
 from rmpa.core.config import PeerRule, PolicySettings, ServiceSettings
 from rmpa.core.errors import RemoteProtocolError
-from tests.bridge.test_service_rules import rules
+from tests.bridge.test_service_rules import obey, rules
 
 ADD = LocalService("/adder", "rosrpc://127.0.0.1:5")
 ABOUT = About("a/Add", "6a2e34150c00229791cc89ff309fff21")
@@ -193,9 +193,9 @@ def test_other_rules_touch_only_what_they_change(exports: ServiceExports) -> Non
     exports.graph("/sub", ADD)
     told(exports)
     requests = opened(exports)
-    assert exports.obey(rules(ServiceSettings(deny=("/sub",)))) == [ServerGone("/sub")]
+    assert obey(exports, rules(ServiceSettings(deny=("/sub",)))) == [ServerGone("/sub")]
     assert told(exports) == [AdvertiseServices(removed=("/sub",))]
     assert exports.callers("/add") == (1,)
-    gone = exports.obey(rules(ServiceSettings(deny=("/add",))))
+    gone = obey(exports, rules(ServiceSettings(deny=("/add",))))
     assert EndRoute(1, ROUTE, requests) in gone
     assert told(exports) == [AdvertiseServices((ServiceOffer("/sub", "/adder"),), ("/add",))]

@@ -43,7 +43,7 @@ from rmpa.bridge.services import (
 from rmpa.core import limits
 from rmpa.core.config import ServiceSettings
 from rmpa.core.errors import RemoteProtocolError
-from tests.bridge.test_service_rules import rules
+from tests.bridge.test_service_rules import obey, rules
 
 SERVICES = ["/a", "/b", "/c"]
 ABOUT = About("a/Add", "6a2e34150c00229791cc89ff309fff21")
@@ -141,8 +141,8 @@ class World:
 
     def change_rules(self, _service: str) -> None:
         self.rules = STRICT if self.rules is OPEN else OPEN
-        self.act(self.exports.obey(self.rules))
-        self.act(self.imports.obey(self.rules))
+        self.act(obey(self.exports, self.rules))
+        self.act(obey(self.imports, self.rules))
 
     def link(self, _service: str = "") -> None:
         if not self.linked:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import pytest
 
 from rmpa.bridge.naming import Names
@@ -9,9 +11,18 @@ from rmpa.bridge.policy import Policy
 from rmpa.bridge.service_rules import ServiceRules
 from rmpa.core.config import PeerRule, PolicySettings, ServiceRule, ServiceSettings
 
+if TYPE_CHECKING:
+    from rmpa.bridge.service_exports import ServiceExports
+    from rmpa.bridge.services import ServiceImports
+
 
 def rules(settings: ServiceSettings | None = None, peers: tuple[PeerRule, ...] = ()) -> ServiceRules:
     return ServiceRules(settings or ServiceSettings(), Policy(PolicySettings(), peers), Names(peers))
+
+
+def obey(plan: ServiceExports | ServiceImports, changed: ServiceRules) -> list[Any]:
+    """Everything that other rules bring."""
+    return [action for portion in plan.obey(changed) for action in portion]
 
 
 @pytest.mark.parametrize(

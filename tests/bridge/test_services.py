@@ -26,7 +26,7 @@ from rmpa.bridge.services import (
 from rmpa.core import limits
 from rmpa.core.config import PeerRule, PolicySettings, ServiceSettings
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
-from tests.bridge.test_service_rules import rules
+from tests.bridge.test_service_rules import obey, rules
 
 MD5 = "6a2e34150c00229791cc89ff309fff21"
 ROUTE = limits.SERVICE_ROUTES + 1
@@ -198,7 +198,7 @@ def test_names_here_are_made_by_the_peers_rules() -> None:
     assert made.advertised(1, offer("/go", full=True)) == [Provide(1, "/robot1/go", "/n")]
     assert made.want(1, "/robot1/go", 0.0) == [Send(1, OpenService(ROUTE, "/go"))]
     made.closed(1, ServiceClosed(ROUTE, "no"))
-    changed = made.obey(rules(peers=(PeerRule("robot", prefix="/r"),)))
+    changed = obey(made, rules(peers=(PeerRule("robot", prefix="/r"),)))
     assert [type(action) for action in changed] == [Withdraw, Provide]
     assert made.get(1, "/r/go") is not None
     assert made.get(1, "/robot1/go") is None
@@ -217,9 +217,9 @@ def test_two_of_one_peer_that_would_have_one_name_here() -> None:
 def test_other_rules_touch_only_what_they_change(imports: ServiceImports) -> None:
     imports.advertised(1, offer("/sub"))
     opened(imports)
-    (gone,) = imports.obey(rules(ServiceSettings(deny=("/sub",))))
+    (gone,) = obey(imports, rules(ServiceSettings(deny=("/sub",))))
     assert gone == Withdraw(1, "/sub", "/n", "policy: services.deny has '/sub'")
     remote = imports.get(1, "/add")
     assert remote is not None
     assert remote.state is SessionState.OPEN
-    assert imports.obey(rules()) == [Provide(1, "/sub", "/n")]
+    assert obey(imports, rules()) == [Provide(1, "/sub", "/n")]

@@ -29,7 +29,7 @@ from rmpa.core import limits
 from rmpa.core.errors import RemoteProtocolError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from rmpa.bridge.messages import Origin
     from rmpa.bridge.service_rules import ServiceRules
@@ -195,26 +195,28 @@ class ServiceExports:
             self._seen[service] = server
         return self._judge(service)
 
-    def obey(self, rules: ServiceRules) -> list[ExportAction]:
-        """Other rules hold from now on; what they do not touch goes on."""
+    def obey(self, rules: ServiceRules) -> Iterator[list[ExportAction]]:
+        """Other rules hold from now on; what they do not touch goes on.
+
+        Returns:
+            What is to be done for one service after the other, looked at when it is asked for.
+        """
         self._rules = rules
-        actions: list[ExportAction] = []
-        for service in list(self._seen):
-            actions += self._judge(service)
         for peer in self._peers.values():
             peer.news |= dict.fromkeys(self._crossing)
-        return actions
+        return (self._judge(service) for service in tuple(self._seen))
 
     def _judge(self, service: str) -> list[ExportAction]:
         server, before = self._seen.get(service), self._crossing.get(service)
+        reason = "its server has gone"
         if server is not None and not self._crosses(service, server):
-            server = None
+            server, reason = None, "a rule keeps it home now"
         if server == before:
             return []
         actions: list[ExportAction] = []
         if server is None:
             del self._crossing[service]
-            actions = self._end(service, "its server has gone")
+            actions = self._end(service, reason)
         elif before is None and len(self._crossing) >= limits.SERVICES_PER_PEER_MAX:
             text = f"more than {limits.SERVICES_PER_PEER_MAX} services would cross; {service} stays home: deny some"
             return [Warn("services.too_many", "local", text)]

@@ -347,18 +347,28 @@ class ServiceImports:
             self._local[service] = node
         return self._choose(service) if service in self._claims else []
 
-    def obey(self, rules: ServiceRules) -> list[ImportAction]:
-        """Other rules hold from now on; what they do not touch goes on."""
+    def obey(self, rules: ServiceRules) -> Iterator[list[ImportAction]]:
+        """Other rules hold from now on; what they do not touch goes on.
+
+        Returns:
+            What is to be done for one service after the other, looked at when it is asked for.
+        """
         self._rules = rules
-        actions: list[ImportAction] = []
-        for number, known in self._peers.items():
-            for wire, remote in list(known.services.items()):
-                if rules.local_name(remote.origin.name if remote.origin else known.name, wire) != remote.name:
-                    actions += self._remove(number, wire, "a rule has another name for it now")
-                    actions += self._offer(number, known, ServiceOffer(wire, remote.node, remote.origin))
-        for service in list(self._claims):
-            actions += self._choose(service)
-        return actions
+        offers = [(number, wire) for number, known in self._peers.items() for wire in known.services]
+        # A second time, for those whose new name was still another one's old one.
+        return (self._rejudge(number, wire, again=again) for again in (False, True) for number, wire in offers)
+
+    def _rejudge(self, number: int, wire: str, *, again: bool) -> list[ImportAction]:
+        known = self._peers.get(number)
+        remote = known.services.get(wire) if known is not None else None
+        if known is None or remote is None:
+            return []
+        name = self._rules.local_name(remote.origin.name if remote.origin else known.name, wire)
+        claimed = self._claims.get(remote.name, {}).get(number)
+        if name != remote.name or (claimed is None and is_crossing_name(name)):
+            actions = self._remove(number, wire, "a rule has another name for it now")
+            return actions + self._offer(number, known, ServiceOffer(wire, remote.node, remote.origin))
+        return [] if again or claimed is not remote else self._choose(name)
 
     def _choose(self, service: str) -> list[ImportAction]:
         """Show one of those who offer a service, and hide the others."""

@@ -117,7 +117,11 @@ class Caller(BodyTaker):
             self._stats.latencies.add(now - began)
         else:
             self._stats.fail(_text(memoryview(body)[1:]))
-        call.reply(ok, memoryview(body)[1:])
+        if isinstance(body, bytearray):
+            del body[:1]  # costs nothing; a copy of a large one would
+            call.reply(ok, body)
+        else:
+            call.reply(ok, memoryview(body)[1:])
 
     def failed(self, sequence: int, reason: str) -> None:
         """A reply had begun, and the rest does not come."""

@@ -13,6 +13,7 @@ import asyncio
 import logging
 from collections import deque
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge.actions import Send, Warn
@@ -121,6 +122,7 @@ class Services(Part):
         self._serving = Serving(core, self.exports, self._attached, self._budgets, self._act)
         self._grace: dict[int, asyncio.TimerHandle] = {}
         self._changed: dict[str, None] = {}
+        self._rejudging: Iterator[list[ExportAction] | list[ImportAction]] | None = None
         self._lessons: deque[tuple[int, AdvertiseServices]] = deque()
         self._actions: deque[ExportAction | ImportAction] = deque()
         self._acting = False
@@ -150,9 +152,8 @@ class Services(Part):
     def obey(self, rules: ServiceRules) -> None:
         """Other rules hold from now on; what they do not touch goes on."""
         self.rules = rules
-        self._act(self.exports.obey(rules))
-        self._act(self.imports.obey(rules))
-        for shown in list(self._shown.values()):
+        self._rejudging = chain(self.exports.obey(rules), self.imports.obey(rules))
+        for shown in breathing(list(self._shown.values()), every=16):
             timeout, endpoint = rules.timeout(shown.service), shown.endpoint
             if endpoint is not None and endpoint.timeout != timeout:
                 endpoint.timeout = timeout
@@ -286,8 +287,21 @@ class Services(Part):
         self._act(self.exports.tell())
         if self._lessons:
             self._learn()
-        if self._changed or self._lessons or self.exports.untold:
+        if self._rejudging is not None:
+            self._rejudge(self._rejudging)
+        if self._changed or self._lessons or self._rejudging is not None or self.exports.untold:
             self._schedule()
+
+    def _rejudge(self, rest: Iterator[list[ExportAction] | list[ImportAction]]) -> None:
+        """Judge a portion by rules that have changed."""
+        for _ in range(limits.LEARNT_AT_ONCE):
+            actions = next(rest, None)
+            if actions is None:
+                if self._rejudging is rest:
+                    self._rejudging = None
+                return
+            self._act(actions)
+            breathe()
 
     def _look_at(self, service: str, providers: Mapping[str, str]) -> None:
         local = next((LocalService(node, uri) for node, uri in providers.items() if not is_own(node)), None)
