@@ -376,6 +376,13 @@ def test_a_message_that_is_on_its_way_is_not_missing() -> None:
     assert found.flows
 
 
+def test_a_topic_that_is_thinned_out_is_not_missing() -> None:
+    thin = msgspec.structs.replace(ROUTE, contract={"max_rate": 0.5})
+    assert one(Case(route=thin, later=thin)).flows
+    quick = msgspec.structs.replace(ROUTE, contract={"max_rate": 10.0})
+    assert not one(Case(route=quick, later=quick)).flows
+
+
 def test_each_publisher_has_a_way_of_its_own() -> None:
     far = FarTopic(sources=(SOURCE, msgspec.structs.replace(SOURCE, node="/second", crosses=False, rule="no")))
     first, second = Case(far=far, source=None, source_later=None).walk()
@@ -383,6 +390,12 @@ def test_each_publisher_has_a_way_of_its_own() -> None:
     assert (second.node, second.flows) == ("/second", False)
     assert second.failed is not None
     assert second.failed.name == "policy there"
+
+
+def test_no_more_ways_are_walked_than_a_user_reads() -> None:
+    many = tuple(msgspec.structs.replace(SOURCE, node=f"/n{i}") for i in range(10 * limits.WHY_SOURCES_MAX))
+    found = Case(far=FarTopic(sources=many), source=None, source_later=None).walk()
+    assert len(found) == limits.WHY_SOURCES_MAX
 
 
 def test_a_peer_is_found_by_its_guid_and_a_wrong_name_by_the_nearest() -> None:

@@ -182,7 +182,10 @@ class Why:
             return (Diagnosis(name=topic, peer=here, to=to, flows=False, stages=stages),)
         question = {"topic": self._bridge.names.wire_name(to, topic, self._core.type_of(topic))}
         try:
-            return await self._ask(attached, HERE, question, tuple[Diagnosis, ...], limits.WHY_TIMEOUT)
+            found = await self._ask(attached, HERE, question, tuple[Diagnosis, ...], limits.WHY_TIMEOUT)
+            if not found:
+                raise RemoteProtocolError("it walked no way at all")
+            return found[: limits.WHY_SOURCES_MAX]
         except RmpaError as error:
             remedy = f"run `rmpa why {here}:{topic}` there"
             silent = Stage("link", Verdict.FAIL, f"{to} does not tell: {error}", remedy)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _COLOURS: Final = {Verdict.OK: "green", Verdict.WARN: "yellow", Verdict.FAIL: "red", Verdict.UNKNOWN: "yellow"}
 EPILOG = """\
 \b
-Exit codes: 0 it flows; 1 it does not, and the first stage that fails says why.
+Exit codes: 0 it flows, on every way if there are several; 1 it does not, and the first stage that fails says why.
 
 \b
 Examples:

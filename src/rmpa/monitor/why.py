@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 
 _OK, _WARN, _FAIL, _UNKNOWN = Verdict.OK, Verdict.WARN, Verdict.FAIL, Verdict.UNKNOWN
+_SEVERAL: Final = 2
+"""Messages of which one may be on its way."""
 _FLOWING: Final = frozenset({"open", "lingering"})
 
 
@@ -130,7 +132,8 @@ def _diagnosis(near: Near, peer: str, to: str, node: str, stages: tuple[Stage, .
 
 def _nodes(sight: Sight, peer: str) -> list[str]:
     far = [source.node for source in sight.far.sources] if sight.far is not None else []
-    return list(dict.fromkeys([*far, *(route.node for route in _routes(sight.near, peer))]))
+    known = [route.node for route in _routes(sight.near, peer)]
+    return list(dict.fromkeys([*far[: limits.WHY_SOURCES_MAX], *known]))[: limits.WHY_SOURCES_MAX]
 
 
 def _routes(near: Near, peer: str) -> list[RouteInfo]:
@@ -308,7 +311,8 @@ def _arrived(
 ) -> Stage:
     moved = now.messages - before.messages
     sent = far_now.messages - far.messages if far is not None and far_now is not None else None
-    if not now.messages or (sent is not None and sent > 1 and not moved):
+    rarely = float(now.contract.get("max_rate") or limits.CONTRACT_RATE_MAX) * limits.WHY_WINDOW < _SEVERAL
+    if not now.messages or (sent is not None and sent >= _SEVERAL and not moved and not rarely):
         text = f"{peer} has {'sent ' + str(sent) if sent else 'sent some'} meanwhile, and none arrived at {here}"
         dropped = f" ({far_now.dropped} were given up over there)" if far_now is not None and far_now.dropped else ""
         remedy = "is the link too slow? `rmpa peer info`; a max_rate or priority helps (docs/contracts.md)"

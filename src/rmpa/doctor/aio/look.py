@@ -101,10 +101,10 @@ def _routes(patient: Patient) -> dict[str, str]:
         for address in peer.addresses[:1]
     }
     names = [seed.host for seed in patient.settings.seeds]
-    for seed, addresses in resolve(names).items():
+    known = resolve(names)
+    for seed, addresses in known.items():
         targets |= {address: f"{address} (seed {seed})" for address in addresses[:1]}
     found = {text: look_network.look_at_route(host) for host, text in targets.items()}
-    known = resolve(names)
     return found | {f"seed {name}": "nobody knows this name" for name in names if not known[name]}
 
 
