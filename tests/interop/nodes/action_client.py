@@ -9,7 +9,7 @@ import threading
 
 import actionlib
 import rospy
-from actionlib.msg import TestAction, TestGoal
+from actionlib.msg import TestAction, TestGoal, TestResult
 from actionlib_msgs.msg import GoalStatus
 from payload import parser, say
 
@@ -22,7 +22,7 @@ def main() -> None:
     client = actionlib.SimpleActionClient(args.action, TestAction)
     say("up", node=rospy.get_name())
 
-    def done(state, result) -> None:
+    def done(state: int, result: TestResult) -> None:
         say("done", state=GoalStatus.to_string(state), result=result.result if result else 0)
 
     def obey() -> None:

@@ -8,7 +8,7 @@ import sys
 
 import actionlib
 import rospy
-from actionlib.msg import TestAction, TestFeedback, TestResult
+from actionlib.msg import TestAction, TestFeedback, TestGoal, TestResult
 from payload import parser, say
 
 
@@ -19,7 +19,7 @@ def main() -> None:
     args = options.parse_args(rospy.myargv(sys.argv)[1:])
     rospy.init_node(args.name or "action_server", anonymous=not args.name)
 
-    def execute(goal) -> None:
+    def execute(goal: TestGoal) -> None:
         say("goal", goal=goal.goal)
         if goal.goal < 0:
             server.set_aborted(TestResult(-1), "it is below 0")

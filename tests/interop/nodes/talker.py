@@ -21,7 +21,7 @@ def main() -> None:
     options.add_argument("--wait", type=int, default=0, help="subscribers to wait for before the first message")
     options.add_argument("--queue", type=int, default=10000)
     options.add_argument("--type", choices=["UInt8MultiArray", "String"], default="UInt8MultiArray")
-    options.add_argument("--another-md5", action="store_true", help="a definition of the same name, not the same fields")
+    options.add_argument("--another-md5", action="store_true", help="the same name, not the same fields")
     args = options.parse_args(rospy.myargv(sys.argv)[1:])
     rospy.init_node(args.name or "talker", anonymous=not args.name, disable_signals=False)
     kind = String if args.type == "String" else UInt8MultiArray

@@ -7,6 +7,7 @@
 import os
 import sys
 import time
+from typing import Any
 
 import rospy
 from payload import parser, say
@@ -21,7 +22,7 @@ def main() -> None:
     args = options.parse_args(rospy.myargv(sys.argv)[1:])
     rospy.init_node(args.name or "worker", anonymous=not args.name)
 
-    def work(request):
+    def work(request: Any) -> Any:
         if not args.quiet:
             say("call", op=request.op, size=len(request.data))
         if request.op == "die":

@@ -30,7 +30,7 @@ class Owner:
             on_first_subscriber=lambda: self.said.append("first"),
             on_last_subscriber=lambda: self.said.append("last"),
             on_mismatch=self.mismatch,
-            **options,
+            **options,  # type: ignore[arg-type] # all of them are numbers
         )
         self.server = TcprosServer("/p", {"/t": self.publication})
         self.server.start()
