@@ -286,10 +286,11 @@ async def test_an_owner_that_comes_back_without_it_takes_nothing_away(sides: Any
     again = Side("base")
     sides(again)
     join(again, pad, 2)
-    await until(lambda: pad.states() == {"/base/robot_description": "followed"})
+    await until(lambda: again.params._desk._last == {"/robot_description": None})
+    await pad.ask(transfer.NAMES, {}, 2)  # its answer comes behind what was told
+    await until(lambda: not pad.params._follower._working)
     await again.look()
     await pad.look()
-    await until(lambda: not pad.params._follower._working)
     assert pad.core.get("/base/robot_description") == "one"
     again.core.set("/robot_description", "two")
     await until(lambda: pad.core.get("/base/robot_description") == "two")
