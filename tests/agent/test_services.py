@@ -261,8 +261,9 @@ async def test_a_service_that_has_no_server_behind_it_is_refused_with_the_reason
 async def test_a_hundred_services_of_fifty_nodes_stand_in_the_other_graph(settings: Callable[..., Settings]) -> None:
     async with running(settings("a"), settings("b")) as (a, b), serving(a) as server:
         for number in range(100):
-            uri = f"http://127.0.0.1:1/{number % 50}"
-            a.core.call("registerService", f"/n{number % 50}", f"/s{number}", server.node.service_uri, uri)
+            a.core.call(
+                "registerService", f"/n{number % 50}", f"/s{number}", server.node.service_uri, server.node.uri
+            )
         await until(lambda: sum(name.startswith("/s") for name in b.core.state().services) == 100)
         for number in range(100):
             a.core.call("unregisterService", f"/n{number % 50}", f"/s{number}", server.node.service_uri)
