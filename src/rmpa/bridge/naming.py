@@ -50,7 +50,7 @@ class PeerNames:
         """What a name of theirs is here.
 
         Args:
-            wire: The name as the peer has it: of a topic, a service or a parameter.
+            wire: The name as the peer has it, of a topic or a service.
             type_name: A topic's message type; rules with ``types`` fit nothing else.
         """
         return self._incoming(wire, type_name)[0]

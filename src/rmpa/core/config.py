@@ -49,7 +49,7 @@ class Remap:
     Args:
         source: The name before, or ``/namespace/**``; ``{peer}`` in it is the peer's name.
         target: The name after, likewise.
-        types: Globs over message types, one of which must fit; empty: topics of any type, services, parameters.
+        types: Globs over message types, one of which must fit; empty: topics of any type, and services.
     """
 
     source: str
