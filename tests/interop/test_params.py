@@ -213,3 +213,10 @@ def test_time_comes_from_one_simulator(configured: Configured) -> None:
     assert [end["remote_node"] for end in json.loads(output)["publishers"]] == ["/simulator"]
     now = sleeper.wait_event("time", since=sleeper.mark_events())
     assert float(str(now["now"])) < 9000
+    # Whom to follow may change while the agent runs.
+    path = other.agent.home / f"{other.name}.toml"
+    path.write_text(path.read_text().replace('"robot"', '"sim"'))
+    code, output = other.agent.rmpa("reload")
+    assert code == 0, output
+    has(other, "/use_sim_time", "true")
+    other.wait_topic("/clock")

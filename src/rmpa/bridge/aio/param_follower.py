@@ -166,6 +166,7 @@ class ParamFollower:
         key, exists, text, refused = (args.get(name) for name in ("key", "exists", "text", "refused"))
         if not isinstance(key, str) or not (text is None or isinstance(text, str)):
             raise RemoteProtocolError("news of a parameter without its key, or with a value that is no text")
+        transfer.check_size(len(text or ""))
         if refused is not None:
             for entry in self.following:
                 if entry.peer == attached.peer and entry.rule.key == key:
