@@ -39,6 +39,19 @@ def test_list_in_a_pipe_is_plain_and_aligned(place: Place, agent: Agent) -> None
     ]
 
 
+def test_a_relayed_module_is_shown_with_its_relay(place: Place, agent: Agent) -> None:
+    pad = PeerInfo(
+        name="pad", guid="10.9.0.1:40001#1", instance="22" * 16, state="relayed", since_ago=0.0, via="base2"
+    )
+    pad = msgspec.structs.replace(pad, topics_in=3, last_error="no route to host")
+    agent(snapshot=msgspec.structs.replace(SNAPSHOT, peers=(pad,), notes=()))
+    code, out, err = place.run("peer", "list")
+    assert (code, err) == (0, ""), "that there is no link is no trouble"
+    assert out.splitlines()[1].split()[:5] == ["pad", "relayed", "-", "via", "base2"]
+    code, out, _ = place.run("peer", "info", "pad")
+    assert (code, out.splitlines()[2]) == (0, "State:        relayed: base2 passes on 3 topics that it publishes")
+
+
 def test_list_as_json(place: Place, agent: Agent) -> None:
     agent()
     code, out, _ = place.run("peer", "list", "--json")
