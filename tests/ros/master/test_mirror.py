@@ -134,6 +134,30 @@ def test_a_type_that_comes_later_is_told_but_each_publisher_keeps_its_own(pair: 
     assert [(change.node, change.type) for change in changes] == [("/other", "std_msgs/Int8")]
 
 
+def test_a_type_that_is_said_again_otherwise_is_a_change(pair: Pair) -> None:
+    pair.theirs("registerPublisher", "/p", "/t", "*", THEIRS)
+    pair.theirs("registerSubscriber", "/s", "/u", "*", MOVED)
+    pair.look()
+    pair.mirror.take_changes()
+    pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
+    pair.theirs("registerSubscriber", "/s", "/u", STRING, MOVED)
+    pair.look()
+    changes = {(change.name, change.node, change.type) for change in pair.mirror.take_changes()}
+    assert changes == {("/t", "/p", STRING), ("/u", "/s", STRING)}
+    assert pair.mirror.state() == pair.master.registrations.state()
+
+
+def test_a_provider_that_a_look_from_before_saw_does_not_take_ours(pair: Pair) -> None:
+    pair.theirs("registerService", "/n", "/srv", "rosrpc://h:9", THEIRS)
+    seen, survey = pair.mirror.asked, pair.survey()
+    pair.theirs("unregisterService", "/n", "/srv", "rosrpc://h:9")
+    pair.call("registerService", "/rmpa/b/n", "/srv", "rosrpc://h:10", OURS)
+    pair.flush()
+    pair.mirror.learn(survey, seen, {})
+    assert pair.mirror.state().services == {"/srv": {"/rmpa/b/n": "rosrpc://h:10"}}
+    assert pair.look() == []
+
+
 def test_ours_counts_at_once_and_a_look_from_before_takes_nothing_back(pair: Pair) -> None:
     pair.theirs("registerSubscriber", "/s", "/t", STRING, THEIRS)
     pair.look()
@@ -227,6 +251,16 @@ def test_a_local_provider_takes_a_service_from_us_and_it_is_not_taken_back(pair:
     assert pair.look() == []
     assert pair.changes() == {("-", "/srv", "/rmpa/b/n"), ("+", "/srv", "/local")}
     assert pair.mirror.state().services == {"/srv": {"/local": "rosrpc://h:10"}}
+
+
+def test_a_proxy_that_left_since_the_look_began_is_no_stranger(pair: Pair) -> None:
+    pair.call("registerPublisher", "/rmpa/b/n", "/t", STRING, OURS)
+    pair.flush()
+    pair.look()
+    seen, survey = pair.mirror.asked, pair.survey()
+    pair.call("unregisterPublisher", "/rmpa/b/n", "/t", OURS)
+    assert pair.mirror.strangers(survey, "/rmpa", seen) == {}
+    assert set(pair.mirror.strangers(survey, "/rmpa", pair.mirror.asked)) == {"/rmpa/b/n"}
 
 
 def test_names_of_an_agent_that_are_not_ours_are_strangers_and_leave_nothing(pair: Pair) -> None:
