@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core import limits
 from rmpa.core.errors import UnreachableError
 from rmpa.ros.aio.http_client import connect, is_own_name, split_uri
+from rmpa.ros.aio.sock_diag import ask_listening_ports
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,8 +31,17 @@ _LISTENING: Final = re.compile(rb"^ *\d+: [0-9A-F]+:([0-9A-F]{4}) [0-9A-F]+:[0-9
 def listening_ports() -> set[int] | None:
     """TCP ports that somebody listens at in this network namespace, or ``None`` where the kernel does not tell.
 
-    For a thread: the kernel takes milliseconds where there are thousands of sockets. Between two short pieces the
-    interpreter is left to others.
+    For a thread: the kernel may take milliseconds.
+    """
+    ports = ask_listening_ports()
+    return ports if ports is not None else read_tables()
+
+
+def read_tables() -> set[int] | None:
+    """The same from ``/proc``, where it cannot be asked for.
+
+    The kernel takes milliseconds where there are thousands of sockets. Between two short pieces the interpreter is
+    left to others.
     """
     ports: set[int] = set()
     try:
