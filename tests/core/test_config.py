@@ -128,6 +128,7 @@ enabled = true
 priority = 80
 cpus = [1, 3]
 lock_memory = false
+keep_awake = true
 [log]
 level = "debug"
 json = true
@@ -146,7 +147,7 @@ json = true
         policy=PolicySettings(("/cmd/**",), ("/cmd/secret",), ("sensor_msgs/*",), ("sensor_msgs/Image",)),
         contracts=(Rule(("/cmd/**",), (), {"depth": 1}),),
         lanes=LaneSettings(46, 5, 8, 1),
-        realtime=RealtimeSettings(True, 80, (1, 3), False),
+        realtime=RealtimeSettings(True, 80, (1, 3), False, True),
         log_level="debug",
         log_json=True,
         config_file=settings.config_file,
@@ -232,6 +233,7 @@ def test_every_variable(load: Load) -> None:
         "RMPA_REALTIME_PRIORITY": "80",
         "RMPA_REALTIME_CPUS": "1, 3",
         "RMPA_REALTIME_LOCK_MEMORY": "no",
+        "RMPA_REALTIME_KEEP_AWAKE": "yes",
         "RMPA_LOG_LEVEL": "WARNING",
         "RMPA_LOG_JSON": "yes",
         "RMPA_RUNTIME_DIR": "/run/x",

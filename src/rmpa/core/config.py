@@ -181,12 +181,14 @@ class RealtimeSettings:
         priority: Of SCHED_FIFO, 1 to 99.
         cpus: The CPUs to run on; empty: any.
         lock_memory: Whether its memory stays in RAM (mlockall).
+        keep_awake: Whether the CPUs are kept from idle states that they wake from late; it costs power.
     """
 
     enabled: bool = False
     priority: int = 50
     cpus: tuple[int, ...] = ()
     lock_memory: bool = True
+    keep_awake: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -154,6 +154,7 @@ class RealtimeTable(_Table, kw_only=True):
     priority: int | UnsetType = UNSET
     cpus: list[int] | UnsetType = UNSET
     lock_memory: bool | UnsetType = UNSET
+    keep_awake: bool | UnsetType = UNSET
 
 
 class RelayTable(_Table, kw_only=True):

@@ -123,6 +123,7 @@ _OPTIONS: Final[Mapping[str, _Option]] = {
     "realtime_priority": _Option(values.read_realtime_priority, ("realtime", "priority"), "RMPA_REALTIME_PRIORITY"),
     "realtime_cpus": _Option(_list_of(values.read_cpu), ("realtime", "cpus"), "RMPA_REALTIME_CPUS"),
     "lock_memory": _Option(values.read_bool, ("realtime", "lock_memory"), "RMPA_REALTIME_LOCK_MEMORY"),
+    "keep_awake": _Option(values.read_bool, ("realtime", "keep_awake"), "RMPA_REALTIME_KEEP_AWAKE"),
     "relay": _Option(values.read_bool, ("relay", "enabled"), "RMPA_RELAY"),
     "log_level": _Option(values.read_level, ("log", "level"), "RMPA_LOG_LEVEL", "--log-level", "log_level"),
     "log_json": _Option(values.read_bool, ("log", "json"), "RMPA_LOG_JSON", "--log-json", "log_json"),
@@ -276,6 +277,7 @@ _GROUPS: Final[Mapping[str, tuple[Callable[..., object], Mapping[str, str]]]] = 
             "realtime_priority": "priority",
             "realtime_cpus": "cpus",
             "lock_memory": "lock_memory",
+            "keep_awake": "keep_awake",
         },
     ),
 }

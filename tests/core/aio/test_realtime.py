@@ -49,6 +49,7 @@ print(json.dumps({
     "loop": who(), "thread": others[0], "worker": worker, "child": os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]),
     "limit": resource.getrlimit(resource.RLIMIT_MEMLOCK),
     "before": sorted(before), "cpus": sorted(os.sched_getaffinity(0)),
+    "files": [os.path.realpath(f"/proc/self/fd/{fd}") for fd in os.listdir("/proc/self/fd")],
     "alive": bytes(bytearray(50_000_000))[:1].hex(),
 }))
 """
@@ -138,6 +139,21 @@ def test_an_impossible_priority_is_told() -> None:
     answer = run_child(priority=100, lock_memory=False)
     assert not wish(answer, "SCHED_FIFO")["granted"]
     assert wish(answer, "SCHED_FIFO")["remedy"] == "priorities are 1 to 99"
+
+
+@pytest.mark.skipif(not os.access("/dev/cpu_dma_latency", os.W_OK), reason="takes /dev/cpu_dma_latency")
+def test_the_cpus_are_kept_awake_while_the_process_lives() -> None:
+    answer = run_child(lock_memory=False, keep_awake=True)
+    assert wish(answer, "wakefulness")["granted"]
+    assert "/dev/cpu_dma_latency" in str(answer["files"])
+    assert "/dev/cpu_dma_latency" not in str(run_child(lock_memory=False)["files"])
+
+
+@needs_setpriv
+def test_a_refusal_to_keep_awake_says_what_would_grant_it() -> None:
+    refused = wish(run_child(unprivileged(), lock_memory=False, keep_awake=True), "wakefulness")
+    assert not refused["granted"]
+    assert "cpu_dma_latency" in str(refused["text"]) + str(refused["remedy"])
 
 
 @needs_lock

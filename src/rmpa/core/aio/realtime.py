@@ -43,6 +43,8 @@ _PR_GET_TIMERSLACK: Final = 30
 _CAP_SYS_NICE: Final = 23
 _MARKS_OF_CONTAINERS: Final = (Path("/.dockerenv"), Path("/run/.containerenv"))
 _STATUS: Final = Path("/proc/self/status")
+_CPU_DMA_LATENCY: Final = Path("/dev/cpu_dma_latency")
+_held: list[int] = []
 _RT_RUNTIME: Final = Path("/proc/sys/kernel/sched_rt_runtime_us")
 
 
@@ -83,6 +85,8 @@ def apply(settings: RealtimeSettings) -> tuple[Wish, ...]:
         wishes.append(_lock_memory())
     if settings.cpus:
         wishes.append(_pin(settings.cpus))
+    if settings.keep_awake:
+        wishes.append(_keep_awake())
     for wish in wishes:
         level, mark = (logging.INFO, "=") if wish.granted else (logging.WARNING, "!")
         remedy = f". For more: {wish.remedy}" if wish.granted else f". To have it: {wish.remedy}"
@@ -261,6 +265,35 @@ def _cpu_ways() -> str:
         f"we run on {_listed(os.sched_getaffinity(0))} of {os.cpu_count()}; realtime.cpus names some of them, "
         "and others are given by AllowedCPUs= of the systemd unit or --cpuset-cpus of the container"
     )
+
+
+# --- idle states -----------------------------------------------------------------------------------------------
+
+
+def _keep_awake() -> Wish:
+    """Keep all CPUs in idle states that they leave at once, for as long as this process lives.
+
+    The kernel's PM QoS (Documentation/power/pm_qos_interface): the wish holds while the file is open, so it is never
+    closed. Between two processes on two CPUs of a virtual machine a wake-up took 11 µs with it, and 21 µs without.
+    """
+    name = "wakefulness"
+    try:
+        file = os.open(_CPU_DMA_LATENCY, os.O_WRONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        text = f"this kernel has no {_CPU_DMA_LATENCY} (CONFIG_CPU_IDLE)"
+        return Wish(name, False, text, "boot with processor.max_cstate=1")
+    except OSError as error:
+        return Wish(name, False, f"{error.strerror} ({_CPU_DMA_LATENCY})", _awake_ways())
+    os.write(file, (0).to_bytes(4, sys.byteorder))
+    _held.append(file)
+    return Wish(name, True, "no CPU goes into an idle state that it wakes from late")
+
+
+def _awake_ways() -> str:
+    if _in_container():
+        return f"start the container with --device {_CPU_DMA_LATENCY}"
+    rule = 'KERNEL=="cpu_dma_latency", MODE="0660", GROUP="realtime"'
+    return f"put the line {rule} into /etc/udev/rules.d/60-rmpa.rules and the agent's user into that group"
 
 
 # --- what would grant it ---------------------------------------------------------------------------------------
