@@ -252,7 +252,7 @@ def test_every_variable(load: Load) -> None:
         group="239.0.0.1",
         policy=PolicySettings(("/a", "/b/**"), ("/c",), ("std_msgs/*",), ("std_msgs/Header",)),
         lanes=LaneSettings(46, 5, 8, 1),
-        realtime=RealtimeSettings(True, 80, (1, 3), False),
+        realtime=RealtimeSettings(True, 80, (1, 3), False, True),
         log_level="warning",
         log_json=True,
         runtime_dir="/run/x",
