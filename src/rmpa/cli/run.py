@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
+import ctypes
 import logging
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
-from typing import TYPE_CHECKING, Final
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Final, NoReturn, Self
 
 import click
 
@@ -18,27 +20,32 @@ from rmpa.cli.output import printable
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
+    from types import FrameType, TracebackType
 
-    from rmpa.resource.declare import Resource
+    from rmpa.resource.declare import Parameter, Resource
 
 _log = logging.getLogger("rmpa.run")
 _STARTS: Final = 20.0
 """Seconds that an agent may take until it answers."""
 _ENDS: Final = 10.0
 """Seconds that it may take to say goodbye."""
+_THREADS: Final = 1.0
+"""Seconds that a function of the user's may take to come back once its resource has ended."""
+_PR_SET_PDEATHSIG: Final = 1
 EPILOG = """\
 \b
 The file declares one or more rmpa.resource.Resource; see docs/tutorials/resources.md.
 Without --name and --master the module is named as its first resource. An agent of that name that runs already
-is used; else one is started with the options behind --, and ended with the resources.
+is used, and stays; else one is started with the options behind --, and ends with the resources.
 
 \b
 Examples:
   rmpa run sonar.py                            with an agent of its own, named sonar
   rmpa run sonar.py --name nose -- --interface wlan0 --realtime
   rmpa run sonar.py --name base                on the agent base, if that runs
+  rmpa run sonar.py --set cone=0.2             with another value of a parameter
   rmpa run sonar.py --master http://127.0.0.1:11311    on any ROS core, without an agent
 """
 
@@ -47,22 +54,50 @@ Examples:
 @click.argument("file", type=click.Path(exists=True, dir_okay=False))
 @click.option("--name", metavar="NAME", help="The module's name. [default: the first resource's]")
 @click.option("--master", metavar="URI", help="Run on this ROS core, whosever it is; no agent is started.")
+@click.option(
+    "--set", "given", metavar="[RESOURCE.]PARAMETER=VALUE", multiple=True, help="Start with this value; repeatable."
+)
 @click.option("--log-level", default="info", type=click.Choice(["debug", "info", "warning", "error"]))
 @click.argument("options", nargs=-1, type=click.UNPROCESSED, metavar="[-- OPTIONS OF rmpa up]")
-def run(file: str, name: str | None, master: str | None, log_level: str, options: tuple[str, ...]) -> int:
+def run(
+    file: str, name: str | None, master: str | None, given: tuple[str, ...], log_level: str, options: tuple[str, ...]
+) -> int:
     """Run the Smart Resources of FILE as nodes of this module's own core."""
     from pathlib import Path
 
     from rmpa.core.log import configure_logging
 
     configure_logging(log_level, sys.stderr, as_json=False)
-    resources = load(Path(file))
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _told_to_end)
+    path = Path(file)
     if master is not None:
         if options:
             raise ConfigError("--", "options of an agent, but --master starts none", "leave one of them out")
+        resources = prepared(path, given)
         return asyncio.run(_run(resources, master, None))
-    with module_agent(name or resources[0].name, options) as (uri, process):
-        return asyncio.run(_run(resources, uri, process))
+    resources = prepared(path, given) if name is None else []
+    with ModuleAgent(name or resources[0].name, options) as agent:
+        if not resources:  # the agent starts meanwhile
+            resources = prepared(path, given)
+        return asyncio.run(_run(resources, agent.core(), agent))
+
+
+def prepared(path: Path, given: Sequence[str] = ()) -> list[Resource]:
+    """The resources of a file with the given parameters, and all that they need imported and compiled.
+
+    Raises:
+        ConfigError: The file cannot be run, or a parameter cannot have its value.
+    """
+    import rmpa.resource.aio.member  # noqa: F401 - takes a while, the first time
+
+    resources = load(path)
+    for text in given:
+        _set(resources, text)
+    for resource in resources:
+        for kind in [topic.type for topics in (resource.outputs, resource.inputs) for topic in topics.values()]:
+            kind.deserialize(kind.serialize(kind.make()))
+    return resources
 
 
 def load(path: Path) -> list[Resource]:
@@ -112,44 +147,118 @@ def _line_in(path: Path, error: BaseException) -> int | None:
     return line
 
 
-@contextlib.contextmanager
-def module_agent(name: str, options: Sequence[str]) -> Iterator[tuple[str, subprocess.Popen[bytes] | None]]:
-    """The core's URI of the agent ``name``, which is started (and ended) unless it runs.
-
-    Yields:
-        The URI, and the agent's process if it is ours.
+def _set(resources: Sequence[Resource], text: str) -> None:
+    """Give a parameter the value that it starts with.
 
     Raises:
-        StartError: It does not start.
+        ConfigError: There is no such one, more than one, or it cannot have this value.
+    """
+    from rmpa.core.config_values import did_you_mean
+
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise ConfigError("--set", f"{text!r} gives no value", "for example --set cone=0.2")
+    known = {f"{r.name}.{p.name}": p for r in resources for p in r.parameters.values()}
+    fits = [name for name in known if key in (name, name.partition(".")[2])]
+    if len(fits) != 1:
+        if fits:
+            raise ConfigError("--set", f"{key} is a parameter of several resources", f"say {' or '.join(fits)}")
+        near = did_you_mean(key, [*known, *(name.partition(".")[2] for name in known)])
+        remedy = f"did you mean {near}?" if near else f"there are {', '.join(known) or 'none'}"
+        raise ConfigError("--set", f"there is no parameter {key}", remedy)
+    known[fits[0]].value = _read(known[fits[0]], value)
+
+
+def _read(parameter: Parameter, text: str) -> bool | int | float | str:
+    """A value as it was typed."""
+    if isinstance(parameter.default, str):
+        return text
+    if isinstance(parameter.default, bool):
+        words = {"true": True, "false": False, "1": True, "0": False}
+        if text.lower() not in words:
+            raise ConfigError(f"parameter {parameter.name}", f"{text!r} is no bool", "true or false")
+        return words[text.lower()]
+    try:
+        return type(parameter.default)(text)
+    except ValueError:
+        example = f"for example {parameter.default!r}"
+        raise ConfigError(f"parameter {parameter.name}", f"{text!r} is no {parameter.type}", example) from None
+
+
+class ModuleAgent:
+    """The agent of a module: one that runs already, or one of ours for as long as the ``with`` lasts.
+
+    Ours ends with us in any case: when we are killed, the kernel tells it to.
+
+    Args:
+        name: The module's.
+        options: Of ``rmpa up``, for one that is started.
+
+    Raises:
         ConfigError: It runs already, so that options for it come too late.
     """
-    uri = _core_of(name)
-    if uri is not None:
-        if options:
-            text = f"an agent {name} runs already; its options were given when it was started"
-            raise ConfigError("--", text, "leave them out, or choose another --name")
-        _log.info("= using the agent %s, %s", name, uri)
-        yield uri, None
-        return
-    command = [sys.executable, "-m", "rmpa.cli.main", "up", "--name", name, *options]
-    # A session of its own: Ctrl-C is ours, and the agent ends when the resources have ended.
-    process = subprocess.Popen(command, start_new_session=True)  # noqa: S603 - our own program
-    try:
-        yield _wait_for(name, process), process
-    finally:
-        _end(process)
 
+    def __init__(self, name: str, options: Sequence[str]) -> None:
+        self.name = name
+        self.process: subprocess.Popen[bytes] | None = None
+        """If it is ours."""
+        self._uri = _core_of(name)
+        self._options = options
 
-def _wait_for(name: str, process: subprocess.Popen[bytes]) -> str:
-    deadline = time.monotonic() + _STARTS
-    while (uri := _core_of(name)) is None:
-        if process.poll() is not None:
-            text = f"it ended with code {process.returncode}"
-            raise StartError(f"agent {name}", text, "what it said stands above")
-        if time.monotonic() > deadline:
-            raise StartError(f"agent {name}", f"it does not answer after {_STARTS:g} s", "what it said stands above")
-        time.sleep(0.02)
-    return uri
+    def __enter__(self) -> Self:
+        if self._uri is not None:
+            if self._options:
+                text = f"an agent {self.name} runs already; its options were given when it was started"
+                raise ConfigError("--", text, "leave them out, or choose another --name")
+            _log.info("= using the agent %s, %s", self.name, self._uri)
+            return self
+        command = [sys.executable, "-m", "rmpa.cli.main", "up", "--name", self.name, *self._options]
+        libc, us = ctypes.CDLL(None), os.getpid()
+
+        def tie() -> None:
+            libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+            if os.getppid() != us:
+                os._exit(1)
+
+        # A session of its own: Ctrl-C is ours, and the agent ends when the resources have ended.
+        self.process = subprocess.Popen(command, start_new_session=True, preexec_fn=tie)  # noqa: S603, PLW1509
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.end()
+
+    def core(self) -> str:
+        """The URI of its core, once it answers.
+
+        Raises:
+            StartError: It does not.
+        """
+        deadline = time.monotonic() + _STARTS
+        while self._uri is None:
+            if self.process is not None and self.process.poll() is not None:
+                text = f"it ended with code {self.process.returncode}"
+                raise StartError(f"agent {self.name}", text, "what it said stands above")
+            if time.monotonic() > deadline:
+                text = f"it does not answer after {_STARTS:g} s"
+                raise StartError(f"agent {self.name}", text, "what it said stands above")
+            time.sleep(0.02)
+            self._uri = _core_of(self.name)
+        return self._uri
+
+    def end(self) -> None:
+        """Let it say goodbye, if it is ours."""
+        if self.process is None or self.process.poll() is not None:
+            return
+        self.process.terminate()
+        try:
+            self.process.wait(_ENDS)
+        except BaseException as error:
+            self.process.kill()  # it hangs, or somebody has no patience
+            self.process.wait()
+            if not isinstance(error, subprocess.TimeoutExpired):
+                raise
 
 
 def _core_of(name: str) -> str | None:
@@ -166,36 +275,50 @@ def _core_of(name: str) -> str | None:
     return None
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
-    if process.poll() is None:
-        process.terminate()
-        try:
-            process.wait(_ENDS)
-        except subprocess.TimeoutExpired:
-            process.kill()
-    process.wait()
-
-
-async def _run(resources: list[Resource], uri: str, process: subprocess.Popen[bytes] | None) -> int:
+async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None) -> int:
     from rmpa.resource.aio.member import run_all
 
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop.set)
+    threads = ThreadPoolExecutor(thread_name_prefix="profile or hook")
+    loop.set_default_executor(threads)
+
+    def told(number: int) -> None:
+        if stop.is_set():
+            _log.warning("! told twice: ending at once")
+            _leave(128 + number)
+        stop.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        loop.add_signal_handler(number, told, number)
+    process = agent.process if agent is not None else None
     died = asyncio.create_task(_watch(process, stop)) if process is not None else None
 
     def ready() -> None:
         _log.info("= %s: active on %s", ", ".join(printable(r.name) for r in resources), uri)
 
+    failure: RmpaError | None = None
     try:
         await run_all(resources, uri, stop, ready)
+    except RmpaError as error:
+        failure = error
     finally:
         if died is not None:
             died.cancel()
             await asyncio.wait([died])
-    if process is not None and process.poll() is not None:
-        raise StartError("the module's agent", f"it ended with code {process.returncode}", "its log says why")
+    if failure is None and process is not None and process.poll() is not None:
+        failure = StartError("the module's agent", f"it ended with code {process.returncode}", "its log says why")
+    threads.shutdown(wait=False, cancel_futures=True)
+    if left := await _left_behind():
+        _log.warning("! %s does not come back; it is left behind", ", ".join(left))
+        if failure is not None:
+            click.echo(f"rmpa: {failure}", err=True)
+        if agent is not None:
+            agent.end()
+        _leave(1)
+    if failure is not None:
+        raise failure
+    _log.info("= %s: ended", ", ".join(printable(r.name) for r in resources))
     return 0
 
 
@@ -204,3 +327,26 @@ async def _watch(process: subprocess.Popen[bytes], stop: asyncio.Event) -> None:
     while process.poll() is None:  # noqa: ASYNC110 - the kernel's event is SIGCHLD, which is the interpreter's own
         await asyncio.sleep(0.25)
     stop.set()
+
+
+async def _left_behind() -> list[str]:
+    """Names of the threads in which functions of the user's hang: the interpreter would wait for them for ever."""
+    loop = asyncio.get_running_loop()
+    deadline = loop.time() + _THREADS
+    while True:
+        alive = [t.name for t in threading.enumerate() if t is not threading.main_thread() and not t.daemon]
+        if not alive or loop.time() > deadline:
+            return alive
+        await asyncio.sleep(0.02)
+
+
+def _leave(code: int) -> NoReturn:
+    """End now, whatever threads there are; an agent of ours is told so by the kernel."""
+    logging.shutdown()
+    sys.stdout.flush()
+    os._exit(code)
+
+
+def _told_to_end(number: int, _frame: FrameType | None) -> NoReturn:
+    """Told to end before there is a loop: unwind, and end what was started."""
+    raise SystemExit(128 + number)
