@@ -216,6 +216,11 @@ class Adaptation:
         return self._target
 
     @property
+    def pinned(self) -> str:
+        """The profile that was chosen by hand, or empty."""
+        return self._pinned
+
+    @property
     def alarm(self) -> Alarm | None:
         """What is wrong at present."""
         return self._alarm
@@ -270,6 +275,7 @@ class Adaptation:
         """
         if profile:
             self._decider.profile(profile)
+            self._knows.troubles.pop(profile, None)  # who chooses it may know that what was wrong is mended
         self._pinned = profile
         why = f"{profile} was chosen by hand" if profile else "the choice by hand is over"
         return self._plan(now, why, at_once=True)
@@ -406,7 +412,8 @@ class Adaptation:
 
     def _pinned_or_best(self, now: float) -> Decision:
         bounds = self._knows.merged.bounds
-        if not self._pinned:
+        if not self._pinned or self._cooling(now).get(self._pinned):
+            # One chosen by hand that cannot be applied is tried again when its cool-down is over, not at once.
             return self._decider.decide(bounds, self._left_out(now))
         others = {name: "another one was chosen by hand" for name in self._decider.profiles if name != self._pinned}
         return self._decider.decide(bounds, others)
@@ -450,8 +457,10 @@ class Adaptation:
         return next(score for score in self.explain(now) if score.profile == profile)
 
     def _left_out(self, now: float) -> dict[str, str]:
-        cooling = {name: t.why for name, t in self._knows.troubles.items() if now < t.until < math.inf}
-        return cooling | self._knows.barred
+        return self._cooling(now) | self._knows.barred
+
+    def _cooling(self, now: float) -> dict[str, str]:
+        return {name: t.why for name, t in self._knows.troubles.items() if now < t.until < math.inf}
 
     def _disappoint(self, profile: str, why: str, now: float) -> None:
         before = self._knows.troubles.get(profile)

@@ -31,6 +31,7 @@ from rmpa.core.contract import Contract
 from rmpa.core.errors import ConfigError, LocalProtocolError
 from rmpa.core.names import is_legal_name
 from rmpa.resource.attributes import MEASURED, Attribute, Category, Direction, Scale
+from rmpa.resource.contexts import parse_rule
 from rmpa.resource.profiles import Profile, check_profiles
 from rmpa.resource.requirements import Bound, bound, find_attribute
 from rmpa.resource.units import quantity
@@ -43,11 +44,13 @@ ParameterValue = bool | int | float | str
 Hook = Callable[[], Awaitable[None] | None]
 TaskFunction = Callable[..., Awaitable[None] | None]
 """Without arguments if periodic; with the message if it runs on an input."""
+INT_MIN: Final = -(2**31)
+INT_MAX: Final = 2**31 - 1
 _Function = TypeVar("_Function", bound=Callable[..., object])
 RESERVED: Final = frozenset(
     {
         "alarms", "context", "decision", "descriptor", "parameter_descriptions", "parameter_updates", "profile",
-        "quality", "requirements", "responses", "set_parameters", "state",
+        "quality", "requirements", "responses", "set_context", "set_parameters", "state",
     }
 )  # fmt: skip
 """Names below a resource's node that are its own topics and services, and parameters with a meaning of their own."""
@@ -139,6 +142,14 @@ class Outlet(Protocol):
         ...
 
 
+class ParameterWatch(Protocol):
+    """Who hears of a parameter's changes while the resource runs."""
+
+    def changed(self, parameter: Parameter) -> None:
+        """It has another value; called in whichever thread set it."""
+        ...
+
+
 class Observer(Protocol):
     """Where an attribute's observations go."""
 
@@ -214,16 +225,36 @@ class Parameter:
     choices: tuple[ParameterValue, ...] = ()
     unit: str = ""
     description: str = ""
-    value: Any = None
+    watch: ParameterWatch | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        self.value = self.default
+        self._value: Any = self.default
+
+    @property
+    def value(self) -> Any:
+        """What it is now; whoever sets it, in any thread, is told by a ``ConfigError`` if it cannot be that."""
+        return self._value
+
+    @value.setter
+    def value(self, value: ParameterValue) -> None:
+        before, self._value = self._value, self.check(value)
+        if self.watch is not None and self._value != before:
+            self.watch.changed(self)
 
     @property
     def type(self) -> str:
         """``bool``, ``int``, ``double`` or ``str``, as dynamic_reconfigure has it."""
         kinds = {bool: "bool", int: "int", float: "double", str: "str"}
         return kinds[type(self.default)]
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """The least and the greatest value of a number; whole ones have 32 bits in dynamic_reconfigure."""
+        widest = (INT_MIN, INT_MAX) if isinstance(self.default, int) else (-math.inf, math.inf)
+        return (
+            self.low if self.low is not None else widest[0],
+            self.high if self.high is not None else widest[1],
+        )
 
     def check(self, value: ParameterValue) -> ParameterValue:
         """A value as this parameter may have it; whole numbers are numbers with a point too.
@@ -243,10 +274,11 @@ class Parameter:
             remedy = f"did you mean {near}?" if near else f"it is one of {', '.join(map(str, self.choices))}"
             raise ConfigError(where, f"{value!r} is none of its values", remedy)
         if not isinstance(value, str | bool):
-            if self.low is not None and value < self.low:
-                raise ConfigError(where, f"{value:g} is too little", f"the least is {self.low:g}")
-            if self.high is not None and value > self.high:
-                raise ConfigError(where, f"{value:g} is too much", f"the most is {self.high:g}")
+            low, high = self.bounds
+            if value < low:
+                raise ConfigError(where, f"{value:g} is too little", f"the least is {low:g}")
+            if value > high:
+                raise ConfigError(where, f"{value:g} is too much", f"the most is {high:g}")
         return value
 
 
@@ -525,7 +557,8 @@ class Resource:
         """Declare a context; behind the profiles and attributes that it names.
 
         Raises:
-            ConfigError: A name twice, an unknown profile or attribute, or an output of another resource.
+            ConfigError: A name twice, an unknown profile or attribute, an output of another resource, or a rule that
+                cannot be read.
         """
         where = f"context {name} of {self.name}"
         if name in self.contexts:
@@ -539,6 +572,8 @@ class Resource:
             wish.bound(find_attribute(self.attributes, key, self.name))
         if outputs is not None and (strange := [o.name for o in outputs if o not in self.outputs.values()]):
             raise ConfigError(where, f"{strange[0]} is no output of this resource", "name its own outputs")
+        if when:
+            parse_rule(when, self.parameters, where)
         names = tuple(output.name for output in outputs) if outputs is not None else None
         made = Context(name, when, dict(requires or {}), tuple(profiles), names, enter)
         self.contexts[name] = made

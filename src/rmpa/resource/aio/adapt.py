@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from rmpa.resource.aio.runtime import Runtime
     from rmpa.resource.aio.tasks import Tasks
     from rmpa.resource.attributes import Value
+    from rmpa.resource.decision import Score
     from rmpa.resource.declare import Input, Output
     from rmpa.resource.requirements import Bound
     from rmpa.ros.aio.topics import Publisher, Received, Subscriber
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 _LOOK: Final = 0.25
 """Seconds between looks whether clients are still connected."""
+_SOON: Final = 0.02
 
 
 class Adapter(RuntimePart):
@@ -91,6 +93,8 @@ class Adapter(RuntimePart):
         self._timers: dict[str, asyncio.TimerHandle] = {}
         self._context_bars: dict[str, str] = {}
         self._closed = False
+        self.chosen = ""
+        """A profile that was chosen by hand before the start."""
         self.reaction: float | None = None
         """Seconds that the last reconfiguration took, from its cause to its completion."""
         self.listeners: list[Callable[[Action], None]] = []
@@ -121,7 +125,7 @@ class Adapter(RuntimePart):
             await self._runtime.say(name, "")
         self._asking = await node.subscribe(f"{node.name}/requirements", ARRAY_TYPE, self._asked)
         self._bar()
-        self._act(self.loop.start(now))
+        self._act(self.loop.pin(self.chosen, now) if self.chosen else self.loop.start(now))
         self._respond()
         self._later("window", self._window, self._end_window)
         self._later("clients", _LOOK, self._look_at_clients)
@@ -232,6 +236,23 @@ class Adapter(RuntimePart):
         """
         self._act(self.loop.pin(profile, self._loop.time()))
         self._respond()
+
+    def refuse(self, client: str, text: str) -> None:
+        """Tell a client among the responses that what it said cannot be."""
+        _log.warning("! %s: %s: %s", self._runtime.node.name, printable(client), text)
+        self._answers[client] = self._answer(Level.ERROR, client, text, {})
+        self._respond()
+
+    def explain(self) -> tuple[Score, ...]:
+        """How each profile does at this moment."""
+        return self.loop.explain(self._loop.time())
+
+    async def settled(self) -> None:
+        """Wait until no profile is being applied; a hanging one is given up in a while."""
+        while self.loop.applying and self._applying is not None and not self._closed:
+            if self._applying.done():
+                await asyncio.sleep(_SOON)  # it died; the loop gives it up at its time-out
+            await asyncio.wait([self._applying], timeout=_LOOK)
 
     def _look_at_clients(self) -> None:
         """Forget those that are gone: killed, unplugged, or simply over."""
@@ -354,6 +375,7 @@ class Adapter(RuntimePart):
         return {
             "profile": self.loop.profile,
             "applying": self.loop.applying,
+            "chosen": self.loop.pinned,
             "reaction": self.reaction,
             "alarm": self.loop.alarm.kind.value if self.loop.alarm is not None else "",
             "conflicts": [str(conflict) for conflict in self.loop.asked.conflicts],
@@ -377,7 +399,7 @@ class Adapter(RuntimePart):
                         for term in score.terms
                     ],
                 }
-                for score in self.loop.explain(self._loop.time())
+                for score in self.explain()
             ],
         }
 

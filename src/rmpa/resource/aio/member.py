@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource.aio.adapt import Adapter
+from rmpa.resource.aio.contexts import Contexts
+from rmpa.resource.aio.reconfigure import Reconfigure
 from rmpa.resource.aio.runtime import Runtime, RuntimePart
 from rmpa.resource.aio.tasks import Tasks
 from rmpa.resource.lifecycle import LifeCycle, State, Transition
@@ -58,7 +60,10 @@ class Member:
         self.tasks = Tasks(self.runtime, on_problem=self._problem, on_deactivate=self._deactivate_soon)
         self.adapter = Adapter(self.runtime, self.tasks, window=window, settings=settings)
         self.adapter.troubles = self._troubles
-        self.runtime.parts += [self.tasks, self.adapter]
+        self.contexts = Contexts(self.runtime, self.tasks, self.adapter)
+        self.configuration = Reconfigure(self.runtime, self.adapter, self.contexts)
+        parts = [self.configuration.before, self.tasks, self.adapter, self.contexts, self.configuration]
+        self.runtime.parts += parts
         self._last_problem: dict[str, str] = {}
         self._deactivating: asyncio.Task[None] | None = None
 
@@ -164,6 +169,7 @@ class Member:
         for name, state in self.tasks.running.items():
             if state != "running":
                 tasks.append(f"task {name} {state}: {self._last_problem.get(name, '')}".rstrip(": "))
+        tasks += [f"rule over {problem}" for problem in self.contexts.problems]
         if self.life.state is not State.ACTIVE:
             tasks.append(f"it is {self.life.state}")
         return missing, tasks

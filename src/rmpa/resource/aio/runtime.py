@@ -65,7 +65,10 @@ class Runtime:
         self._publishers: dict[str, Publisher] = {}
         self._subscribers: dict[str, Subscriber] = {}
         self._texts: dict[str, tuple[Publisher, str | None]] = {}
-        self._held: list[tuple[Output, bytes]] | None = None
+        self._held: list[tuple[Output, bytes]] = []
+        self._holders: set[str] = set()
+        self.flowing: frozenset[str] | None = None
+        """The only outputs whose messages leave in the present context; ``None``: all."""
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread = 0
         self._undo = contextlib.AsyncExitStack()
@@ -88,6 +91,10 @@ class Runtime:
             for declared in self.resource.declared_attributes.values():
                 declared.observer = _Observer(self)
                 undo.callback(setattr, declared, "observer", None)
+            watch = _Watch(self)
+            for parameter in self.resource.parameters.values():
+                parameter.watch = watch
+                undo.callback(setattr, parameter, "watch", None)
             await self.say(TOPIC, self.descriptor.serialize())
             for item in self.resource.inputs.values():
                 await self._listen(item)
@@ -121,8 +128,10 @@ class Runtime:
             ConfigError: It cannot have that value.
             KeyError: There is no such parameter.
         """
-        parameter = self.resource.parameters[name]
-        parameter.value = parameter.check(value)
+        self.resource.parameters[name].value = value  # the parts hear of it by its watch
+
+    def parameter_changed(self, parameter: Parameter) -> None:
+        """Tell the parts that a parameter has another value."""
         for part in self.parts:
             part.parameter_changed(parameter)
 
@@ -131,15 +140,22 @@ class Runtime:
         subscriber = self._subscribers.get(item.name)
         return subscriber.publishers if subscriber is not None else 0
 
-    def hold(self) -> None:
-        """Keep what is published from now on: a profile is being applied, and no output may mix two of them."""
-        self._held = []
+    def hold(self, who: str = "profile") -> None:
+        """Keep what is published from now on: no output may mix two profiles, or two contexts.
 
-    def release(self, *, drop: bool = False) -> None:
+        Args:
+            who: What changes; messages leave when the last change is over.
+        """
+        self._holders.add(who)
+
+    def release(self, who: str = "profile", *, drop: bool = False) -> None:
         """Let what was kept leave, in order; or drop it, for it belongs to a profile that was not applied."""
-        held, self._held = self._held, None
-        for output, raw in held or ():
-            if not drop:
+        self._holders.discard(who)
+        if drop:
+            self._held = []
+        if not self._holders:
+            held, self._held = self._held, []
+            for output, raw in held:
                 self._send(output, raw)
 
     def call_in_loop(self, function: Any, *args: Any) -> None:
@@ -162,14 +178,14 @@ class Runtime:
 
     def send(self, output: Output, raw: bytes) -> None:
         """Send one message of an output, or keep it while a profile is being applied."""
-        if self._held is not None:
+        if self._holders:
             self._held.append((output, raw))
         else:
             self._send(output, raw)
 
     def _send(self, output: Output, raw: bytes) -> None:
         publisher = self._publishers.get(output.name)
-        if publisher is None:
+        if publisher is None or (self.flowing is not None and output.name not in self.flowing):
             return
         publisher.publish_raw(raw)
         now_ns = time.time_ns()
@@ -213,3 +229,14 @@ class _Observer:
     def observe(self, attribute: str, value: Value) -> None:
         """Hand one on."""
         self._runtime.call_in_loop(self._runtime.observe, attribute, value)
+
+
+class _Watch:
+    """Who hears that a parameter has changed; may be called from any thread."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+
+    def changed(self, parameter: Parameter) -> None:
+        """Tell the parts, in the loop."""
+        self._runtime.call_in_loop(self._runtime.parameter_changed, parameter)

@@ -46,13 +46,13 @@ class Gate:
 
     def __init__(self) -> None:
         self._change = threading.Condition()
-        self._open = True
+        self._closers: set[str] = set()
         self._within = 0
 
     def enter(self, ended: Callable[[], bool]) -> bool:
         """Wait in a thread until it is open, or ``ended`` says that nobody need go in any more (then false)."""
         with self._change:
-            while not self._open:
+            while self._closers:
                 if ended():
                     return False
                 self._change.wait(_SLICE)
@@ -65,27 +65,27 @@ class Gate:
             self._within -= 1
             self._change.notify_all()
 
-    def close(self) -> None:
+    def close(self, who: str) -> None:
         """Let nobody in any more."""
         with self._change:
-            self._open = False
+            self._closers.add(who)
 
     def empty(self, timeout: float) -> bool:
         """Wait in a thread until nobody is within; false if that takes longer than so many seconds."""
         with self._change:
             return self._change.wait_for(lambda: not self._within, timeout)
 
-    def open(self) -> None:
-        """Let runs through again."""
+    def open(self, who: str) -> None:
+        """Let runs through again, if nobody else keeps it closed."""
         with self._change:
-            self._open = True
+            self._closers.discard(who)
             self._change.notify_all()
 
     async def enter_soon(self) -> None:
         """As ``enter``, in the loop."""
         while True:
             with self._change:
-                if self._open:
+                if not self._closers:
                     self._within += 1
                     return
             await asyncio.sleep(_GATE_LOOK)
@@ -149,14 +149,18 @@ class Tasks(RuntimePart):
             runner.stop()
         await asyncio.gather(*(runner.ended() for runner in runners))
 
-    async def pause(self) -> None:
-        """Let no run begin, and wait until none is under way; one that is stuck is not waited for."""
-        self._gate.close()
+    async def pause(self, who: str = "profile") -> None:
+        """Let no run begin, and wait until none is under way; one that is stuck is not waited for.
+
+        Args:
+            who: What changes; runs begin again when the last change is over.
+        """
+        self._gate.close(who)
         await asyncio.to_thread(self._gate.empty, limits.TASK_PAUSE_TIMEOUT)
 
-    def resume(self) -> None:
-        """Let the tasks go on."""
-        self._gate.open()
+    def resume(self, who: str = "profile") -> None:
+        """Let the tasks go on, if nothing else changes."""
+        self._gate.open(who)
 
     async def close(self) -> None:
         """End with the resource."""
