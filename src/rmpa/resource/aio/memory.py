@@ -1,0 +1,164 @@
+"""What a resource remembers: takes it from its store at the start, and tells the store what changes."""
+
+from __future__ import annotations
+
+import logging
+import time
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from rmpa.resource.adaptation import Action, AlarmKind, Apply, Clear, Raise, Reacted
+from rmpa.resource.aio.runtime import RuntimePart
+from rmpa.resource.remembered import CHOSEN, LAST, PARAMETER, REQUIREMENT, Asked, recall
+from rmpa.ros.diagnostic_array import Level
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rmpa.resource.adaptation import Alarm
+    from rmpa.resource.aio.adapt import Adapter
+    from rmpa.resource.aio.runtime import Runtime
+    from rmpa.resource.aio.store import Store
+    from rmpa.resource.attributes import Value
+    from rmpa.resource.declare import Parameter
+    from rmpa.resource.remembered import Key
+
+_log = logging.getLogger(__name__)
+_SECOND = 1_000_000_000
+
+
+class Memory(RuntimePart):
+    """The memory of one resource.
+
+    Args:
+        runtime: Of the resource.
+        adapter: Takes what clients asked before, and tells what changes.
+        store: Not yet open; closed with the resource.
+    """
+
+    def __init__(self, runtime: Runtime, adapter: Adapter, store: Store) -> None:
+        self._runtime = runtime
+        self._adapter = adapter
+        self._store = store
+        self._said: dict[Key, str] = {}
+
+    @property
+    def problem(self) -> str:
+        """Why nothing is kept at present, or empty."""
+        return f"nothing is kept: {self._store.problem}" if self._store.problem else ""
+
+    async def recall(self) -> None:
+        """Take what was before, to be called before the node is registered and any other part starts."""
+        rows = await self._store.open()
+        resource = self._runtime.resource
+        found = recall(rows, resource, time.time_ns())
+        for lost in found.lost:
+            _log.warning("! %s: not remembered: %s", self._runtime.node.name, lost)
+        for name, value in found.parameters.items():
+            parameter = resource.parameters[name]
+            if parameter.value == parameter.default:  # else somebody has set it for this start
+                parameter.value = value
+        self._adapter.recalled = found
+        self._said = dict(rows)
+        if found.parameters or found.chosen or found.asked:
+            chosen = f", profile {found.chosen} chosen by hand" if found.chosen else ""
+            _log.info(
+                "= %s: remembered: %d parameters, %d clients%s",
+                self._runtime.node.name,
+                len(found.parameters),
+                len(found.asked),
+                chosen,
+            )
+
+    async def start(self) -> None:
+        """Hear of changes from now on."""
+        adapter = self._adapter
+        adapter.listeners.append(self._acted)
+        adapter.on_window.append(self._window)
+        adapter.on_asked.append(self._asked)
+        descriptor = self._runtime.descriptor
+        self._store.descriptor(descriptor.node, descriptor.serialize(), time.time_ns())
+        for name, parameter in self._runtime.resource.parameters.items():
+            if parameter.value != parameter.default:
+                self._put((PARAMETER, name), _json(parameter.value))
+        self._asked()
+
+    async def close(self) -> None:
+        """Write what is not written yet."""
+        await self._store.close()
+
+    def parameter_changed(self, parameter: Parameter) -> None:
+        """Remember it."""
+        self._put((PARAMETER, parameter.name), _json(parameter.value))
+
+    # --- inside -------------------------------------------------------------------------------------------------
+
+    def _put(self, key: Key, value: str | None) -> None:
+        if value is None:
+            if self._said.pop(key, None) is not None:
+                self._store.put(key, None)
+        elif self._said.get(key) != value:
+            self._said[key] = value
+            self._store.put(key, value)
+
+    def _asked(self) -> None:
+        """Something that was asked, or chosen by hand, may be another."""
+        asked = {one.client: one for one in self._adapter.asked(time.time_ns())}
+        for client, one in asked.items():
+            key = (REQUIREMENT, client)
+            before = self._said.get(key)
+            if before is None or not _same(before, one):
+                self._put(key, one.serialize())
+        for kind, name in [key for key in self._said if key[0] == REQUIREMENT and key[1] not in asked]:
+            self._put((kind, name), None)
+        loop = self._adapter.loop
+        self._put(CHOSEN, _json(loop.pinned))
+        if loop.profile:
+            self._put(LAST, _json(loop.profile))
+
+    def _window(self, level: Level, message: str, measured: Mapping[str, Value]) -> None:
+        text = _json({key: round(v, 9) if isinstance(v, float) else v for key, v in measured.items()})
+        self._store.window(time.time_ns(), self._adapter.loop.profile, int(level), message, text)
+
+    def _acted(self, action: Action) -> None:
+        match action:
+            case Apply():
+                self._event("apply", Level.OK, action.why, {"profile": action.profile})
+            case Raise():
+                level = Level.ERROR if action.alarm.kind is AlarmKind.NON_ADAPTABLE else Level.WARN
+                self._event("alarm", level, self._adapter.told(action.alarm), _details(action.alarm))
+            case Clear():
+                self._event("over", Level.OK, self._adapter.told(action.alarm), _details(action.alarm))
+            case Reacted():
+                details = {"profile": action.profile, "reaction": round(action.reaction, 6)}
+                self._event("reacted", Level.OK, f"{action.profile} runs", details)
+
+    def _event(self, event: str, level: Level, message: str, details: object) -> None:
+        self._store.event(time.time_ns(), event, int(level), message, _json(details))
+
+
+def _json(value: object) -> str:
+    return msgspec.json.encode(value).decode()
+
+
+def _same(before: str, one: Asked) -> bool:
+    """Whether a row says the same; its expiry by the wall clock is never the same to the nanosecond."""
+    try:
+        known = msgspec.json.decode(before, type=Asked)
+    except msgspec.DecodeError:
+        return False
+    if (known.values, known.mark) != (one.values, one.mark):
+        return False
+    if known.expires_ns is None or one.expires_ns is None:
+        return known.expires_ns == one.expires_ns
+    return abs(known.expires_ns - one.expires_ns) < _SECOND
+
+
+def _details(alarm: Alarm) -> dict[str, object]:
+    return {
+        "kind": alarm.kind.value,
+        "before": alarm.before,
+        "after": alarm.after,
+        "attributes": [short.attribute for short in alarm.shortfalls],
+    }
