@@ -104,7 +104,7 @@ def load(path: Path) -> list[Resource]:
     """The resources that a Python file declares, in order.
 
     Raises:
-        ConfigError: It cannot be run, declares none, or two of one name.
+        ConfigError: It cannot be run, declares none, two of one name, or one without a profile.
     """
     import runpy
 
@@ -131,6 +131,9 @@ def load(path: Path) -> list[Resource]:
         if resource.name in seen:
             raise ConfigError(f"resource {resource.name}", "there are two of this name", "rename one of them", path)
         seen.add(resource.name)
+        if not resource.profiles:
+            remedy = "declare one: @NAME.profile(offers={…})"
+            raise ConfigError(f"resource {resource.name}", "it has no System Profile", remedy, path)
     return found
 
 
@@ -348,5 +351,5 @@ def _leave(code: int) -> NoReturn:
 
 
 def _told_to_end(number: int, _frame: FrameType | None) -> NoReturn:
-    """Told to end before there is a loop: unwind, and end what was started."""
-    raise SystemExit(128 + number)
+    """Told to end before there is a loop: unwind as at Ctrl-C, and end what was started."""
+    raise KeyboardInterrupt(number)
