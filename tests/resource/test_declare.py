@@ -6,7 +6,7 @@ import pytest
 
 from rmpa.core.contract import Contract, Reliability
 from rmpa.core.errors import ConfigError, LimitExceeded, LocalProtocolError, RemoteProtocolError
-from rmpa.resource.declare import Resource, at_least, at_most, between, exactly
+from rmpa.resource.declare import Parameter, Resource, at_least, at_most, between, exactly
 from rmpa.resource.descriptor import Descriptor, describe
 
 if TYPE_CHECKING:
@@ -122,6 +122,8 @@ MISTAKES: list[tuple[Callable[[Resource], object], str]] = [
     (lambda r: r.context("x", outputs=[sonar().outputs["ranges"]]), "ranges is no output of this resource"),
     (lambda r: r.task()(lambda: None), "it needs either a rate or an input"),
     (lambda r: r.task(rate=0)(lambda: None), "a rate of 0 Hz"),
+    (lambda r: r.task(rate=r.parameters["gain"])(lambda: None), "gain may be what no rate can be"),
+    (lambda r: r.task(rate=Parameter("hz", 5.0, 1, 9))(lambda: None), "hz is no parameter of this resource"),
     (lambda r: r.task(rate=1, name="measure")(lambda: None), "there are two of this name"),
     (lambda r: r.task(on=sonar().inputs["/joy"])(lambda: None), "/joy is no input of this resource"),
     (lambda r: r.task(rate=1, on_failure="retry")(lambda: None), "'retry' is not known here"),

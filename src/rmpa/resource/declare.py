@@ -30,6 +30,7 @@ from rmpa.core.config_values import BadValue, did_you_mean
 from rmpa.core.contract import Contract
 from rmpa.core.errors import ConfigError, LocalProtocolError
 from rmpa.core.names import is_legal_name
+from rmpa.resource.adaptation import AdaptationSettings
 from rmpa.resource.attributes import MEASURED, Attribute, Category, Direction, Scale
 from rmpa.resource.contexts import parse_rule
 from rmpa.resource.profiles import Profile, check_profiles
@@ -44,6 +45,8 @@ ParameterValue = bool | int | float | str
 Hook = Callable[[], Awaitable[None] | None]
 TaskFunction = Callable[..., Awaitable[None] | None]
 """Without arguments if periodic; with the message if it runs on an input."""
+_RATE_MAX: Final = 10_000
+"""Hz, of a periodic task."""
 INT_MIN: Final = -(2**31)
 INT_MAX: Final = 2**31 - 1
 _Function = TypeVar("_Function", bound=Callable[..., object])
@@ -342,6 +345,7 @@ class Task:
         on: The input whose messages it runs on, else ``None``.
         on_failure: What becomes of it when it raises or is stuck.
         stuck_after: Seconds that one run may take before it counts as stuck; ``None``: ten periods, at least 5 s.
+        follows: The parameter whose value is the rate, if there is one; profiles and people change it.
     """
 
     name: str
@@ -350,6 +354,7 @@ class Task:
     on: Input | None = None
     on_failure: OnFailure = OnFailure.RESTART
     stuck_after: float | None = None
+    follows: Parameter | None = None
 
 
 class Resource:
@@ -384,6 +389,10 @@ class Resource:
         self.contexts: dict[str, Context] = {}
         self.tasks: dict[str, Task] = {}
         self.hooks: dict[str, Hook] = {}
+        self.window = 1.0
+        """Seconds of one quality window."""
+        self.settings = AdaptationSettings()
+        """How patient its loop is."""
 
     # --- what it offers and needs -------------------------------------------------------------------------------
 
@@ -582,7 +591,7 @@ class Resource:
     def task(
         self,
         *,
-        rate: float | str | None = None,
+        rate: float | str | Parameter | None = None,
         on: Input | None = None,
         name: str = "",
         on_failure: str = "restart",
@@ -590,8 +599,16 @@ class Resource:
     ) -> Callable[[_Function], _Function]:
         """Declare what it does: periodically at a rate, or with each message of an input.
 
+        Args:
+            rate: Such as ``"10 Hz"``; or a parameter, whose value is the rate (Hz) also when it changes.
+            on: The input.
+            name: By default the function's.
+            on_failure: ``restart``, ``stop`` or ``deactivate``.
+            stuck_after: How long one run may take.
+
         Raises:
-            ConfigError: Neither or both of ``rate`` and ``on``, a rate that cannot be, an input of another resource.
+            ConfigError: Neither or both of ``rate`` and ``on``, a rate that cannot be, an input or a parameter of
+                another resource.
         """
 
         def declare(function: _Function) -> _Function:
@@ -601,17 +618,69 @@ class Resource:
                 raise ConfigError(where, "there are two of this name", "name one of them otherwise")
             if (rate is None) == (on is None):
                 raise ConfigError(where, "it needs either a rate or an input", 'rate="10 Hz", or on=an input')
-            hertz = quantity(rate, "Hz", where) if rate is not None else None
-            if hertz is not None and not 0 < hertz <= 10_000:
+            follows, hertz = None, None
+            if isinstance(rate, Parameter):
+                self._check_rate(rate, where)
+                follows, hertz = rate, float(rate.default)
+            elif rate is not None:
+                hertz = quantity(rate, "Hz", where)
+            if hertz is not None and not 0 < hertz <= _RATE_MAX:
                 raise ConfigError(where, f"a rate of {hertz:g} Hz", "it is above 0 and at most 10 kHz")
             if on is not None and on not in self.inputs.values():
                 raise ConfigError(where, f"{on.name} is no input of this resource", "declare it there first")
             seconds = quantity(stuck_after, "s", where) if stuck_after is not None else None
             policy = _word(OnFailure, on_failure, where)
-            self.tasks[title] = Task(title, function, hertz, on, policy, seconds)  # type: ignore[arg-type] # as told
+            self.tasks[title] = Task(title, function, hertz, on, policy, seconds, follows)  # type: ignore[arg-type] # as told
             return function
 
         return declare
+
+    def adaptation(
+        self,
+        *,
+        window: float | str = 1.0,
+        violations: int = 2,
+        windows: int = 3,
+        improvement: float = 0.05,
+        dwell: float | str = 2.0,
+        cool_down: float | str = 10.0,
+        cool_down_max: float | str = 160.0,
+        apply_timeout: float | str = 5.0,
+    ) -> None:
+        """Say how quickly it adapts; without this, as the defaults say.
+
+        Args:
+            window: Seconds of one quality window.
+            violations: So many violated windows …
+            windows: … of the last so many are a disturbance.
+            improvement: A change without a disturbance must lessen the distance by more than this.
+            dwell: Seconds that a profile runs at least before such a change.
+            cool_down: Seconds that a profile is left out after it failed or disappointed; twice as long each time …
+            cool_down_max: … up to this.
+            apply_timeout: Seconds after which a profile that is being applied counts as hung.
+
+        Raises:
+            ConfigError: A time that cannot be, or more violations than windows.
+        """
+        where = f"adaptation of {self.name}"
+        if not 1 <= violations <= windows <= 100:
+            raise ConfigError(where, f"{violations} of {windows} windows", "1 <= violations <= windows <= 100")
+        seconds = {
+            name: quantity(value, "s", f"{where}, {name}")
+            for name, value in (
+                ("window", window),
+                ("dwell", dwell),
+                ("cool_down", cool_down),
+                ("cool_down_max", cool_down_max),
+                ("apply_timeout", apply_timeout),
+            )
+        }
+        for name, least in (("window", 0.05), ("dwell", 0.0), ("cool_down", 0.0), ("apply_timeout", 0.01)):
+            if not least <= seconds[name] <= 86400:
+                raise ConfigError(where, f"{name} is {seconds[name]:g} s", f"at least {least:g} s, at most a day")
+        self.window = seconds.pop("window")
+        seconds["cool_down_max"] = max(seconds["cool_down_max"], seconds["cool_down"])
+        self.settings = AdaptationSettings(violations=violations, windows=windows, improvement=improvement, **seconds)
 
     def on(self, event: str) -> Callable[[_Function], _Function]:
         """Declare what is done at a change of the life cycle.
@@ -635,6 +704,14 @@ class Resource:
             return function
 
         return declare
+
+    def _check_rate(self, parameter: Parameter, where: str) -> None:
+        if parameter not in self.parameters.values():
+            raise ConfigError(where, f"{parameter.name} is no parameter of this resource", "declare it there first")
+        low, high = parameter.bounds
+        if parameter.type not in ("int", "double") or not low > 0 or not high <= _RATE_MAX:
+            remedy = f"declare it with low above 0 and high at most {_RATE_MAX:g}"
+            raise ConfigError(where, f"{parameter.name} may be what no rate can be", remedy)
 
     def _new(self, what: str, name: str, known: Mapping[str, object]) -> None:
         where = f"{what} {name} of {self.name}"

@@ -134,6 +134,11 @@ class TaskFigures:
         """The times between two runs are no period any more: it waited for another reason."""
         self._last = None
 
+    def retimed(self, period: float) -> None:
+        """It has another period from now on."""
+        self._period = period
+        self._last = None
+
     def missed(self, count: int) -> None:
         """So many times were left out."""
         self._missed += count

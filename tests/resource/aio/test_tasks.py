@@ -90,6 +90,36 @@ async def test_a_periodic_task_keeps_to_its_schedule(bench: Bench, kind: str) ->
 
 
 @pytest.mark.parametrize("kind", ["thread", "coroutine"])
+async def test_a_task_follows_the_parameter_that_is_its_rate(bench: Bench, kind: str) -> None:
+    rate = bench.resource.parameter("hz", 0.01, low=0.01, high=500, unit="Hz")
+    count = Counter(21)
+
+    def plain() -> None:
+        count()
+
+    async def coroutine() -> None:
+        count()
+
+    bench.resource.task(rate=rate)(plain if kind == "thread" else coroutine)
+    bench.tasks.activate()
+    async with asyncio.timeout(30):
+        while not count.times:
+            await asyncio.sleep(0.01)
+    # It would sleep for a hundred seconds.
+    rate.value = 50
+    bench.tasks.parameter_changed(rate)
+    await count.wait()
+    assert count.times[20] - count.times[1] > 0.3, "19 periods of 20 ms, whatever the lateness of the two"
+    rate.value = 0.01
+    bench.tasks.parameter_changed(rate)
+    await asyncio.sleep(0.15)
+    ran = len(count.times)
+    await asyncio.sleep(0.1)
+    assert len(count.times) == ran
+    assert bench.problems == []
+
+
+@pytest.mark.parametrize("kind", ["thread", "coroutine"])
 async def test_a_task_that_raises_is_reported_and_goes_on(bench: Bench, kind: str) -> None:
     count = Counter(4)
 

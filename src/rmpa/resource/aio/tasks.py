@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import threading
 import time
 from collections import deque
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from rmpa.resource.aio.runtime import Runtime
-    from rmpa.resource.declare import Input, Task
+    from rmpa.resource.declare import Input, Parameter, Task
     from rmpa.resource.tasks import TaskReport
     from rmpa.ros.aio.topics import Received
 
@@ -176,6 +177,12 @@ class Tasks(RuntimePart):
             if runner.task.on is item:
                 runner.give(message)
 
+    def parameter_changed(self, parameter: Parameter) -> None:
+        """Let the tasks go on whose rate it is."""
+        for runner in self._runners.values():
+            if runner.task.follows is parameter:
+                runner.retime(parameter.value)
+
     # --- inside -------------------------------------------------------------------------------------------------
 
     def _begin(self, task: Task) -> None:
@@ -221,7 +228,8 @@ class _Runner:
     """Runs one task until it is stopped."""
 
     def __init__(self, task: Task, gate: Gate, on_failed: Callable[[str], None]) -> None:
-        period = 1 / task.rate if task.rate else None
+        rate = task.follows.value if task.follows is not None else task.rate
+        period = 1 / rate if rate else None
         self.task = task
         self.waiting = False
         """Whether it pauses after a failure."""
@@ -253,6 +261,13 @@ class _Runner:
 
     def wake(self) -> None:
         raise NotImplementedError
+
+    def retime(self, rate: float) -> None:
+        """Go on with another rate, Hz: the next run is due one new period behind the last one."""
+        self._period = 1 / rate
+        self.patience = stuck_after(self._period, self.task.stuck_after)
+        self.figures.retimed(self._period)
+        self.wake()
 
     def give(self, message: Received) -> None:
         """Queue a message; the oldest gives way."""
@@ -305,15 +320,21 @@ class _AsyncRunner(_Runner):
                 loop.remove_reader(timer.fileno())
 
     async def _periodically(self, period: float, timer: TimerFd) -> None:
-        schedule = Schedule(period, time.monotonic())
+        schedule, last = Schedule(period, time.monotonic()), -math.inf
         while True:
+            if schedule.period != self._period:
+                period = self._period or period
+                schedule = Schedule(period, max(last + period, time.monotonic()))
             missed = schedule.missed
             due = schedule.next_due(time.monotonic())
             self.figures.missed(schedule.missed - missed)
             timer.set(due)
-            while not timer.wait():
+            while not (over := timer.wait()) and schedule.period == self._period:
                 self._wake.clear()
                 await self._wake.wait()
+            if not over:
+                continue  # it has another period meanwhile
+            last = due
             if not await self._once(due, None):
                 schedule = Schedule(period, time.monotonic())
 
@@ -395,14 +416,20 @@ class _ThreadRunner(_Runner):
                 self._loop.call_soon_threadsafe(self._done.set)
 
     def _periodically(self, period: float, timer: TimerFd) -> None:
-        schedule = Schedule(period, time.monotonic())
+        schedule, last = Schedule(period, time.monotonic()), -math.inf
         while not self._end.is_set():
+            if schedule.period != self._period:
+                period = self._period or period
+                schedule = Schedule(period, max(last + period, time.monotonic()))
             missed = schedule.missed
             due = schedule.next_due(time.monotonic())
             self.figures.missed(schedule.missed - missed)
-            while due - time.monotonic() > _SLICE:
+            while due - time.monotonic() > _SLICE and schedule.period == self._period:
                 if self._end.wait(min(due - time.monotonic() - _SLICE / 2, _SLICE)):
                     return
+            if schedule.period != self._period:
+                continue
+            last = due
             timer.set(due)
             timer.wait()
             if not self._once(due, None):
