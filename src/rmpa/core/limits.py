@@ -584,8 +584,8 @@ RESOURCE_CLIENT_GRACE: Final = 30.0
 and the links may all have to come up first."""
 RESOURCE_REPORT_WINDOWS: Final = 3
 """Quality windows for which what a client observes counts; one that reports no more observes nothing."""
-RESOURCE_MARKS_MAX: Final = 1024
-"""Requests with an expiry whose marks are remembered, so that a latched one that comes again does not begin anew."""
+RESOURCE_STAMPS_MAX: Final = 1024
+"""Requests with an expiry whose stamps are remembered, so that a latched one that comes again does not begin anew."""
 STORE_WINDOWS_MAX: Final = 3600
 """Quality windows in a resource's history: an hour of them, some 2 MB."""
 STORE_EVENTS_MAX: Final = 2000

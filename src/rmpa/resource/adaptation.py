@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
@@ -26,7 +26,7 @@ from rmpa.core.errors import LocalProtocolError, PeerRefused
 from rmpa.resource.requirements import Merged, Requirement, merge
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from rmpa.resource.attributes import Attribute, Value
     from rmpa.resource.decision import Decider, Decision, Score
@@ -194,6 +194,7 @@ class Adaptation:
         self._profile = ""
         self._target = ""
         self._pinned = ""
+        self._before = ""
         self._since = -math.inf
         self._deadline = math.inf
         self._caused = math.inf
@@ -240,6 +241,12 @@ class Adaptation:
         return self._decider.explain(self._knows.merged.bounds, self._left_out(now))
 
     # --- what is asked ------------------------------------------------------------------------------------------
+
+    def remember(self, requirements: Iterable[Requirement], profile: str) -> None:
+        """Begin with what was asked before a restart, and with the profile that ran if that is as good; at first."""
+        self._knows.requirements = {requirement.client: requirement for requirement in requirements}
+        self._knows.merged = merge(self._knows.requirements.values())
+        self._before = profile
 
     def start(self, now: float) -> list[Action]:
         """Take the first profile."""
@@ -399,7 +406,7 @@ class Adaptation:
         if self._state is ProfileState.APPLYING:
             self._asked_meanwhile |= at_once
             return []  # ``applied`` or ``failed`` looks again
-        decision = self._pinned_or_best(now)
+        decision = self._as_before(self._pinned_or_best(now), now)
         if not decision.profile:
             self._state, self._profile = ProfileState.NONE, ""
             return []
@@ -417,6 +424,16 @@ class Adaptation:
             return self._decider.decide(bounds, self._left_out(now))
         others = {name: "another one was chosen by hand" for name in self._decider.profiles if name != self._pinned}
         return self._decider.decide(bounds, others)
+
+    def _as_before(self, decision: Decision, now: float) -> Decision:
+        """The first decision after a restart: the profile that ran before, unless another is worth a change."""
+        before, self._before = self._before, ""
+        if not before or self._pinned or before == decision.profile or before in self._left_out(now):
+            return decision
+        score, best = self._score(before, now), self._score(decision.profile, now)
+        if score.feasible != best.feasible or score.distance - best.distance > self._settings.improvement:
+            return decision
+        return replace(decision, profile=before)
 
     def _worth_it(self, decision: Decision, now: float) -> bool:
         """Whether a change without a new question pays."""

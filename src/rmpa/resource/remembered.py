@@ -39,13 +39,15 @@ class Asked(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         client: Who.
         values: Attribute and text, ``priority``, ``expires``; as it came.
-        mark: On the message that said so; the same message may come again, and is the same request then.
+        mark: On the message that said so, and on the answers to it.
+        stamp: The message's, or empty; the same one may come again (latched), and is the same request then.
         expires_ns: By the wall clock, Unix nanoseconds: the monotonic one begins anew with each boot.
     """
 
     client: str
     values: tuple[tuple[str, str], ...]
     mark: str = ""
+    stamp: str = ""
     expires_ns: int | None = None
 
     def serialize(self) -> str:

@@ -10,10 +10,12 @@ import asyncio
 import inspect
 import logging
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
+from rmpa.core import limits
 from rmpa.core.errors import ConfigError
 from rmpa.resource.adaptation import (
     Action,
@@ -29,6 +31,7 @@ from rmpa.resource.adaptation import (
 from rmpa.resource.aio.runtime import RuntimePart
 from rmpa.resource.decision import Decider, wanted
 from rmpa.resource.quality import ObservedQuality, TopicQuality
+from rmpa.resource.remembered import Asked, Remembered
 from rmpa.resource.requirement_text import parse_requirement
 from rmpa.resource.requirements import Requirement
 from rmpa.ros.diagnostic_array import ARRAY_TYPE, Level, Status, frame_array
@@ -99,6 +102,20 @@ class Adapter(RuntimePart):
         """Seconds that the last reconfiguration took, from its cause to its completion."""
         self.listeners: list[Callable[[Action], None]] = []
         """Called with each action of the loop, for the store and the diagnostics."""
+        self.on_window: list[Callable[[Level, str, Mapping[str, Value]], None]] = []
+        """Called with each window: how the resource is, in words, and what was measured."""
+        self.on_asked: list[Callable[[], None]] = []
+        """Called when what is asked, chosen or running may be another."""
+        self.recalled = Remembered()
+        """What there was before a restart; set before the start."""
+        self._said: dict[str, tuple[tuple[str, str], ...]] = {}
+        """By client: what it asked, in its own words."""
+        self._stamps: dict[str, str] = {}
+        """By client: its request's stamp, or empty."""
+        self._expiries: dict[tuple[str, str], float] = {}
+        """By client and stamp: when a request expires, so that the same message, latched, does not begin anew."""
+        self._grace: dict[str, float] = {}
+        """By client that asked before a restart: until when it may come back."""
         self.troubles: Callable[[], tuple[list[str], list[str]]] = lambda: ([], [])
         """What is wrong beside the quality: (what is missing, what does not work), each ready to read."""
 
@@ -124,6 +141,7 @@ class Adapter(RuntimePart):
         for name in ("profile", "decision"):
             await self._runtime.say(name, "")
         self._asking = await node.subscribe(f"{node.name}/requirements", ARRAY_TYPE, self._asked)
+        self._recall(now)
         self._bar()
         self._act(self.loop.pin(self.chosen, now) if self.chosen else self.loop.start(now))
         self._respond()
@@ -188,7 +206,10 @@ class Adapter(RuntimePart):
     def _asked(self, message: Received) -> None:
         """A client says what it asks."""
         client = message.caller_id
+        self._grace.pop(client, None)
         self._marks[client] = next((str(s.hardware_id) for s in message.message.status), "")
+        stamp = message.message.header.stamp
+        self._stamps[client] = f"{stamp.sec}.{stamp.nanosec:09}" if stamp.sec or stamp.nanosec else ""
         try:
             values = [(str(pair.key), str(pair.value)) for status in message.message.status for pair in status.values]
             self.require(client, values)
@@ -206,12 +227,49 @@ class Adapter(RuntimePart):
         now = self._loop.time()
         name = self._runtime.resource.name
         requirement = parse_requirement(client, values, self._attributes, name, now)
+        if requirement.expires is not None and (stamp := self._stamps.get(client, "")):
+            due = self._expiries.setdefault((client, stamp), requirement.expires)
+            while len(self._expiries) > limits.RESOURCE_STAMPS_MAX:
+                del self._expiries[next(iter(self._expiries))]
+            if due <= now:
+                return  # a latched message that comes again, behind its time
+            requirement = replace(requirement, expires=due)
         self._answers.pop(client, None)
+        self._said[client] = tuple(values)
         if requirement.bounds:
             self._act(self.loop.require(requirement, now))
         elif client in self.loop.requirements:
             self._act(self.loop.release(client, now))
         self._respond()
+
+    def asked(self, now_ns: int) -> list[Asked]:
+        """What each client asks, in its own words, at a time of the wall clock."""
+        now, found = self._loop.time(), []
+        for client, requirement in self.loop.requirements.items():
+            if (values := self._said.get(client)) is not None:
+                expires = None
+                if requirement.expires is not None:
+                    expires = now_ns + round((requirement.expires - now) * 1e9)
+                mark, stamp = self._marks.get(client, ""), self._stamps.get(client, "")
+                found.append(Asked(client=client, values=values, mark=mark, stamp=stamp, expires_ns=expires))
+        return found
+
+    def _recall(self, now: float) -> None:
+        """Take up what was asked before a restart; who does not come back within the grace is forgotten."""
+        found, name, now_ns = [], self._runtime.resource.name, time.time_ns()
+        for asked in self.recalled.asked:
+            requirement = asked.requirement(self._attributes, name, now, now_ns)
+            if requirement is None:
+                continue
+            found.append(requirement)
+            self._said[asked.client] = asked.values
+            self._marks[asked.client] = asked.mark
+            self._grace[asked.client] = now + limits.RESOURCE_CLIENT_GRACE
+            self._stamps[asked.client] = asked.stamp
+            if asked.stamp and requirement.expires is not None:
+                self._expiries[asked.client, asked.stamp] = requirement.expires
+        self.loop.remember(found, self.recalled.last)
+        self.chosen = self.chosen or self.recalled.chosen
 
     def shift(self, context: str, bounds: Mapping[str, Bound], bars: Mapping[str, str]) -> None:
         """A context begins: what it requires counts above the clients', and some profiles may not run in it."""
@@ -261,6 +319,9 @@ class Adapter(RuntimePart):
         for client in {*self.loop.requirements, *self._answers}:
             if client in callers or client.startswith("context "):
                 self._absent.pop(client, None)
+                self._grace.pop(client, None)
+                continue
+            if self._grace.get(client, 0.0) > self._loop.time():
                 continue
             # Twice in a row: a proxy's subscribers connect anew when its link was gone for a moment.
             self._absent[client] = self._absent.get(client, 0) + 1
@@ -269,6 +330,9 @@ class Adapter(RuntimePart):
             del self._absent[client]
             self._answers.pop(client, None)
             self._marks.pop(client, None)
+            self._stamps.pop(client, None)
+            self._said.pop(client, None)
+            self._grace.pop(client, None)
             if client in self.loop.requirements:
                 _log.info("= %s: %s is gone, and what it asked for", self._runtime.node.name, printable(client))
                 self._act(self.loop.release(client, self._loop.time()))
@@ -299,10 +363,10 @@ class Adapter(RuntimePart):
                     _log.info("= %s: profile %s: %s", self._runtime.node.name, action.profile, action.why)
                     self._begin(action.profile)
                 case Raise():
-                    _log.warning("! %s: %s", self._runtime.node.name, self._told(action.alarm))
+                    _log.warning("! %s: %s", self._runtime.node.name, self.told(action.alarm))
                     self._publish_alarm(action.alarm, cleared=False)
                 case Clear():
-                    _log.info("= %s: over: %s", self._runtime.node.name, self._told(action.alarm))
+                    _log.info("= %s: over: %s", self._runtime.node.name, self.told(action.alarm))
                     self._publish_alarm(action.alarm, cleared=True)
                 case Reacted():
                     self.reaction = action.reaction
@@ -413,6 +477,8 @@ class Adapter(RuntimePart):
         values["profile"] = self.loop.profile
         if self.reaction is not None:
             values["reaction"] = f"{self.reaction:.6g} s"
+        for hear in self.on_window:
+            hear(level, message, self._measured)
         status = self._status(level, self._runtime.resource.name, message, values)
         self._publish("quality", [status])
         self._publish("diagnostics", [status])
@@ -421,13 +487,13 @@ class Adapter(RuntimePart):
         missing, broken = self.troubles()
         alarm = self.loop.alarm
         if alarm is not None and alarm.kind is AlarmKind.NON_ADAPTABLE:
-            return Level.ERROR, self._told(alarm)
+            return Level.ERROR, self.told(alarm)
         if missing:
             return Level.STALE, "; ".join((*missing, *broken))
         if not self.loop.profile:
             return Level.ERROR, "; ".join(("no profile runs", *broken))
         if alarm is not None or broken:
-            told = [self._told(alarm)] if alarm is not None else []
+            told = [self.told(alarm)] if alarm is not None else []
             return Level.WARN, "; ".join((*told, *broken))
         return Level.OK, f"profile {self.loop.profile}"
 
@@ -438,10 +504,11 @@ class Adapter(RuntimePart):
             given = attribute.show(short.given) if short.given is not None else "nothing"
             values[short.attribute] = f"wanted {wanted(attribute, short.wanted)}, given {given}"
         level = Level.OK if cleared else _LEVELS[alarm.kind]
-        text = f"over: {self._told(alarm)}" if cleared else self._told(alarm)
+        text = f"over: {self.told(alarm)}" if cleared else self.told(alarm)
         self._publish("alarms", [self._status(level, self._runtime.resource.name, text, values)])
 
-    def _told(self, alarm: Alarm) -> str:
+    def told(self, alarm: Alarm) -> str:
+        """An alarm in words."""
         names = ", ".join(short.attribute for short in alarm.shortfalls) or "the quality"
         if alarm.kind is AlarmKind.ADAPTATION:
             return f"adaptation: {names} fell short under {alarm.before}; {alarm.after} takes over"
@@ -449,6 +516,8 @@ class Adapter(RuntimePart):
 
     def _respond(self) -> None:
         """Tell each client what it asked and what it is given."""
+        for hear in self.on_asked:
+            hear()
         statuses = []
         for client, requirement in self.loop.requirements.items():
             lost = [c for c in self.loop.asked.conflicts if c.client == client]
@@ -476,7 +545,7 @@ class Adapter(RuntimePart):
     def _judged(self, short: list[str], lost: bool) -> tuple[Level, str]:
         alarm = self.loop.alarm
         if alarm is not None and alarm.kind is AlarmKind.NON_ADAPTABLE:
-            return Level.ERROR, self._told(alarm)
+            return Level.ERROR, self.told(alarm)
         if not self.loop.profile:
             return Level.WARN, "no profile runs yet"
         if short or lost:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import secrets
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
@@ -147,7 +148,8 @@ class ResourceClient:
         self._mark = secrets.token_hex(8)
         self._answer = None
         status: Any = [{"name": self._node.name, "hardware_id": self._mark, "values": pairs}]
-        self._asking.publish(self._asking.make({"status": status}))
+        # By its stamp a latched request that comes again is known, and its expiry does not begin anew.
+        self._asking.publish(self._asking.make({"header": {"stamp": time.time()}, "status": status}))
 
     def _heard(self, received: Received) -> None:
         for status in received.message.status:

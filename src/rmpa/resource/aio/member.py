@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource.aio.adapt import Adapter
 from rmpa.resource.aio.contexts import Contexts
+from rmpa.resource.aio.memory import Memory
 from rmpa.resource.aio.reconfigure import Reconfigure
 from rmpa.resource.aio.runtime import Runtime, RuntimePart
+from rmpa.resource.aio.store import Store
 from rmpa.resource.aio.tasks import Tasks
 from rmpa.resource.lifecycle import LifeCycle, State, Transition
 from rmpa.ros.aio.http_client import call_api
@@ -19,6 +21,7 @@ from rmpa.ros.aio.node import Node
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from rmpa.resource.adaptation import AdaptationSettings
     from rmpa.resource.aio.tasks import TaskProblem
@@ -35,6 +38,7 @@ class Member:
         master_uri: The core's.
         window: Seconds of one quality window.
         settings: How patient its loop is.
+        store: Where it remembers what is to survive a restart; without one it remembers nothing.
 
     Raises:
         ConfigError: It declares no profile: there would be nothing to decide.
@@ -45,8 +49,9 @@ class Member:
         resource: Resource,
         master_uri: str,
         *,
-        window: float = 1.0,
+        window: float | None = None,
         settings: AdaptationSettings | None = None,
+        store: Store | None = None,
     ) -> None:
         if not resource.profiles:
             remedy = "declare one: @NAME.profile(offers={…})"
@@ -58,12 +63,18 @@ class Member:
         node = Node(resource.name, master_uri=master_uri, on_shutdown=lambda _reason: self.ended.set())
         self.runtime = Runtime(resource, node)
         self.tasks = Tasks(self.runtime, on_problem=self._problem, on_deactivate=self._deactivate_soon)
-        self.adapter = Adapter(self.runtime, self.tasks, window=window, settings=settings)
+        self.adapter = Adapter(
+            self.runtime,
+            self.tasks,
+            window=window if window is not None else resource.window,
+            settings=settings if settings is not None else resource.settings,
+        )
         self.adapter.troubles = self._troubles
         self.contexts = Contexts(self.runtime, self.tasks, self.adapter)
-        self.configuration = Reconfigure(self.runtime, self.adapter, self.contexts)
+        self.configuration = Reconfigure(self.runtime, self.tasks, self.adapter, self.contexts)
         parts = [self.configuration.before, self.tasks, self.adapter, self.contexts, self.configuration]
-        self.runtime.parts += parts
+        self.memory = Memory(self.runtime, self.adapter, store) if store is not None else None
+        self.runtime.parts += [*parts, self.memory] if self.memory is not None else parts
         self._last_problem: dict[str, str] = {}
         self._deactivating: asyncio.Task[None] | None = None
 
@@ -79,7 +90,14 @@ class Member:
             UnreachableError: The core does not answer.
         """
         await self._refuse_twin()
-        await self.runtime.start()
+        if self.memory is not None:
+            await self.memory.recall()
+        try:
+            await self.runtime.start()
+        except BaseException:
+            if self.memory is not None:
+                await self.memory.close()
+            raise
         try:
             await self._turn(Transition.CONFIGURE)
             await self._turn(Transition.ACTIVATE)
@@ -170,12 +188,20 @@ class Member:
             if state != "running":
                 tasks.append(f"task {name} {state}: {self._last_problem.get(name, '')}".rstrip(": "))
         tasks += [f"rule over {problem}" for problem in self.contexts.problems]
+        if self.memory is not None and self.memory.problem:
+            tasks.append(self.memory.problem)
         if self.life.state is not State.ACTIVE:
             tasks.append(f"it is {self.life.state}")
         return missing, tasks
 
 
-async def run_all(resources: list[Resource], master_uri: str, stop: asyncio.Event, ready: Callable[[], None]) -> None:
+async def run_all(
+    resources: list[Resource],
+    master_uri: str,
+    stop: asyncio.Event,
+    ready: Callable[[], None],
+    stores: Path | None = None,
+) -> None:
     """Run resources until ``stop`` is set or all of them have ended.
 
     Args:
@@ -183,6 +209,7 @@ async def run_all(resources: list[Resource], master_uri: str, stop: asyncio.Even
         master_uri: Its core's.
         stop: Set by the caller.
         ready: Called when all are active.
+        stores: The folder of their stores; ``None``: nothing is remembered over a restart.
 
     Raises:
         RmpaError: One of them cannot start; those that have are closed.
@@ -190,7 +217,8 @@ async def run_all(resources: list[Resource], master_uri: str, stop: asyncio.Even
     members: list[Member] = []
     try:
         for resource in resources:
-            member = Member(resource, master_uri)
+            store = Store(stores / f"{resource.name}.sqlite") if stores is not None else None
+            member = Member(resource, master_uri, store=store)
             await member.start()
             members.append(member)
         ready()

@@ -148,7 +148,7 @@ def _same(before: str, one: Asked) -> bool:
         known = msgspec.json.decode(before, type=Asked)
     except msgspec.DecodeError:
         return False
-    if (known.values, known.mark) != (one.values, one.mark):
+    if (known.values, known.mark, known.stamp) != (one.values, one.mark, one.stamp):
         return False
     if known.expires_ns is None or one.expires_ns is None:
         return known.expires_ns == one.expires_ns
