@@ -101,6 +101,23 @@ class Decision:
     best_effort: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class _Column:
+    """One attribute under one bound, a value for each profile.
+
+    Args:
+        bound: What is asked.
+        deltas: The shortfalls.
+        weighted: Times the weight.
+        squares: Their squares, times the weight.
+    """
+
+    bound: Bound
+    deltas: list[float]
+    weighted: list[float]
+    squares: list[float]
+
+
 class Decider:
     """Decides for one resource; what does not change between decisions is worked out once.
 
@@ -121,6 +138,7 @@ class Decider:
         self._costs = [EPSILON * profile.cost for profile in profiles]
         self._places: dict[str, list[float | None]] = {}
         self._spans: dict[str, float] = {}
+        self._columns: dict[str, _Column] = {}
         for name, attribute in attributes.items():
             places = [attribute.place(p.offers[name]) if name in p.offers else None for p in profiles]
             known = [place for place in places if place is not None]
@@ -175,9 +193,12 @@ class Decider:
         """Every profile's score with all its terms, in order of declaration."""
         distances, hard = self._judge(bounds)
         left_out = excluded or {}
+        said = {name: wanted(self._attributes[name], bound) for name, bound in bounds.items()}
         return tuple(
-            Score(name, distances[index], hard[index], left_out.get(name, ""), self._terms(index, bounds))
-            for index, name in enumerate(self._profiles)
+            Score(
+                name, distances[index], hard[index], left_out.get(name, ""), self._terms(index, profile, said, bounds)
+            )
+            for index, (name, profile) in enumerate(self._profiles.items())
         )
 
     def distance(self, name: str, bounds: Mapping[str, Bound]) -> float:
@@ -186,18 +207,27 @@ class Decider:
 
     def _judge(self, bounds: Mapping[str, Bound]) -> tuple[list[float], list[float]]:
         """Distances, and largest weighted hard shortfalls, by profile."""
-        sums = [0.0] * len(self._profiles)
-        hard = [0.0] * len(self._profiles)
-        weights = 0.0
-        for name, bound in bounds.items():
-            deltas = self._deltas(name, bound)
-            weight = bound.weight
-            weights += weight
-            sums = [total + weight * delta * delta for total, delta in zip(sums, deltas, strict=True)]
-            if bound.hard:
-                hard = [max(most, weight * delta) for most, delta in zip(hard, deltas, strict=True)]
-        scale = weights or 1.0
-        return [math.sqrt(s / scale) + cost for s, cost in zip(sums, self._costs, strict=True)], hard
+        if not bounds:
+            return list(self._costs), [0.0] * len(self._profiles)
+        columns = [self._column(name, bound) for name, bound in bounds.items()]
+        scale = sum(bound.weight for bound in bounds.values())
+        sums = map(sum, zip(*(column.squares for column in columns), strict=True))
+        distances = [math.sqrt(total / scale) + cost for total, cost in zip(sums, self._costs, strict=True)]
+        hard = [column.weighted for column in columns if column.bound.hard]
+        if not hard:
+            return distances, [0.0] * len(self._profiles)
+        return distances, [*map(max, zip(*hard, strict=True))] if len(hard) > 1 else hard[0]
+
+    def _column(self, name: str, bound: Bound) -> _Column:
+        """One attribute's part in every profile's distance; most bounds are as they were at the last decision."""
+        known = self._columns.get(name)
+        if known is not None and known.bound == bound:
+            return known
+        deltas = self._deltas(name, bound)
+        weighted = [bound.weight * delta for delta in deltas] if bound.weight != 1 else deltas
+        squares = [part * delta for part, delta in zip(weighted, deltas, strict=True)]
+        made = self._columns[name] = _Column(bound, deltas, weighted, squares)
+        return made
 
     def _deltas(self, name: str, bound: Bound) -> list[float]:
         places, span = self._places[name], self._spans[name]
@@ -221,14 +251,15 @@ class Decider:
             ]
         return [_MISSING if place is None or not low <= place <= high else 0.0 for place in places]
 
-    def _terms(self, index: int, bounds: Mapping[str, Bound]) -> tuple[Term, ...]:
-        profile = self._profiles[self.profiles[index]]
+    def _terms(
+        self, index: int, profile: Profile, said: Mapping[str, str], bounds: Mapping[str, Bound]
+    ) -> tuple[Term, ...]:
         return tuple(
             Term(
                 name,
                 profile.offers.get(name),
-                wanted(self._attributes[name], bound),
-                self._deltas(name, bound)[index],
+                said[name],
+                self._column(name, bound).deltas[index],
                 bound.weight,
                 bound.hard,
             )

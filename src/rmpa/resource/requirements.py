@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING
 
 from rmpa.core.config_values import did_you_mean
@@ -167,24 +168,58 @@ class Merged:
 
 def merge(requirements: Iterable[Requirement]) -> Merged:
     """Intersect the clients' intervals, the more important first; of equal ones the earlier."""
-    bounds: dict[str, Bound] = {}
-    asked: dict[str, list[str]] = {}
-    conflicts = []
-    for requirement in sorted(requirements, key=lambda r: -r.priority):
-        client = requirement.client
+    clients = sorted(requirements, key=_importance)
+    asked: dict[str, list[Bound]] = {}
+    for requirement in clients:
         for name, ours in requirement.bounds.items():
-            before = bounds.get(name)
+            before = asked.get(name)
             if before is None:
-                bounds[name] = ours
-                asked[name] = [client]
-                continue
-            both = _both(before, ours)
-            if both is None:
-                conflicts.append(Conflict(client, name, tuple(asked[name])))
+                asked[name] = [ours]
             else:
-                asked[name].append(client)
-                bounds[name] = both
-    return Merged(bounds, tuple(conflicts))
+                before.append(ours)
+    bounds: dict[str, Bound] = {}
+    conflicts: list[tuple[int, Conflict]] = []
+    for name, several in asked.items():
+        both = _all(several)
+        bounds[name] = both if both is not None else _in_order(name, clients, conflicts)
+    conflicts.sort(key=itemgetter(0))
+    return Merged(bounds, tuple(conflict for _, conflict in conflicts))
+
+
+def _importance(requirement: Requirement) -> int:
+    return -requirement.priority
+
+
+_low, _high, _weight, _hard, _words_of = (attrgetter(name) for name in ("low", "high", "weight", "hard", "words"))
+
+
+def _all(bounds: list[Bound]) -> Bound | None:
+    """The intersection of bounds without words; ``None`` where it is empty, or words are asked for."""
+    if len(bounds) == 1:
+        return bounds[0]
+    if any(map(_words_of, bounds)):
+        return None
+    low, high = max(map(_low, bounds)), min(map(_high, bounds))
+    if low > high:
+        return None
+    return Bound(low, high, weight=max(map(_weight, bounds)), hard=any(map(_hard, bounds)))
+
+
+def _in_order(name: str, clients: list[Requirement], conflicts: list[tuple[int, Conflict]]) -> Bound:
+    """The intersection for one attribute, one client after the other; who is left out goes to ``conflicts``."""
+    found: Bound | None = None
+    kept: list[str] = []
+    for place, requirement in enumerate(clients):
+        ours = requirement.bounds.get(name)
+        if ours is None:
+            continue
+        both = _both(found, ours) if found is not None else ours
+        if both is None:
+            conflicts.append((place, Conflict(requirement.client, name, tuple(kept))))
+        else:
+            found = both
+            kept.append(requirement.client)
+    return found if found is not None else Bound()
 
 
 def _both(one: Bound, other: Bound) -> Bound | None:
