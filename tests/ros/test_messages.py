@@ -2,7 +2,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from typing import Any
 
+import numpy as np
 import pytest
 
 from rmpa.ros.definitions import SEPARATOR, DefinitionError, known_types
@@ -103,6 +105,44 @@ def test_values_that_do_not_fit_are_named(values: Plain, error: str) -> None:
     with pytest.raises(MessageError) as caught:
         MessageType("sensor_msgs/Joy").make(values)
     assert error in str(caught.value)
+
+
+def test_a_program_may_give_arrays_bytes_and_messages() -> None:
+    image, pixels = MessageType("sensor_msgs/Image"), np.arange(6, dtype=np.uint8).reshape(2, 3)
+    raw = bytes(range(6))
+    for data in (raw, bytearray(raw), memoryview(raw), tuple(raw), pixels, np.arange(6)):
+        made = image.make({"data": data})
+        assert image.to_plain(image.deserialize(image.serialize(made)))["data"] == list(range(6))
+    made = image.make({"data": pixels})
+    pixels[:] = 9  # the caller's own, again
+    assert list(made.data) == list(range(6))
+    scan = MessageType("sensor_msgs/LaserScan")
+    made = scan.make({"header": made.header, "ranges": np.array([1.5, np.inf]), "angle_min": np.float32(0.5)})
+    assert made.ranges.dtype == np.float32
+    assert made.angle_min == 0.5
+    again = scan.make({"header": {"stamp": made.header.stamp}, "intensities": made.ranges})
+    assert list(scan.deserialize(scan.serialize(again)).intensities) == [1.5, np.inf]
+    twist, vector = MessageType("geometry_msgs/Twist"), MessageType("geometry_msgs/Vector3")
+    assert twist.to_plain(twist.make({"linear": vector.make([1, 2, 3])}))["linear"] == {"x": 1.0, "y": 2.0, "z": 3.0}
+    assert MessageType("std_msgs/Int32").make({"data": np.int64(5)}).data == 5
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "error"),
+    [
+        ("sensor_msgs/Image", {"data": np.array([256])}, "data: 256 to 256 do not fit uint8"),
+        ("sensor_msgs/Image", {"data": np.array([1.0])}, "data is a list of uint8, not of float64"),
+        ("sensor_msgs/LaserScan", {"ranges": b"abcd"}, "ranges is a list of float32, not b'abcd'"),
+        ("sensor_msgs/LaserScan", {"ranges": np.array(["a"])}, "ranges is a list of float32, not of <U1"),
+        ("geometry_msgs/PoseWithCovariance", {"covariance": np.eye(5)}, "covariance has 36 elements, not 25"),
+        ("sensor_msgs/LaserScan", {"ranges": bytes(500_000)}, "…"),
+    ],
+)
+def test_what_a_program_gives_that_does_not_fit(kind: str, values: Any, error: str) -> None:
+    with pytest.raises(MessageError) as caught:
+        MessageType(kind).make(values)
+    assert error in str(caught.value)
+    assert len(str(caught.value)) < 300
 
 
 def test_fixed_arrays_have_their_size() -> None:

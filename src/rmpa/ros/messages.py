@@ -36,6 +36,8 @@ Plain: TypeAlias = Union[  # noqa: UP007 - | does not take the forward reference
 _TIMES: Final = {"time": "builtin_interfaces/msg/Time", "duration": "builtin_interfaces/msg/Duration"}
 _NANO: Final = 1_000_000_000
 _FLOATS: Final = frozenset(("float32", "float64"))
+_SHOWN: Final = 80
+"""Characters of a wrong value that an error shows."""
 _DTYPES: Final = {"bool": "bool_", "byte": "uint8", "char": "uint8"}
 
 
@@ -127,7 +129,7 @@ class MessageType:
         except Exception as error:
             raise MessageError(f"{len(raw)} bytes are not a {self.name}: {error}") from error
 
-    def make(self, values: Plain = None) -> Any:
+    def make(self, values: Plain | Mapping[str, object] = None) -> Any:
         """A message object from plain values; what is not given is 0, empty or false, as in ROS.
 
         Args:
@@ -155,10 +157,10 @@ class MessageType:
     def _class(self, name: str) -> Any:
         return self._store.types[_inner(name)]
 
-    def _make(self, name: str, values: Plain, path: str) -> object:
+    def _make(self, name: str, values: Plain | Mapping[str, object], path: str) -> object:
         fields = self._specifications[name].fields
         if values is None:
-            given: Mapping[str, Plain] = {}
+            given: Mapping[str, object] = {}
         elif isinstance(values, Mapping):
             given = values
         elif isinstance(values, list):
@@ -180,14 +182,18 @@ class MessageType:
             made["structure_needs_at_least_one_member"] = 0
         return self._class(name)(**made)
 
-    def _value(self, field: Field, value: Plain, path: str) -> object:
+    def _value(self, field: Field, value: Any, path: str) -> object:
         if not field.array:
             return self._scalar(field, value, path)
         if isinstance(value, str) and field.type in ("uint8", "char"):
             value = list(value.encode())
+        if not isinstance(value, list | str | None):
+            value = _sequence(field, value, path)
+            if not isinstance(value, list):
+                return value
         items = value if value is not None else []
         if not isinstance(items, list):
-            raise MessageError(f"{path} is a list of {field.type}, not {value!r}")
+            raise MessageError(f"{path} is a list of {field.type}, not {_short(value)}")
         if field.size and not items:
             items = [None] * field.size
         if field.size and len(items) != field.size:
@@ -199,12 +205,18 @@ class MessageType:
 
         return np.array(made, dtype=_DTYPES.get(field.type, field.type))
 
-    def _scalar(self, field: Field, value: Plain, path: str) -> object:
+    def _scalar(self, field: Field, value: Any, path: str) -> object:
         if field.type in _TIMES:
+            if getattr(value, "__msgtype__", None) == _TIMES[field.type]:
+                return value
             secs, nsecs = _time(value, path)
             return self._store.types[_TIMES[field.type]](sec=secs, nanosec=nsecs)
         if not field.primitive:
+            if getattr(value, "__msgtype__", None) == _inner(field.type):
+                return value
             return self._make(field.type, value, path)
+        if not isinstance(value, bool | int | float | str | list | dict | None) and hasattr(value, "item"):
+            value = value.item()  # numpy's
         return _primitive(field.type, value, path)
 
     def _plain(self, name: str, message: object) -> dict[str, Plain]:
@@ -255,6 +267,39 @@ def _primitive(kind: str, value: Plain, path: str) -> bool | float | str:
         if isinstance(value, int):
             raise MessageError(f"{path}: {value} does not fit {kind} ({low} to {high})")
     raise MessageError(f"{path} is a {kind}, not {value!r}")
+
+
+def _sequence(field: Field, value: Any, path: str) -> Any:
+    """What a program has for an array: numpy's array or bytes, ready to be sent; else as a list."""
+    if isinstance(value, tuple):
+        return list(value)
+    raw = isinstance(value, bytes | bytearray | memoryview) and field.type in ("uint8", "char", "byte", "int8")
+    if not raw and not (hasattr(value, "dtype") and value.ndim):
+        raise MessageError(f"{path} is a list of {field.type}, not {_short(value)}")
+    if not field.primitive or field.type in ("string", *_TIMES):
+        return list(value)
+    import numpy as np  # noqa: PLC0415 - see the module's docstring
+
+    kind = np.dtype(_DTYPES.get(field.type, field.type))
+    # A copy: the caller may go on to change what it gave.
+    given = np.frombuffer(value, kind).copy() if raw else np.asarray(value).ravel()
+    if field.size and given.size != field.size:
+        raise MessageError(f"{path} has {field.size} elements, not {given.size}")
+    if given.dtype == kind:
+        return given if raw else given.copy()
+    whole = kind.kind in "iu"
+    if given.dtype.kind not in ("biu" if whole or kind.kind == "b" else "biuf"):
+        raise MessageError(f"{path} is a list of {field.type}, not of {given.dtype}")
+    if whole and given.size:
+        low, high = _RANGES[field.type]
+        if int(given.min()) < low or int(given.max()) > high:
+            raise MessageError(f"{path}: {given.min()} to {given.max()} do not fit {field.type} ({low} to {high})")
+    return given.astype(kind)
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
 
 
 def _time(value: Plain, path: str) -> tuple[int, int]:
