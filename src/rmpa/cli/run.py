@@ -57,10 +57,21 @@ Examples:
 @click.option(
     "--set", "given", metavar="[RESOURCE.]PARAMETER=VALUE", multiple=True, help="Start with this value; repeatable."
 )
+@click.option(
+    "--state", metavar="DIR", help="Where it remembers. [env: RMPA_STATE_DIR; default: ~/.local/state/rmpa]"
+)
+@click.option("--no-state", is_flag=True, help="Remember nothing over a restart, and take up nothing.")
 @click.option("--log-level", default="info", type=click.Choice(["debug", "info", "warning", "error"]))
 @click.argument("options", nargs=-1, type=click.UNPROCESSED, metavar="[-- OPTIONS OF rmpa up]")
 def run(
-    file: str, name: str | None, master: str | None, given: tuple[str, ...], log_level: str, options: tuple[str, ...]
+    file: str,
+    name: str | None,
+    master: str | None,
+    given: tuple[str, ...],
+    state: str | None,
+    no_state: bool,
+    log_level: str,
+    options: tuple[str, ...],
 ) -> int:
     """Run the Smart Resources of FILE as nodes of this module's own core."""
     from pathlib import Path
@@ -71,16 +82,20 @@ def run(
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _told_to_end)
     path = Path(file)
+
+    def stores(module: str) -> Path | None:
+        return None if no_state else _stores(module, state)
+
     if master is not None:
         if options:
             raise ConfigError("--", "options of an agent, but --master starts none", "leave one of them out")
         resources = prepared(path, given)
-        return asyncio.run(_run(resources, master, None))
+        return asyncio.run(_run(resources, master, None, stores(name or resources[0].name)))
     resources = prepared(path, given) if name is None else []
     with ModuleAgent(name or resources[0].name, options) as agent:
         if not resources:  # the agent starts meanwhile
             resources = prepared(path, given)
-        return asyncio.run(_run(resources, agent.core(), agent))
+        return asyncio.run(_run(resources, agent.core(), agent, stores(name or resources[0].name)))
 
 
 def prepared(path: Path, given: Sequence[str] = ()) -> list[Resource]:
@@ -278,7 +293,18 @@ def _core_of(name: str) -> str | None:
     return None
 
 
-async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None) -> int:
+def _stores(module: str, state: str | None) -> Path | None:
+    """Where the resources of a module remember."""
+    from rmpa.resource.aio.store import module_dir, state_dir
+
+    directory = state_dir(os.environ, state)
+    if directory is None:
+        _log.warning("! there is no home to remember anything in; set RMPA_STATE_DIR, or --no-state")
+        return None
+    return module_dir(directory, module)
+
+
+async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None, stores: Path | None = None) -> int:
     from rmpa.resource.aio.member import run_all
 
     stop = asyncio.Event()
@@ -302,7 +328,7 @@ async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None) -
 
     failure: RmpaError | None = None
     try:
-        await run_all(resources, uri, stop, ready)
+        await run_all(resources, uri, stop, ready, stores)
     except RmpaError as error:
         failure = error
     finally:

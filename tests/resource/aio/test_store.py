@@ -8,7 +8,7 @@ import pytest
 
 from rmpa.core import limits
 from rmpa.resource.aio import store as store_module
-from rmpa.resource.aio.store import Store, state_dir, store_path
+from rmpa.resource.aio.store import Store, module_dir, state_dir
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -18,7 +18,7 @@ GAIN, DRIVER = ("parameter", "gain"), ("requirement", "/driver")
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    return store_path(tmp_path / "state", "robot1", "sonar")
+    return module_dir(tmp_path / "state", "robot1") / "sonar.sqlite"
 
 
 async def until(fits: object) -> None:
@@ -40,7 +40,7 @@ def test_where_a_store_lies(tmp_path: Path) -> None:
     assert str(state_dir({"HOME": "/h", "RMPA_STATE_DIR": "/r"})) == "/r"
     assert str(state_dir({"RMPA_STATE_DIR": "/r"}, "/s")) == "/s"
     assert state_dir({}) is None
-    assert store_path(tmp_path, "../a b", "sonar") == tmp_path / "_a_b" / "sonar.sqlite"
+    assert module_dir(tmp_path, "../a b") == tmp_path / "_a_b"
 
 
 async def test_what_is_put_survives_and_what_is_taken_back_does_not(path: Path) -> None:

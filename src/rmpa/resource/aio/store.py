@@ -79,10 +79,9 @@ def state_dir(environ: Mapping[str, str], setting: str | None = None) -> Path | 
     return None
 
 
-def store_path(directory: Path, module: str, resource: str) -> Path:
-    """The file of one resource of one module."""
-    safe = re.sub(r"[^\w.-]", "_", module).lstrip(".") or "_"
-    return directory / safe / f"{resource}.sqlite"
+def module_dir(directory: Path, module: str) -> Path:
+    """The folder of one module's stores; each is named as its resource, with ``.sqlite``."""
+    return directory / (re.sub(r"[^\w.-]", "_", module).lstrip(".") or "_")
 
 
 class DamagedStore(Exception):  # noqa: N818 - reads as what happened; never leaves this file
