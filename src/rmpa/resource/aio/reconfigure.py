@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.core.errors import LocalProtocolError, PeerRefused, RmpaError
+from rmpa.core.errors import ConfigError, LocalProtocolError, RmpaError
 from rmpa.resource.aio.runtime import RuntimePart
 from rmpa.resource.reconfigure import (
     CONFIG_TYPE,
@@ -34,9 +34,11 @@ if TYPE_CHECKING:
     from rmpa.resource.aio.adapt import Adapter
     from rmpa.resource.aio.contexts import Contexts
     from rmpa.resource.aio.runtime import Runtime
+    from rmpa.resource.aio.tasks import Tasks
     from rmpa.resource.declare import Parameter, ParameterValue
     from rmpa.ros.aio.topics import Publisher
 
+_WHO: Final = "configuration"
 _log = logging.getLogger(__name__)
 
 
@@ -45,12 +47,14 @@ class Reconfigure(RuntimePart):
 
     Args:
         runtime: Of the resource.
+        tasks: Paused while several parameters are set.
         adapter: Takes a profile that is chosen by hand.
         contexts: Take a context that is.
     """
 
-    def __init__(self, runtime: Runtime, adapter: Adapter, contexts: Contexts) -> None:
+    def __init__(self, runtime: Runtime, tasks: Tasks, adapter: Adapter, contexts: Contexts) -> None:
         self._runtime = runtime
+        self._tasks = tasks
         self._adapter = adapter
         self._contexts = contexts
         self._known = entries(runtime.resource)
@@ -58,6 +62,7 @@ class Reconfigure(RuntimePart):
         self._said: Mapping[str, ParameterValue] = {}
         self._mirrored: dict[str, ParameterValue] = {}
         self._mirror: asyncio.Task[None] | None = None
+        self._quiet = False
         self._one = asyncio.Lock()
 
     @property
@@ -99,21 +104,27 @@ class Reconfigure(RuntimePart):
         """Set parameters together.
 
         Raises:
-            ConfigError: One of them cannot be; nothing is changed then.
-            PeerRefused: The profile or context could not be applied; what was chosen before is chosen again.
+            ConfigError: One of them cannot be, or the profile not be applied; nothing is changed then.
+            PeerRefused: The context could not begin; likewise.
         """
         wanted = checked(values, self._known, self._runtime.resource.parameters)
         async with self._one:
             if self._updates is None:
                 raise LocalProtocolError(f"resource {self._runtime.resource.name} ends")
-            if wanted.get(CONTEXT, self._contexts.chosen) != self._contexts.chosen:
-                await self._contexts.choose(str(wanted[CONTEXT]))
-            for name, value in wanted.items():
-                if name not in (PROFILE, CONTEXT):
-                    self._runtime.set_parameter(name, value)
-            if PROFILE in wanted:
-                await self._choose(str(wanted[PROFILE]))
-            self.say()
+            self._quiet = True  # what is set together is said together
+            try:
+                before = self._contexts.chosen
+                if wanted.get(CONTEXT, before) != before:
+                    await self._contexts.choose(str(wanted[CONTEXT]))
+                try:
+                    await self._choose(str(wanted.get(PROFILE, self._adapter.loop.pinned)))
+                except RmpaError:
+                    await self._contexts.choose(before)
+                    raise
+                await self._set_parameters({n: v for n, v in wanted.items() if n not in (PROFILE, CONTEXT)})
+            finally:
+                self._quiet = False
+                self.say()
 
     def parameter_changed(self, parameter: Parameter) -> None:  # noqa: ARG002 - all are said together
         """Say it, whoever changed it."""
@@ -122,7 +133,7 @@ class Reconfigure(RuntimePart):
     def say(self) -> None:
         """Publish the configuration if it is another one, and mirror it at the parameter server."""
         values = self.values
-        if self._updates is None or values == self._said:
+        if self._updates is None or self._quiet or values == self._said:
             return
         self._said = values
         self._updates.publish(self._updates.make(config(values, self._known)))
@@ -135,6 +146,17 @@ class Reconfigure(RuntimePart):
         await self.set(read_config(request.config))
         return {"config": config(self.values, self._known)}
 
+    async def _set_parameters(self, values: Mapping[str, ParameterValue]) -> None:
+        """Set declared parameters; several of them between two runs of the tasks, so that none sees half of them."""
+        if len(values) > 1:
+            await self._tasks.pause(_WHO)
+        try:
+            for name, value in values.items():
+                self._runtime.set_parameter(name, value)
+        finally:
+            if len(values) > 1:
+                self._tasks.resume(_WHO)
+
     async def _choose(self, profile: str) -> None:
         loop, before = self._adapter.loop, self._adapter.loop.pinned
         if profile == before and (not profile or profile == loop.profile):
@@ -145,7 +167,7 @@ class Reconfigure(RuntimePart):
             return
         why = next((s.excluded for s in self._adapter.explain() if s.profile == profile), "") or "another was taken"
         self._adapter.pin(before)
-        raise PeerRefused(f"profile {profile}", f"it could not be applied: {why}", "what was chosen before stays")
+        raise ConfigError(f"profile {profile}", f"it could not be applied: {why}", "what was chosen before stays")
 
     def _acted(self, _action: Action) -> None:
         self.say()

@@ -1,0 +1,214 @@
+"""``rmpa profile list|get|set|explain``."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rmpa.cli.master import choose_master
+from rmpa.cli.options import agent_option, json_option, master_option
+from rmpa.cli.output import Column, print_json, print_table, printable
+from rmpa.cli.resources_seen import decision_of, known_name, look_around
+from rmpa.core.errors import ConfigError, RmpaError
+
+if TYPE_CHECKING:
+    from rmpa.cli.resources_seen import Room, Seen
+    from rmpa.resource.descriptor import Descriptor
+
+
+def shown(value: object, unit: str) -> str:
+    """A value with its unit; ``-`` for none."""
+    if value is None:
+        return "-"
+    return f"{value:.6g} {unit}".rstrip() if isinstance(value, int | float) else str(value)
+
+
+def offers(descriptor: Descriptor, values: dict[str, float | str]) -> str:
+    """What a profile offers, in one line."""
+    units = {attribute.name: attribute.unit for attribute in descriptor.attributes}
+    return ", ".join(f"{name} {shown(value, units.get(name, ''))}" for name, value in values.items())
+
+
+async def _decision(room: Room, one: Seen) -> dict[str, Any]:
+    (said,) = await room.texts([one], "decision")
+    if not said.get(one):
+        raise RmpaError(f"{one} has decided nothing yet; is it active?")
+    return decision_of(said[one])
+
+
+@click.command("list", epilog="\b\nExamples:\n  rmpa profile list\n  rmpa profile list base:/sonar --json\n")
+@click.argument("resource", required=False)
+@json_option
+@agent_option
+@master_option
+def list_(resource: str | None, as_json: bool, agent: str | None, master: str | None) -> None:
+    """List a RESOURCE's profiles and what they offer."""
+
+    async def body(room: Room) -> None:
+        one = room.pick(resource)
+        decision = await _decision(room, one)
+        runs, chosen = decision.get("profile", ""), decision.get("chosen", "")
+        left_out = {str(s.get("profile")): str(s.get("excluded", "")) for s in decision.get("scores", ())}
+        if as_json:
+            print_json(
+                {
+                    "resource": one.path,
+                    "peer": one.peer,
+                    "profile": runs,
+                    "chosen": chosen,
+                    "profiles": one.descriptor.profiles,
+                    "left_out": {name: why for name, why in left_out.items() if why},
+                }
+            )
+            return
+        rows, colours = [], []
+        for each in one.descriptor.profiles:
+            why = left_out.get(each.name, "")
+            state = ("runs, by hand" if each.name == chosen else "runs") if each.name == runs else ""
+            colours.append("green" if state else "yellow" if why else "")
+            notes = "; ".join(filter(None, ("best effort" if each.best_effort else "", each.description)))
+            cells = (
+                each.name,
+                state or ("left out" if why else "-"),
+                offers(one.descriptor, each.offers) or "-",
+                f"{each.cost:g}",
+                why or notes,
+            )
+            rows.append(tuple(map(printable, cells)))
+        columns = (Column("PROFILE"), Column("STATE"), Column("OFFERS"), Column("COST", right=True), Column("NOTES"))
+        print_table(columns, rows, colours=colours)
+
+    asyncio.run(look_around(choose_master(master, agent, os.environ), body))
+
+
+@click.command(epilog="\b\nExamples:\n  rmpa profile get /sonar\n")
+@click.argument("resource", required=False)
+@json_option
+@agent_option
+@master_option
+def get(resource: str | None, as_json: bool, agent: str | None, master: str | None) -> None:
+    """Print the profile of a RESOURCE that runs."""
+
+    async def body(room: Room) -> None:
+        one = room.pick(resource)
+        decision = await _decision(room, one)
+        if as_json:
+            said = {key: decision.get(key, "") for key in ("profile", "applying", "chosen")}
+            print_json({"resource": one.path, "peer": one.peer, **said})
+        else:
+            click.echo(printable(str(decision.get("profile", ""))))
+
+    asyncio.run(look_around(choose_master(master, agent, os.environ), body))
+
+
+@click.command(
+    "set",
+    epilog="\b\nExamples:\n  rmpa profile set /sonar fine\n  rmpa profile set base:/sonar --auto\n",
+)
+@click.argument("resource")
+@click.argument("profile", required=False)
+@click.option("--auto", is_flag=True, help="Let the resource decide again.")
+@agent_option
+@master_option
+def set_(resource: str, profile: str | None, auto: bool, agent: str | None, master: str | None) -> None:
+    """Choose the PROFILE of a RESOURCE by hand; returns when it runs.
+
+    It runs whatever clients ask, until --auto. If it cannot be applied, what was chosen before stays.
+    """
+    if (profile is None) != auto:
+        raise ConfigError("PROFILE", "say which one, or --auto", "one of both")
+
+    async def body(room: Room) -> None:
+        one = room.pick(resource)
+        if profile is not None:
+            known_name("profile", profile, (each.name for each in one.descriptor.profiles))
+        await room.configure(one, {"profile": profile or ""})
+
+    asyncio.run(look_around(choose_master(master, agent, os.environ), body))
+
+
+@click.command(
+    epilog="""\
+\b
+D is the distance of a profile from what is asked: sqrt(sum(weight * shortfall^2) / sum(weight)) over its terms,
+and a little for its cost. A shortfall of 1 is the tolerance of the attribute, or the range over all profiles. The
+smallest D that falls short of nothing hard is taken.
+
+\b
+Examples:
+  rmpa profile explain /sonar
+  rmpa profile explain base:/sonar --json
+"""
+)
+@click.argument("resource", required=False)
+@json_option
+@agent_option
+@master_option
+def explain(resource: str | None, as_json: bool, agent: str | None, master: str | None) -> None:
+    """Show each term of a RESOURCE's last decision."""
+
+    async def body(room: Room) -> None:
+        one = room.pick(resource)
+        decision = await _decision(room, one)
+        if as_json:
+            print_json({"resource": one.path, "peer": one.peer, **decision})
+        else:
+            _print_explained(one, decision)
+
+    asyncio.run(look_around(choose_master(master, agent, os.environ), body))
+
+
+def _print_explained(one: Seen, decision: dict[str, Any]) -> None:
+    runs, chosen = str(decision.get("profile", "")), str(decision.get("chosen", ""))
+    clients = ", ".join(map(str, decision.get("clients", ()))) or "nobody"
+    click.echo(printable(f"{one}: profile {runs or 'none'}" + (", chosen by hand" if chosen else "")))
+    click.echo(printable(f"asked by {clients}"))
+    for conflict in decision.get("conflicts", ()):
+        click.echo(printable(f"conflict: {conflict}"))
+    if decision.get("alarm"):
+        click.echo(printable(f"alarm: {decision['alarm']}"))
+    if decision.get("reaction") is not None:
+        click.echo(f"last reconfiguration took {decision['reaction']:.3g} s")
+    click.echo()
+    units = {attribute.name: attribute.unit for attribute in one.descriptor.attributes}
+    rows, colours = [], []
+    for score in decision.get("scores", ()):
+        name = str(score.get("profile"))
+        head = (name, _verdict(score, runs), f"{score.get('distance', 0.0):.4g}")
+        terms: list[dict[str, Any]] = score.get("terms") or [{}]
+        for term in terms:
+            attribute = str(term.get("attribute", "-"))
+            shortfall = term.get("delta")
+            cells = (
+                *head,
+                attribute,
+                f"{term.get('wanted', '-')}" + (" hard" if term.get("hard") else ""),
+                shown(term.get("offered"), units.get(attribute, "")),
+                f"{shortfall:.4g}" if shortfall is not None else "-",
+                f"{term['weight']:g}" if "weight" in term else "-",
+            )
+            rows.append(tuple(map(printable, cells)))
+            colours.append("green" if name == runs else "yellow" if score.get("excluded") else "")
+            head = ("", "", "")
+    columns = (
+        Column("PROFILE"),
+        Column("VERDICT"),
+        Column("D", right=True),
+        Column("ATTRIBUTE"),
+        Column("WANTED"),
+        Column("OFFERED"),
+        Column("SHORTFALL", right=True),
+        Column("WEIGHT", right=True),
+    )
+    print_table(columns, rows, colours=colours)
+
+
+def _verdict(score: dict[str, Any], runs: str) -> str:
+    if score.get("excluded"):
+        return f"left out: {score['excluded']}"
+    if score.get("profile") == runs:
+        return "runs" if score.get("feasible") else "runs, best there is"
+    return "can serve" if score.get("feasible") else "falls short"

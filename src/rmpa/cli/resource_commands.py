@@ -1,0 +1,197 @@
+"""``rmpa resource list|info``."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from rmpa.cli.master import choose_master
+from rmpa.cli.options import agent_option, json_option, master_option
+from rmpa.cli.output import Column, print_json, print_table, printable, warn
+from rmpa.cli.profile_commands import offers, shown
+from rmpa.cli.resources_seen import look_around
+from rmpa.resource.attributes import MEASURED
+from rmpa.ros.diagnostic_array import ARRAY_TYPE, Level
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from rmpa.cli.resources_seen import Room, Seen
+    from rmpa.resource.descriptor import Descriptor, ParameterDescriptor, TopicDescriptor
+
+_COLOURS: Final = {"active": "green", "inactive": "yellow", "unconfigured": "yellow", "finalized": "red"}
+
+
+@click.command("list", epilog="\b\nExamples:\n  rmpa resource list\n  rmpa resource list --json | jq -r '.[].name'\n")
+@json_option
+@agent_option
+@master_option
+def list_(as_json: bool, agent: str | None, master: str | None) -> None:
+    """List the resources of this module, and those of peers with the peers' names."""
+
+    async def body(room: Room) -> None:
+        states, profiles, contexts = await room.texts(room.seen, "state", "profile", "context")
+        if as_json:
+            print_json(
+                [
+                    {
+                        "name": one.path,
+                        "peer": one.peer,
+                        "role": one.descriptor.role,
+                        "physical": one.descriptor.physical,
+                        "description": one.descriptor.description,
+                        "state": states.get(one),
+                        "profile": profiles.get(one),
+                        "context": contexts.get(one),
+                    }
+                    for one in room.seen
+                ]
+            )
+            return
+        rows = [
+            tuple(
+                printable(cell)
+                for cell in (
+                    str(one),
+                    states.get(one) or "does not answer",
+                    one.descriptor.role,
+                    "device" if one.descriptor.physical else "simulated",
+                    profiles.get(one) or "-",
+                    contexts.get(one) or "-",
+                    one.descriptor.description,
+                )
+            )
+            for one in room.seen
+        ]
+        titles = ("RESOURCE", "STATE", "ROLE", "KIND", "PROFILE", "CONTEXT", "DESCRIPTION")
+        colours = [_COLOURS.get(states.get(one, ""), "") for one in room.seen]
+        print_table(tuple(map(Column, titles)), rows, colours=colours)
+
+    asyncio.run(look_around(choose_master(master, agent, os.environ), body))
+
+
+@click.command(epilog="\b\nExamples:\n  rmpa resource info /sonar\n  rmpa resource info base:/arm --json\n")
+@click.argument("resource", required=False)
+@json_option
+@agent_option
+@master_option
+def info(resource: str | None, as_json: bool, agent: str | None, master: str | None) -> None:
+    """Show all of a RESOURCE: its topics, parameters, qualities, profiles, contexts, tasks and clients."""
+
+    async def body(room: Room) -> None:
+        one = room.pick(resource)
+        texts, values, quality, responses = await asyncio.gather(
+            room.texts([one], "state", "profile", "context"),
+            room.configuration(one),
+            room.hear([one], "quality", ARRAY_TYPE),
+            room.hear([one], "responses", ARRAY_TYPE),
+        )
+        state, profile, context = (said.get(one, "") for said in texts)
+        health, *_ = [*_statuses(quality.get(one)), None]
+        about: dict[str, Any] = {
+            "name": one.path,
+            "peer": one.peer,
+            "node": one.caller,
+            "state": state,
+            "profile": profile,
+            "context": context,
+            "health": health,
+            "parameters": values,
+            "clients": _statuses(responses.get(one)),
+        }
+        if as_json:
+            print_json(about | {"descriptor": one.descriptor})
+        else:
+            _print_info(one, about)
+
+    asyncio.run(look_around(choose_master(master, agent, os.environ), body))
+
+
+def _statuses(message: Any) -> list[dict[str, Any]]:
+    """The elements of a ``DiagnosticArray``."""
+    if message is None:
+        return []
+    return [
+        {
+            "name": str(status.name),
+            "level": Level(int(status.level) & 3).name,
+            "message": str(status.message),
+            "values": {str(pair.key): str(pair.value) for pair in status.values},
+        }
+        for status in message.status
+    ]
+
+
+def _print_info(one: Seen, about: dict[str, Any]) -> None:
+    said, health = one.descriptor, about["health"]
+    kind = "device" if said.physical else "simulated"
+    _line("Resource", f"{one} ({said.role}, {kind})")
+    if said.description:
+        _line("Description", said.description)
+    if one.peer is not None:
+        _line("Node", f"{said.node} of peer {one.peer}, by its proxy {one.caller}")
+    _line("State", about["state"] or "does not answer")
+    _line("Profile", about["profile"] or "none runs")
+    if said.contexts:
+        _line("Context", about["context"] or "none")
+    if health is None:
+        warn(f"{printable(str(one))} has sent no quality while we listened")
+    else:
+        _line("Health", f"{health['level']}: {health['message']}")
+    _topics("OUTPUT", said.outputs)
+    _topics("INPUT", said.inputs)
+    _table(
+        ("PARAMETER", "VALUE", "RANGE", "DESCRIPTION"), (_parameter(p, about["parameters"]) for p in said.parameters)
+    )
+    _table(("QUALITY", "NOW", "BETTER", "CLASS"), _qualities(said, health["values"] if health else {}))
+    _table(
+        ("PROFILE", "COST", "OFFERS", "DESCRIPTION"),
+        ((p.name, f"{p.cost:g}", offers(said, p.offers) or "-", p.description) for p in said.profiles),
+    )
+    _table(("CONTEXT", "WHEN"), ((c.name, c.when or "by hand") for c in said.contexts))
+    _table(("TASK", "RUNS"), ((t.name, f"{t.rate:g} Hz" if t.rate else f"on {t.on}") for t in said.tasks))
+    _table(
+        ("CLIENT", "IS TOLD", "ASKS"),
+        (
+            (c["name"], f"{c['level']}: {c['message']}", "; ".join(f"{k} {v}" for k, v in c["values"].items()) or "-")
+            for c in about["clients"]
+        ),
+    )
+
+
+def _parameter(one: ParameterDescriptor, values: dict[str, Any]) -> Sequence[str]:
+    low, high = ("" if bound is None else f"{bound:g}" for bound in (one.low, one.high))
+    within = " | ".join(map(str, one.choices)) or (f"{low} .. {high}" if low or high else one.type)
+    value = values.get(one.name, one.default)
+    text = str(value).lower() if isinstance(value, bool) else shown(value, one.unit)
+    return one.name, text, within, one.description
+
+
+def _qualities(said: Descriptor, values: dict[str, str]) -> list[Sequence[str]]:
+    """What is declared, and what is measured."""
+    return [
+        (each.name, values.get(each.name, "not measured"), each.better, each.category)
+        for each in said.attributes
+        if each.name in values or each.name.rpartition(".")[2] not in MEASURED
+    ]
+
+
+def _topics(title: str, topics: Sequence[TopicDescriptor]) -> None:
+    _table(
+        (title, "TYPE", "CONTRACT"),
+        ((t.topic, t.type, ", ".join(f"{key} {value}" for key, value in t.contract.items()) or "-") for t in topics),
+    )
+
+
+def _line(title: str, text: str) -> None:
+    click.echo(printable(f"{title}: {text}"))
+
+
+def _table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    made = [tuple(map(printable, row)) for row in rows]
+    if made:
+        click.echo()
+        print_table(tuple(map(Column, titles)), made)
