@@ -52,8 +52,8 @@ INT_MAX: Final = 2**31 - 1
 _Function = TypeVar("_Function", bound=Callable[..., object])
 RESERVED: Final = frozenset(
     {
-        "alarms", "context", "decision", "descriptor", "parameter_descriptions", "parameter_updates", "profile",
-        "quality", "requirements", "responses", "set_context", "set_parameters", "state",
+        "alarms", "context", "decision", "descriptor", "observed", "parameter_descriptions", "parameter_updates",
+        "profile", "quality", "requirements", "responses", "set_context", "set_parameters", "state",
     }
 )  # fmt: skip
 """Names below a resource's node that are its own topics and services, and parameters with a meaning of their own."""

@@ -30,6 +30,7 @@ from rmpa.resource.adaptation import (
 )
 from rmpa.resource.aio.runtime import RuntimePart
 from rmpa.resource.decision import Decider, wanted
+from rmpa.resource.observed import Missing, Observed
 from rmpa.resource.quality import ObservedQuality, TopicQuality
 from rmpa.resource.remembered import Asked, Remembered
 from rmpa.resource.requirement_text import parse_requirement
@@ -114,6 +115,10 @@ class Adapter(RuntimePart):
         """By client: its request's stamp, or empty."""
         self._expiries: dict[tuple[str, str], float] = {}
         """By client and stamp: when a request expires, so that the same message, latched, does not begin anew."""
+        self.on_missing: list[Callable[[str, bool], None]] = []
+        """Called when something that is needed is missing (true), and when it is back."""
+        self._observed_by = Observed(self._attributes, resource.name, limits.RESOURCE_REPORT_WINDOWS * window)
+        self._missing = Missing()
         self._grace: dict[str, float] = {}
         """By client that asked before a restart: until when it may come back."""
         self.troubles: Callable[[], tuple[list[str], list[str]]] = lambda: ([], [])
@@ -141,6 +146,7 @@ class Adapter(RuntimePart):
         for name in ("profile", "decision"):
             await self._runtime.say(name, "")
         self._asking = await node.subscribe(f"{node.name}/requirements", ARRAY_TYPE, self._asked)
+        await node.subscribe(f"{node.name}/observed", ARRAY_TYPE, self._told_of)
         self._recall(now)
         self._bar()
         self._act(self.loop.pin(self.chosen, now) if self.chosen else self.loop.start(now))
@@ -195,11 +201,35 @@ class Adapter(RuntimePart):
         for name, quality in self._observed.items():
             if (seen := quality.window()) is not None:
                 measured[name] = seen
+        self._observed_by.judge(measured, self.loop.requirements, now)
         self._measured = measured
+        for text, gone in self._missing.look(self.troubles()[0]):
+            self._miss(text, gone=gone)
         self._bar()
         self._act(self.loop.window(measured, now))
         self._publish_quality()
         self._respond()
+
+    def _told_of(self, message: Received) -> None:
+        """A client says what it observes."""
+        values = [(str(pair.key), str(pair.value)) for status in message.message.status for pair in status.values]
+        try:
+            self._observed_by.told(message.caller_id, values, self._loop.time())
+        except ConfigError as error:
+            known = self._answers.get(message.caller_id)
+            if known is None or known.message != str(error):  # it will say so once a second
+                self.refuse(message.caller_id, str(error))
+
+    def _miss(self, text: str, *, gone: bool) -> None:
+        if gone:
+            _log.warning("! %s: %s", self._runtime.node.name, text)
+        else:
+            _log.info("= %s: over: %s", self._runtime.node.name, text)
+        level, said = (Level.STALE, text) if gone else (Level.OK, f"over: {text}")
+        values = {"cleared": str(not gone).lower()}
+        self._publish("alarms", [self._status(level, self._runtime.resource.name, said, values)])
+        for hear in self.on_missing:
+            hear(text, gone)
 
     # --- clients ------------------------------------------------------------------------------------------------
 
@@ -370,6 +400,7 @@ class Adapter(RuntimePart):
                     self._publish_alarm(action.alarm, cleared=True)
                 case Reacted():
                     self.reaction = action.reaction
+                    _log.info("= %s: %s runs, after %.3g s", self._runtime.node.name, action.profile, action.reaction)
             for listener in self.listeners:
                 listener(action)
         if actions:
@@ -403,6 +434,7 @@ class Adapter(RuntimePart):
             return  # it took so long that another one is applied; that one opens what is closed
         self._runtime.release(drop=bool(why))
         self._tasks.resume()
+        self._observed_by.clear()
         now = self._loop.time()
         self._act(self.loop.failed(profile, why, now) if why else self.loop.applied(profile, now))
         self._respond()
@@ -499,6 +531,8 @@ class Adapter(RuntimePart):
 
     def _publish_alarm(self, alarm: Alarm, *, cleared: bool) -> None:
         values = {"before": alarm.before, "after": alarm.after, "cleared": str(cleared).lower()}
+        if cleared and self.reaction is not None:
+            values["reaction"] = f"{self.reaction:.6g} s"
         for short in alarm.shortfalls:
             attribute = self._attributes[short.attribute]
             given = attribute.show(short.given) if short.given is not None else "nothing"
@@ -515,7 +549,8 @@ class Adapter(RuntimePart):
         return f"non-adaptable: no profile gives {names} as asked; {alarm.after} is the best there is"
 
     def _respond(self) -> None:
-        """Tell each client what it asked and what it is given."""
+        """Tell each client what it asked and what it is given, and everybody how the profiles do now."""
+        self._say()
         for hear in self.on_asked:
             hear()
         statuses = []
@@ -524,7 +559,8 @@ class Adapter(RuntimePart):
             values, short = {}, []
             for name, bound in requirement.bounds.items():
                 attribute = self._attributes[name]
-                given = self._measured.get(name)
+                seen = self._observed_by.given(client, name)
+                given = seen if seen is not None else self._measured.get(name)
                 shown = attribute.show(given) if given is not None else "not measured yet"
                 values[name] = f"wanted {wanted(attribute, bound)}, given {shown}"
                 if given is not None and not bound.met_by(attribute, given):

@@ -58,6 +58,7 @@ class ResourceClient:
         self._node = node
         self.resource = resource if resource.startswith("/") else f"/{resource}"
         self._asking: Publisher | None = None
+        self._observing: Publisher | None = None
         self._responses: Subscriber | None = None
         self._answer: Answer | None = None
         self._mark = "none yet"
@@ -77,7 +78,7 @@ class ResourceClient:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for topic in (self._asking, self._responses):
+        for topic in (self._asking, self._observing, self._responses):
             if topic is not None:
                 await topic.close()
 
@@ -118,6 +119,24 @@ class ResourceClient:
         if self._answer.level is Level.ERROR and "non-adaptable" not in self._answer.message:
             raise PeerRefused(f"resource {self.resource}", self._answer.message)
         return self._answer
+
+    async def observe(self, **values: float | str) -> None:
+        """Say what this client observes of what it is given: ``await sonar.observe(rate="12 Hz")``, again and again.
+
+        The resource measures what it sends; what comes here may be less, and that is what it is to adapt to. It
+        counts beside a requirement of the same client, for three of the resource's quality windows.
+
+        Args:
+            values: By attribute, as in ``require``; a number is in the attribute's unit.
+
+        Raises:
+            UnreachableError: The master does not answer.
+        """
+        if self._observing is None:
+            self._observing = await self._node.advertise(f"{self.resource}/observed", ARRAY_TYPE)
+        pairs: Any = [{"key": key.replace("__", "."), "value": str(value)} for key, value in values.items()]
+        status: Any = [{"name": self._node.name, "values": pairs}]
+        self._observing.publish(self._observing.make({"header": {"stamp": time.time()}, "status": status}))
 
     def release(self) -> None:
         """Ask for nothing any more."""

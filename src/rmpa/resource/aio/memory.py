@@ -77,6 +77,7 @@ class Memory(RuntimePart):
         adapter.listeners.append(self._acted)
         adapter.on_window.append(self._window)
         adapter.on_asked.append(self._asked)
+        adapter.on_missing.append(self._missing)
         descriptor = self._runtime.descriptor
         self._store.descriptor(descriptor.node, descriptor.serialize(), time.time_ns())
         for name, parameter in self._runtime.resource.parameters.items():
@@ -133,6 +134,9 @@ class Memory(RuntimePart):
             case Reacted():
                 details = {"profile": action.profile, "reaction": round(action.reaction, 6)}
                 self._event("reacted", Level.OK, f"{action.profile} runs", details)
+
+    def _missing(self, text: str, gone: bool) -> None:
+        self._event("alarm" if gone else "over", Level.STALE if gone else Level.OK, text, {"kind": "missing"})
 
     def _event(self, event: str, level: Level, message: str, details: object) -> None:
         self._store.event(time.time_ns(), event, int(level), message, _json(details))
