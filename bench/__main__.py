@@ -13,7 +13,9 @@ from rich.console import Console
 
 from bench import (
     bed,
+    bookkeeping,
     crosstraffic,
+    decision,
     idle,
     joining,
     load,
@@ -26,6 +28,7 @@ from bench import (
     services,
     startup,
     storm,
+    tasks,
     throughput,
 )
 from tests.interop import namespaces
@@ -82,6 +85,11 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
         "what it costs to follow a real roscore, and how soon changes are seen", roscore.measure, (bed.why_no_ros,)
     ),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),
+    "tasks": Measurement(
+        "how evenly a resource's task runs, beside loops of rospy and roscpp", tasks.measure, (bed.why_no_ros,)
+    ),
+    "decision": Measurement("how long a resource takes to decide", decision.measure, needs=()),
+    "bookkeeping": Measurement("what measuring quality costs, and how soon a resource adapts", bookkeeping.measure),
 }
 
 

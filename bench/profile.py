@@ -122,7 +122,7 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
         way = schedule.agents(bed)
         stream = way.stream(bed, _TOPIC)
         pids = {f"agent {number}": agent.pid for number, agent in enumerate(way.agents, 1)}
-        costs = list(_costs(stream, pids, plan))
+        costs = list(relay_costs(stream, pids, plan))
         for name, pid in pids.items():
             console.print(f"looking into {name}", style="dim")
             _perf(profiles[name], pid, stream, plan.profiled, bed.home)
@@ -147,7 +147,8 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
 # --- the cost -------------------------------------------------------------------------------------------------------
 
 
-def _costs(stream: schedule.Stream, pids: Mapping[str, int], plan: Plan) -> Iterator[Cost]:
+def relay_costs(stream: schedule.Stream, pids: Mapping[str, int], plan: Plan) -> Iterator[Cost]:
+    """What a relayed message costs each agent, at each of the plan's rates."""
     stream.run(_SIZE, _USUAL, 1.0)
     meter = Meter(pids)
     time.sleep(plan.idle)

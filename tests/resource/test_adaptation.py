@@ -319,3 +319,12 @@ def _any_requirement(chance: random.Random, now: float) -> Requirement:
     return Requirement(
         chance.choice(("/a", "/b", "/c")), bounds, chance.randrange(3), now + chance.choice((1.0, 50.0))
     )
+
+
+def test_a_reaction_counts_from_the_beginning_of_the_first_bad_window() -> None:
+    one = running(20.0, FAST, MIDDLE)
+    assert one.profile == "middle"
+    one.window({"rate": 20.0}, 2.0)
+    one.window({"rate": 9.0}, 3.0)  # it fell at 2.3, say
+    assert applies(one.window({"rate": 9.0}, 4.0)) == ["fast"]
+    assert one.applied("fast", 4.5)[0] == Reacted("fast", 2.5)

@@ -133,7 +133,7 @@ class Reacted:
 
     Args:
         profile: The one that runs now.
-        reaction: Seconds since the first window, or request, that called for it.
+        reaction: Seconds since the request that called for it, or since the first window that did so began.
     """
 
     profile: str
@@ -171,7 +171,7 @@ class _Knowledge:
     """Profiles whose preconditions do not hold, and why."""
     troubles: dict[str, _Trouble] = field(default_factory=dict)
     windows: deque[tuple[float, tuple[Shortfall, ...]]] = field(default_factory=deque)
-    """When each of the last windows ended, and what fell short in it; since the profile became active."""
+    """When each of the last windows began, and what fell short in it; since the profile became active."""
 
 
 class Adaptation:
@@ -196,6 +196,7 @@ class Adaptation:
         self._pinned = ""
         self._before = ""
         self._since = -math.inf
+        self._window: float | None = None
         self._deadline = math.inf
         self._caused = math.inf
         self._alarm: Alarm | None = None
@@ -295,11 +296,13 @@ class Adaptation:
 
     def window(self, measured: Mapping[str, Value], now: float) -> list[Action]:
         """A window of quality has ended under the active profile; what was not measured is not judged."""
+        began = max(self._window, self._since) if self._window is not None else now
+        self._window = now
         if self._state is not ProfileState.ACTIVE:
             return []
         short = self._shortfalls(measured)
         windows = self._knows.windows
-        windows.append((now, short))
+        windows.append((began, short))
         while len(windows) > self._settings.windows:
             windows.popleft()
         violated = [(at, short) for at, short in windows if short]
