@@ -1,97 +1,47 @@
 """The module *base*: a simulated Turtlebot that drives as the Velocity Order says and tells its odometry.
 
-rmpa up --name base &
-python base.py
+rmpa run base.py
 """
 
-from __future__ import annotations
-
-import math
 import time
-from typing import TYPE_CHECKING
+from typing import Any
 
-from mapping import MAX_SPEED, MAX_TURN, limited
-from module import arguments, joined, run
-from rate import Rate
-from unicycle import Pose
+from mapping import MAX_SPEED
+from rmpa.resource import Resource, at_most
+from robot import Turtlebot, odometry
 
-if TYPE_CHECKING:
-    from rmpa.ros.aio.node import Received
-    from rmpa.ros.messages import Plain
-
-RATE = 50
-"""Hz; a Turtlebot's."""
-ORDER_TIMEOUT = 0.5
-"""Seconds: a robot that hears no order for this long stops."""
-SURE, UNKNOWN = 1e-4, 1e6
-"""Variances: of what wheels measure, and of what a robot on the floor cannot know (height, roll, pitch)."""
-COVARIANCE: list[Plain] = [
-    variance if row == column else 0.0
-    for row, variance in enumerate([SURE, SURE, UNKNOWN, UNKNOWN, UNKNOWN, SURE])
-    for column in range(6)
-]
+base = Resource("base", role="acting", physical=False, description="a simulated Turtlebot")
+orders = base.input("/velocity_order", "geometry_msgs/Twist")
+odom = base.output("/odom", "nav_msgs/Odometry", deadline="300 ms")
+rate = base.parameter("rate", 50.0, low=1.0, high=100.0, unit="Hz", description="of the odometry; profiles set it")
+power = base.attribute("power", better="min", unit="W")
+robot = Turtlebot()
 
 
-class Turtlebot:
-    """The simulated robot: its pose, and the order that it follows."""
-
-    def __init__(self) -> None:
-        self.pose = Pose()
-        self.speed = 0.0
-        self.turn = 0.0
-        self._ordered = -math.inf
-        self._moved = -math.inf
-
-    def order(self, speed: float, turn: float, now: float) -> None:
-        """Follow an order (m/s, rad/s) from ``now`` on, within what the robot can do."""
-        self.step(now)
-        self.speed, self.turn = limited(speed, MAX_SPEED), limited(turn, MAX_TURN)
-        self._ordered = now
-
-    def step(self, now: float) -> None:
-        """Drive until ``now`` (seconds); stop where the last order is too old."""
-        end = min(now, self._ordered + ORDER_TIMEOUT)
-        if end > self._moved and math.isfinite(self._moved):
-            self.pose = self.pose.moved(self.speed, self.turn, end - self._moved)
-        self._moved = now
-        if now >= self._ordered + ORDER_TIMEOUT:
-            self.speed = self.turn = 0.0
+@base.profile(offers={"rate": "50 Hz", "power": "15 W"})
+def full() -> None:
+    """As fast as a Turtlebot is."""
+    rate.value, robot.top_speed = 50.0, MAX_SPEED
 
 
-async def base(master_uri: str) -> None:
-    """Publish ``nav_msgs/Odometry`` on ``/odom``: the pose in ``odom``, the speed in ``base_link`` (REP 105)."""
-    robot = Turtlebot()
-
-    def order(received: Received) -> None:
-        robot.order(received.message.linear.x, received.message.angular.z, time.monotonic())
-
-    async with joined("base", master_uri, "nav_msgs/Odometry", "geometry_msgs/Twist") as node:
-        publisher = await node.advertise("/odom", "nav_msgs/Odometry")
-        await node.subscribe("/velocity_order", "geometry_msgs/Twist", order)
-        async for _ in Rate(RATE):
-            robot.step(time.monotonic())
-            publisher.publish(publisher.make(odometry(robot, time.time_ns())))
+@base.profile(offers={"rate": "10 Hz", "power": "6 W"}, best_effort=True)
+def saving() -> None:
+    """Slow, and seldom heard: what the battery lasts longest with."""
+    rate.value, robot.top_speed = 10.0, 0.2
 
 
-def odometry(robot: Turtlebot, stamp: int) -> dict[str, Plain]:
-    """The message's fields; ``stamp`` in nanoseconds since the epoch."""
-    pose = robot.pose
-    return {
-        "header": {"stamp": {"secs": stamp // 10**9, "nsecs": stamp % 10**9}, "frame_id": "odom"},
-        "child_frame_id": "base_link",
-        "pose": {
-            "pose": {
-                "position": {"x": pose.x, "y": pose.y},
-                "orientation": {"z": math.sin(pose.heading / 2), "w": math.cos(pose.heading / 2)},
-            },
-            "covariance": COVARIANCE,
-        },
-        "twist": {
-            "twist": {"linear": {"x": robot.speed}, "angular": {"z": robot.turn}},
-            "covariance": COVARIANCE,
-        },
-    }
+base.context("low_battery", requires={"power": at_most("6 W")}, profiles=["saving"])
 
 
-if __name__ == "__main__":
-    run(base(arguments(__doc__).parse_args().master))
+@base.task(on=orders)
+async def follow(order: Any) -> None:
+    """Drive as the order says, from now on."""
+    robot.order(order.linear.x, order.angular.z, time.monotonic())
+
+
+@base.task(rate=rate)
+async def drive() -> None:
+    """Tell where the wheels have brought it (REP 105: the pose in ``odom``, the speed in ``base_link``)."""
+    robot.step(time.monotonic())
+    odom.publish(**odometry(robot, time.time_ns()))
+    power.observe(robot.power(rate.value))

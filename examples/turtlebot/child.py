@@ -1,4 +1,7 @@
-"""One child process: in a group of its own, gone when we are gone, its words heard."""
+"""One child process: in a group of its own, gone when we are gone, its words heard.
+
+A child may have children of its own in other groups (``rmpa run`` has its agent).
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,13 @@ import ctypes
 import os
 import signal
 from collections import deque
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-PR_SET_PDEATHSIG = 1
+PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 TAIL = 30
 """Lines that are kept of what a child says."""
 _libc = ctypes.CDLL(None)
@@ -75,6 +79,30 @@ class Child:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.pid, number)
 
+    def pids(self) -> list[int]:
+        """Of its children, and its own."""
+        found: list[int] = []
+        with contextlib.suppress(OSError):
+            for task in Path(f"/proc/{self.pid}/task").iterdir():
+                found += map(int, (task / "children").read_text(encoding="ascii").split())
+        return [*found, self.pid]
+
+    async def kill(self) -> None:
+        """``kill -9`` of it and its children; returns when none of them is there any more."""
+        if not self.runs:
+            return
+        self.ours = True
+        *children, _ = self.pids()
+        # The children first: they must not hear that their parent is gone, and say goodbye.
+        for pid in children:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        self.send(signal.SIGKILL)
+        await self.ended()
+        for pid in children:
+            with contextlib.suppress(ChildProcessError):  # its parent has seen its end
+                await asyncio.to_thread(os.waitpid, pid, 0)
+
     def tell(self, line: bytes) -> None:
         """Write to its standard input; a child that has ended does not hear it."""
         if self.runs and self.process.stdin is not None and not self.process.stdin.is_closing():
@@ -99,6 +127,11 @@ class Child:
             text = line.decode(errors="replace").rstrip()
             self.tail.append(text)
             heard(text)
+
+
+def adopt() -> None:
+    """Have the kernel give us the children of children that die."""
+    _libc.prctl(PR_SET_CHILD_SUBREAPER, 1)
 
 
 def _die_with(parent: int) -> None:

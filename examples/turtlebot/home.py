@@ -36,6 +36,11 @@ class Home:
         return self.path / "agents"
 
     @property
+    def variables(self) -> dict[str, str]:
+        """The environment's part that keeps agents and resources to this directory."""
+        return {"RMPA_RUNTIME_DIR": str(self.agents), "RMPA_STATE_DIR": str(self.path / "state")}
+
+    @property
     def settings(self) -> Path:
         """The agents' ``rmpa.toml``."""
         return self.path / "rmpa.toml"

@@ -1,41 +1,53 @@
-"""The module *joystick*: publishes the Command Information, ten times a second.
+"""The module *joystick*: publishes the Command Information, ten times a second, or more often if somebody asks.
 
-rmpa up --name joystick &
-python joystick.py --device /dev/input/js0
+rmpa run joystick.py --set device=/dev/input/js0
 """
-
-from __future__ import annotations
 
 import sys
 import time
 
-from module import arguments, joined, run
-from rate import Rate
+from rmpa.resource import Resource
 from stick import LinuxJoystick, Recording, Stick
 
-RATE = 10
-"""Hz; the paper's."""
+joystick = Resource("joystick", role="sensing", description="the stick that steers")
+command = joystick.output("/command_information", "sensor_msgs/Joy", deadline="300 ms")
+device = joystick.parameter("device", "", description="such as /dev/input/js0; empty: a recorded drive")
+rate = joystick.parameter("rate", 10.0, low=1.0, high=50.0, unit="Hz", description="profiles set it")
+sticks: dict[str, Stick] = {}
 
 
-async def joystick(master_uri: str, stick: Stick) -> None:
-    """Publish the stick's state as ``sensor_msgs/Joy`` on ``/command_information``."""
-    async with joined("joystick", master_uri, "sensor_msgs/Joy") as node:
-        publisher = await node.advertise("/command_information", "sensor_msgs/Joy")
-        async for _ in Rate(RATE):
-            axes, buttons = stick.read()
-            stamp = time.time_ns()
-            message = publisher.make({"axes": list(axes), "buttons": list(buttons)})
-            message.header.frame_id = "joystick"
-            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
-            publisher.publish(message)
+@joystick.profile(offers={"rate": "10 Hz"}, cost=1, best_effort=True)
+def steady() -> None:
+    """The paper's."""
+    rate.value = 10.0
 
 
-def _say(text: str) -> None:
+@joystick.profile(offers={"rate": "25 Hz"}, cost=3)
+def brisk() -> None:
+    """For who steers a fast robot."""
+    rate.value = 25.0
+
+
+@joystick.task(rate=rate)
+def read() -> None:
+    """Send the stick's present state. A device may block: this is a thread of its own."""
+    stamp = time.time_ns()
+    axes, buttons = stick().read()
+    command.publish(
+        header={"stamp": {"secs": stamp // 10**9, "nsecs": stamp % 10**9}, "frame_id": "joystick"},
+        axes=list(axes),
+        buttons=list(buttons),
+    )
+
+
+def stick() -> Stick:
+    """What is read from; another one once the parameter is another."""
+    name = device.value
+    if name not in sticks:
+        sticks[name] = LinuxJoystick(name, say) if name else Recording()
+    return sticks[name]
+
+
+def say(text: str) -> None:
+    """Tell the user."""
     print(text, file=sys.stderr, flush=True)
-
-
-if __name__ == "__main__":
-    parser = arguments(__doc__)
-    parser.add_argument("--device", help="a Linux joystick such as /dev/input/js0 [default: a recorded drive]")
-    options = parser.parse_args()
-    run(joystick(options.master, LinuxJoystick(options.device, _say) if options.device else Recording()))

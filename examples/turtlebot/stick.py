@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import os
 import struct
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
@@ -21,6 +22,8 @@ BUTTON, AXIS, INIT = 0x01, 0x02, 0x80
 CONTROLS_MAX = 64
 """Axes or buttons; a joystick with more is no joystick."""
 RECORDING = Path(__file__).with_name("drive.csv")
+ROWS = 10
+"""A second, of a recording."""
 
 T = TypeVar("T")
 Deflections = tuple[tuple[float, ...], tuple[int, ...]]
@@ -40,12 +43,13 @@ class Recording:
 
     Args:
         path: A CSV file with the columns forward, left, dead_man.
+        now: The clock, in seconds.
 
     Raises:
         ValueError: With file and line, if it is no such file.
     """
 
-    def __init__(self, path: Path = RECORDING) -> None:
+    def __init__(self, path: Path = RECORDING, now: Callable[[], float] = time.monotonic) -> None:
         self.rows: list[Deflections] = []
         with path.open(newline="", encoding="utf-8") as file:
             rows = csv.DictReader(file)
@@ -61,13 +65,15 @@ class Recording:
                 self.rows.append(((left, forward), (held,)))
         if not self.rows:
             raise ValueError(f"{path}: no recorded drive in it")
-        self._next = 0
+        self._now = now
+        self._began: float | None = None
 
     def read(self) -> Deflections:
-        """The next row."""
-        row = self.rows[self._next]
-        self._next = (self._next + 1) % len(self.rows)
-        return row
+        """The row of this moment, the first one at the first call."""
+        now = self._now()
+        if self._began is None:
+            self._began = now - 0.5 / ROWS  # in a row's middle: who reads as often meets each row once
+        return self.rows[int((now - self._began) * ROWS) % len(self.rows)]
 
 
 class StickState:

@@ -1,4 +1,7 @@
-"""Runs the four modules: each an agent (``rmpa up``) with a core of its own, and a node, as children of ours."""
+"""Runs the four modules, each with an agent and a core of its own, as children of ours.
+
+Three are Smart Resources: ``rmpa run`` starts their agents. The pc is an agent (``rmpa up``) and an ordinary node.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from child import Child
+from child import Child, adopt
 from ports import free_port
 
 if TYPE_CHECKING:
@@ -26,7 +29,7 @@ if TYPE_CHECKING:
 MODULES = ("joystick", "velocity", "base", "pc")
 GROUP = "239.255.82.77"
 HERE = Path(__file__).parent
-FAREWELL = 3.0
+FAREWELL = 6.0
 """Seconds for a child to end in order before it is killed."""
 STARTING = 3.0
 """An agent that ends within so many seconds of its start because of a port gets another port …"""
@@ -74,15 +77,16 @@ class Supervisor:
         self._untold: list[bytes] | None = []
         self._watching: set[asyncio.Task[None]] = set()
         self._server: asyncio.Server | None = None
+        self._killing: list[asyncio.Future[None]] = []
         self._over = asyncio.Event()
         self.failures: list[str] = []
         """What ended by itself, with its last words."""
 
     async def run(self, seconds: float | None) -> None:
         """Run everything until ``seconds`` are over, ``stop`` is called or the pc's node is gone; end it all."""
+        adopt()
         try:
             self._server = await asyncio.start_unix_server(self._serve, self._home.socket, limit=LINE_MAX)
-            # All agents before the nodes: theirs is the longer way to the first message.
             await asyncio.gather(*(self._start(module) for module in self._modules.values()))
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._over.wait(), seconds)
@@ -92,8 +96,7 @@ class Supervisor:
     def stop(self) -> None:
         """End in order; at the second call, at once."""
         if self._over.is_set():
-            for child in self._children():
-                child.send(signal.SIGKILL)
+            self._killing = [asyncio.ensure_future(child.kill()) for child in self._children()]
         self._over.set()
 
     # --- modules ------------------------------------------------------------------------------------------------
@@ -106,41 +109,42 @@ class Supervisor:
         if module.name != "pc":
             self._news(started)
         env = self._environment(module)
-        for name, argv in (("agent", self._agent(module)), ("node", self._node(module))):
-            watched = module.name == "pc" and name == "node"
-            full_name = f"{name} of {module.name}"
-            child = await Child.start(full_name, argv, env, self._hearing(module, name), piped=watched)
+        for name, argv in self._programs(module):
+            watched = name == "node of pc"
+            child = await Child.start(name, argv, env, self._hearing(module), piped=watched)
             module.children.append(child)
             if watched:
                 self._tell_early_news(child)
                 self._news(started)
-            task = asyncio.create_task(self._watch(module, child), name=f"watch {full_name}")
+            task = asyncio.create_task(self._watch(module, child), name=f"watch {name}")
             self._watching.add(task)
             task.add_done_callback(self._watching.discard)
 
-    def _agent(self, module: Module) -> list[str]:
-        return [
-            *(rmpa_program(), "up", "--name", module.name, "--core-port", str(module.core_port)),
-            *("--interface", "lo", "--multicast", self._multicast),
-            *("--config", str(self._home.settings), "--log-level", "warning"),
+    def _programs(self, module: Module) -> list[tuple[str, list[str]]]:
+        options = [
+            *("--core-port", str(module.core_port), "--interface", "lo", "--multicast", self._multicast),
+            *("--config", str(self._home.settings)),
         ]
-
-    def _node(self, module: Module) -> list[str]:
-        argv = [sys.executable, str(HERE / f"{module.name}.py"), "--master", f"http://127.0.0.1:{module.core_port}/"]
-        if module.name == "joystick" and self._joystick:
-            argv += ["--device", self._joystick]
+        rmpa, file = rmpa_program(), str(HERE / f"{module.name}.py")
         if module.name == "pc":
-            argv += ["--events", *(["--json"] if self._as_json else [])]
-        return argv
+            node = [sys.executable, file, "--master", f"http://127.0.0.1:{module.core_port}/", "--events"]
+            return [
+                ("agent of pc", [rmpa, "up", "--name", "pc", *options, "--log-level", "error"]),
+                ("node of pc", node + (["--json"] if self._as_json else [])),
+            ]
+        # Agents report lost peers to their log; the table shows those. What a resource says is for the user.
+        run = [rmpa, "run", file, "--name", module.name, "--log-level", "warning"]
+        if module.name == "joystick" and self._joystick:
+            run += ["--set", f"device={self._joystick}"]
+        return [(f"module {module.name}", [*run, "--", *options, "--log-level", "error"])]
 
     def _environment(self, module: Module) -> Mapping[str, str]:
         foreign = ("ROS_", "RMPA_", "NOTIFY_SOCKET")
         kept = {name: value for name, value in os.environ.items() if not name.startswith(foreign)}
-        return {**kept, "RMPA_RUNTIME_DIR": str(self._home.agents), "RMPA_AGENT": module.name}
+        return {**kept, **self._home.variables, "RMPA_AGENT": module.name}
 
-    def _hearing(self, module: Module, name: str) -> Callable[[str], None]:
-        # Agents report lost peers to their log; the table shows those. What a node says is for the user.
-        if name == "agent" or module.name == "pc":
+    def _hearing(self, module: Module) -> Callable[[str], None]:
+        if module.name == "pc":
             return lambda _: None
         return lambda text: self._news({"event": "note", "module": module.name, "text": text})
 
@@ -161,10 +165,7 @@ class Supervisor:
             self._over.set()  # without the pc's node nobody sees anything
 
     async def _kill(self, module: Module) -> None:
-        for child in module.children:
-            child.send(signal.SIGKILL)
-        for child in module.children:
-            await child.ended()
+        await asyncio.gather(*(child.kill() for child in module.children))
 
     def _news(self, news: dict[str, object]) -> None:
         """Tell the pc's node; what happens before its first start waits for it."""
@@ -202,7 +203,7 @@ class Supervisor:
             if not module.runs:
                 raise Refused(f"{name} does not run; `demo.py start {name}` starts it")
             at = time.monotonic()
-            pids = ", ".join(str(child.pid) for child in module.children if child.runs)
+            pids = ", ".join(str(pid) for child in module.children if child.runs for pid in child.pids())
             # Told first: on a busy machine the pc's agent may see it gone before we have buried it.
             self._news({"event": "killed", "module": name, "at": at})
             await self._kill(module)
@@ -236,9 +237,8 @@ class Supervisor:
         await asyncio.gather(*(child.ended(FAREWELL) for child in children))
         for child in self._children():
             self.failures.append(f"the {child.name} did not end within {FAREWELL} s, and was killed")
-            child.send(signal.SIGKILL)
-            await child.ended()
-        await asyncio.gather(*self._watching, return_exceptions=True)
+            await child.kill()
+        await asyncio.gather(*self._watching, *self._killing, return_exceptions=True)
 
 
 def rmpa_program() -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import re
@@ -15,11 +16,14 @@ from typing import TYPE_CHECKING, Any, Final
 import psutil
 import pytest
 
+from rmpa.monitor.aio.control_client import ControlClient, choose_agent
+from rmpa.resource import ResourceClient, at_least, at_most
+from rmpa.ros.aio.node import Node
 from stick import AXIS, BUTTON, EVENT
 from tests.interop.processes import Process, eventually
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Coroutine, Iterator
 
 ROOT: Final = Path(__file__).parents[2]
 DEMO: Final = ROOT / "examples" / "turtlebot" / "demo.py"
@@ -123,6 +127,48 @@ def test_the_paper_s_set_up_runs_and_leaves_nothing(tidy: dict[str, str]) -> Non
     poses = {(view["pose"]["x"], view["pose"]["y"]) for view in views(demo) if view["pose"]}
     assert len(poses) > 2, "the robot drives"
     assert all(module["first_message"] > 0 for module in summary["modules"].values())
+
+
+async def test_its_modules_are_smart_resources_and_anybody_may_ask_them(tidy: dict[str, str]) -> None:
+    def view(holds: Callable[[dict[str, Any]], bool], what: str) -> Coroutine[object, object, dict[str, Any]]:
+        return asyncio.to_thread(wait_for_view, demo, holds, what)
+
+    with Process([sys.executable, DEMO, "--json"], env=tidy, name="demo") as demo:
+        before = await view(lambda view: all_linked(view) and flows(view), "messages of all modules")
+        (agents,) = Path(tidy["TMPDIR"]).glob("rmpa-demo-*/agents")
+        # From the pc, of whose core they know nothing.
+        with ControlClient(choose_agent({"RMPA_RUNTIME_DIR": str(agents)}, "pc").path) as agent:
+            uri = agent.snapshot().agent.core_uri
+        async with Node("guest", master_uri=uri) as node:
+            async with (
+                ResourceClient(node, "joystick") as joystick,
+                ResourceClient(node, "velocity") as velocity,
+                ResourceClient(node, "base") as base,
+            ):
+                await joystick.require(timeout=30.0, rate=at_least("20 Hz", hard=True))
+                await velocity.require(timeout=30.0, acceleration=at_most("1.2 m/s²"))
+                await base.require(timeout=30.0, power=at_most("6 W", hard=True))
+                for name, profile in (("joystick", "brisk"), ("velocity", "gentle"), ("base", "saving")):
+                    async with asyncio.timeout(30):
+                        async for received in await node.subscribe(f"/{name}/profile", "std_msgs/String"):
+                            if received.message.data == profile:
+                                break
+                await view(
+                    lambda view: (
+                        view["topics"]["/odom"]["rate"] == pytest.approx(10, rel=0.2)
+                        and view["topics"]["/command_information"]["rate"] == pytest.approx(25, rel=0.2)
+                    ),
+                    "what was asked",
+                )
+            await view(
+                lambda view: (
+                    view["topics"]["/odom"]["rate"] == pytest.approx(50, rel=0.2)
+                    and view["topics"]["/command_information"]["rate"] == pytest.approx(10, rel=0.2)
+                ),
+                "what was before the guest came",
+            )
+        assert before["notes"] == [], "nothing to say at the start"
+        assert await asyncio.to_thread(demo.interrupt) == 0, demo.output
 
 
 def test_a_killed_module_is_seen_gone_the_others_go_on_and_it_comes_back(tidy: dict[str, str]) -> None:

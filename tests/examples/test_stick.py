@@ -81,15 +81,19 @@ def test_a_joystick_is_unplugged_and_comes_back(tmp_path: Path) -> None:
 
 
 def test_the_recorded_drive_is_a_minute_with_curves_and_ends_where_it_began() -> None:
-    recording = Recording()
+    time = [7.0]
+    recording = Recording(now=lambda: time[0])
     assert len(recording.rows) == 600
     pose, furthest = Pose(), 0.0
     for _ in range(600):
         pose = pose.moved(*velocity_order(*recording.read()), 0.1)
+        time[0] += 0.1
         furthest = max(furthest, abs(pose.x), abs(pose.y))
     assert (pose.x, pose.y, pose.heading) == pytest.approx((0, 0, 0), abs=0.01)
     assert 1.0 < furthest < 5.0
     assert recording.read() == recording.rows[0], "it loops"
+    time[0] += 1.63
+    assert recording.read() == recording.rows[16], "however often it is read"
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from base import Turtlebot, odometry
 from rmpa.ros.messages import MessageType
+from robot import Turtlebot, odometry
 from unicycle import Pose
 
 
@@ -40,6 +40,16 @@ def test_it_keeps_to_its_limits_and_stops_at_nonsense() -> None:
     assert (robot.speed, robot.turn) == (0.65, -3.14)
     robot.order(math.nan, math.inf, 1.1)
     assert (robot.speed, robot.turn) == (0.0, 0.0)
+
+
+def test_a_slower_profile_keeps_it_slow_and_takes_less_power() -> None:
+    robot = Turtlebot()
+    robot.order(0.65, 0.0, 1.0)
+    fast = robot.power(50)
+    robot.top_speed = 0.2
+    robot.order(0.65, 0.0, 1.1)
+    assert robot.speed == 0.2
+    assert robot.power(10) < 6 < fast < 15
 
 
 def test_its_odometry_is_a_message_in_the_frames_of_rep_105() -> None:
