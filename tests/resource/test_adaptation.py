@@ -328,3 +328,32 @@ def test_a_reaction_counts_from_the_beginning_of_the_first_bad_window() -> None:
     one.window({"rate": 9.0}, 3.0)  # it fell at 2.3, say
     assert applies(one.window({"rate": 9.0}, 4.0)) == ["fast"]
     assert one.applied("fast", 4.5)[0] == Reacted("fast", 2.5)
+
+
+def test_a_soft_bound_that_the_profile_is_known_to_fall_short_of_is_no_disturbance() -> None:
+    only = Profile("only", {"rate": 10.0, "latency": 0.1}, cost=1)
+    one = running(20, only, hard=False)
+    for second in range(2, 8):
+        assert alarms(one.window({"rate": 10.0}, float(second))) == []
+    one.window({"rate": 2.0}, 8.0)  # far less than the profile promised
+    assert [kind for kind, _, _ in alarms(one.window({"rate": 2.0}, 9.0))] == [AlarmKind.NON_ADAPTABLE]
+
+
+def test_a_restart_begins_with_what_was_asked_and_the_profile_that_ran() -> None:
+    one = loop()
+    one.remember([at_least(15)], "fast")  # fast serves as well as middle does
+    assert applies(one.start(0.0)) == ["fast"]
+    one.applied("fast", 0.1)
+    assert one.requirements.keys() == {"/client"}
+    assert one.window({"rate": 40.0}, 5.0) == []
+    assert applies(one.release("/client", 6.0)) == ["slow"]
+
+    worse = loop()
+    worse.remember([at_least(15, hard=True)], "slow")
+    assert applies(worse.start(0.0)) == ["middle"]
+    pinned = loop()
+    pinned.remember([], "fast")
+    assert applies(pinned.pin("middle", 0.0)) == ["middle"]
+    barred = loop()
+    barred.remember([], "fast")
+    assert applies(barred.bar({"fast": "no power"}, 0.0)) == ["slow"]

@@ -35,6 +35,10 @@ if TYPE_CHECKING:
 COOL_DOWN_GROWTH: Final = 2.0
 """Each time that a profile disappoints again its cool-down is so many times as long, up to ``cool_down_max``."""
 
+EXPECTED: Final = 1.25
+"""A soft bound that the profile is declared to fall short of may be missed by so many times that; more is a
+disturbance."""
+
 
 @dataclass(frozen=True, slots=True)
 class AdaptationSettings:
@@ -316,9 +320,17 @@ class Adaptation:
         short = []
         for name, bound in self._knows.merged.bounds.items():
             value = measured.get(name)
-            if value is not None and not bound.met_by(self._attributes[name], value):
+            if value is not None and not bound.met_by(self._attributes[name], value) and not self._known(name, value):
                 short.append(Shortfall(name, bound, value))
         return tuple(short)
+
+    def _known(self, name: str, value: Value) -> bool:
+        """Whether the profile was taken although it falls short of a soft bound so far: that is no disturbance."""
+        bound, attribute = self._knows.merged.bounds[name], self._attributes[name]
+        offer = self._decider.profile(self._profile).offers.get(name)
+        if bound.hard or offer is None or bound.met_by(attribute, offer):
+            return False
+        return _beyond(bound, attribute.place(value)) <= EXPECTED * _beyond(bound, attribute.place(offer))
 
     def _disturbed(self, since: float, short: tuple[Shortfall, ...], now: float) -> list[Action]:
         """The active profile does not give what it was taken for."""
@@ -500,6 +512,11 @@ class Adaptation:
         # Under it the quality is as asked again: the next disturbance starts with a short cool-down.
         self._knows.troubles.pop(self._profile, None)
         return [Clear(alarm)]
+
+
+def _beyond(bound: Bound, place: float) -> float:
+    """How far a place lies outside a bound; words have no distance."""
+    return 0.0 if bound.words else max(bound.low - place, place - bound.high, 0.0)
 
 
 def _named(short: tuple[Shortfall, ...]) -> str:
