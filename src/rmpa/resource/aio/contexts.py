@@ -75,7 +75,8 @@ class Contexts(RuntimePart):
         self._work: set[asyncio.Task[None]] = set()
         self._switching: asyncio.Task[None] | None = None
         self._timers: dict[str, asyncio.TimerHandle] = {}
-        self._closed = False
+        self._closed = True
+        """Before the start, and after the end."""
         self.listeners: list[Callable[[], None]] = []
         """Called when there is another context, or another choice by hand."""
 
@@ -100,7 +101,7 @@ class Contexts(RuntimePart):
 
     async def start(self) -> None:
         """Hear what is chosen, and look at the rules."""
-        self._loop = asyncio.get_running_loop()
+        self._loop, self._closed = asyncio.get_running_loop(), False
         await self._runtime.say(TOPIC, "")
         if not self._known:
             return
@@ -346,8 +347,11 @@ class _Source:
                 fields = (kind.fields[0].name,)
             for name in fields:
                 value = getattr(value, name)
-        except (RmpaError, AttributeError) as error:
-            return self._without(f"{error}")
+        except AttributeError:
+            has = ", ".join(field.name for field in kind.fields)
+            return self._without(f"{kind.name} has no {'.'.join(fields)}; it has {has}")
+        except RmpaError as error:
+            return self._without(str(error))
         if hasattr(value, "nanosec"):
             return float(value.sec + value.nanosec / 1e9)
         if isinstance(value, bool | int | float | str):
