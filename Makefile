@@ -24,8 +24,8 @@ test: $(STAMP) ros style types imports tests  ## everything, with Debian's ROS 1
 ros:  ## install Debian's ROS 1 for the interop tests (only where apt and root are there; else says so)
 	scripts/install-ros
 
-tests: $(STAMP)  ## pytest, in two halves side by side; some of it: make tests ARGS="tests/core -k names"
-	scripts/run-tests $(BIN)/python $(ARGS)
+tests: $(STAMP)  ## all tests, several parts at a time; some of them: make tests ARGS="tests/core -k names"
+	$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),$(PYTHON) scripts/run-tests $(BIN)/python)
 
 style: $(STAMP)  ## ruff: lint and format
 	$(BIN)/ruff check .
