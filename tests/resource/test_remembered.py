@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource.declare import Resource
-from rmpa.resource.remembered import CHOSEN, LAST, Asked, recall
+from rmpa.resource.remembered import CHOSEN, CONTEXT, LAST, Asked, recall
 
 NOW = 1_800_000_000_000_000_000
 SECOND = 1_000_000_000
@@ -20,6 +20,7 @@ def sonar() -> Resource:
     one.parameter("count", 3)
     one.parameter("frame", "base")
     one.profile(offers={"noise": "1 cm"}, name="fine")(lambda: None)
+    one.context("docked")
     return one
 
 
@@ -35,12 +36,13 @@ def test_what_was_kept_comes_back() -> None:
         ("requirement", "/driver"): asked(expires_ns=NOW + 12 * SECOND).serialize(),
         CHOSEN: '"fine"',
         LAST: '"fine"',
+        CONTEXT: '"docked"',
     }
     found = recall(rows, sonar(), NOW)
     assert found.lost == ()
     assert found.parameters == {"gain": 2.0, "frame": "sonar_link"}
     assert isinstance(found.parameters["gain"], float)
-    assert (found.chosen, found.last) == ("fine", "fine")
+    assert (found.chosen, found.last, found.context) == ("fine", "fine", "docked")
     (one,) = found.asked
     requirement = one.requirement(sonar().attributes, "sonar", 100.0, NOW)
     assert requirement is not None
@@ -62,6 +64,7 @@ def test_what_has_expired_meanwhile_is_forgotten() -> None:
         (("parameter", "power"), "1", "declared no longer"),
         (CHOSEN, '"exact"', "declared no longer"),
         (LAST, "{", "profile last"),
+        (CONTEXT, '"away"', "context away"),
         (("requirement", "/a"), '{"client": "/a", "values": [["nois", ">= 1"]]}', "nois"),
         (("requirement", "/a"), '{"client": "/a", "values": [["noise", "soft"]]}', "soft"),
         (("requirement", "/a"), "[" * 100_000, "requirement /a"),

@@ -185,6 +185,7 @@ def _set(resources: Sequence[Resource], text: str) -> None:
         remedy = f"did you mean {near}?" if near else f"there are {', '.join(known) or 'none'}"
         raise ConfigError("--set", f"there is no parameter {key}", remedy)
     known[fits[0]].value = _read(known[fits[0]], value)
+    known[fits[0]].given = True
 
 
 def _read(parameter: Parameter, text: str) -> bool | int | float | str:

@@ -39,6 +39,7 @@ from rmpa.resource.units import quantity
 from rmpa.ros.messages import MessageType
 
 if TYPE_CHECKING:
+    from rmpa.resource.answer import Answer
     from rmpa.resource.attributes import Value
 
 ParameterValue = bool | int | float | str
@@ -232,6 +233,8 @@ class Parameter:
 
     def __post_init__(self) -> None:
         self._value: Any = self.default
+        self.given = False
+        """Whether it was set for this start (``rmpa run --set``), and not what it was before counts."""
 
     @property
     def value(self) -> Any:
@@ -301,6 +304,38 @@ class DeclaredAttribute:
         checked = self.attribute.check(value, f"observation of {self.attribute.name}")
         if self.observer is not None:
             self.observer.observe(self.attribute.name, checked)
+
+
+class Asker(Protocol):
+    """Carries what a resource asks of others while it runs."""
+
+    def asked(self, demand: Demand) -> None:
+        """It asks for something else; called in any thread."""
+        ...
+
+
+@dataclass(eq=False)
+class Demand:
+    """What a resource asks of another one, here or in another module, for as long as it runs.
+
+    Args:
+        resource: The other one's node, as this module's graph has it: ``sonar``, ``/robot1/sonar``.
+        wishes: By attribute; empty: nothing at present.
+        priority: The higher one wins a conflict between clients.
+        answer: What the other one says to it, the last time; ``None`` before it said anything.
+    """
+
+    resource: str
+    wishes: Mapping[str, Wish] = field(default_factory=dict)
+    priority: int = 0
+    answer: Answer | None = field(default=None, repr=False)
+    asker: Asker | None = field(default=None, repr=False)
+
+    def ask(self, **wishes: Wish) -> None:
+        """Ask for this instead, from now on; from a profile or a task, in any thread. Nothing: ask for nothing."""
+        self.wishes = wishes
+        if self.asker is not None:
+            self.asker.asked(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -388,6 +423,7 @@ class Resource:
         self.profiles: dict[str, DeclaredProfile] = {}
         self.contexts: dict[str, Context] = {}
         self.tasks: dict[str, Task] = {}
+        self.demands: dict[str, Demand] = {}
         self.hooks: dict[str, Hook] = {}
         self.window = 1.0
         """Seconds of one quality window."""
@@ -419,6 +455,29 @@ class Resource:
         self._new("input", name, self.inputs)
         made = Input(name, MessageType(kind), _contract(f"input {name} of {self.name}", contract), required)
         self.inputs[name] = made
+        return made
+
+    def asks(self, resource: str, *, priority: int = 0, **wishes: Wish) -> Demand:
+        """Declare what it asks of another resource: ``keeper.asks("sonar", accuracy=at_most("5 cm"))``.
+
+        Args:
+            resource: The other one's node, as this module's graph has it.
+            priority: The higher one wins a conflict between clients.
+            wishes: By the other one's attributes; a qualified one (``ranges.rate``) is written ``ranges__rate``.
+
+        Raises:
+            ConfigError: An illegal name, the same one twice, or its own.
+        """
+        where = f"what {self.name} asks of {resource}"
+        name = resource if resource.startswith("/") else f"/{resource}"
+        if not is_legal_name(name) or name == "/":
+            raise ConfigError(where, f"{resource!r} is not a ROS name", "for example sonar, or /robot1/sonar")
+        if name in self.demands:
+            raise ConfigError(where, "it asks it already", "say all wishes at once, or change them by .ask()")
+        if name == f"/{self.name}":
+            raise ConfigError(where, "that is itself", "give its profiles what they need")
+        made = Demand(name, dict(wishes), priority)
+        self.demands[name] = made
         return made
 
     def parameter(

@@ -30,6 +30,8 @@ CHOSEN: Final = (PROFILE, "chosen")
 """The profile that was chosen by hand, or empty."""
 LAST: Final = (PROFILE, "last")
 """The profile that ran last."""
+CONTEXT: Final = ("context", "chosen")
+"""The context that was chosen by hand, or empty."""
 _SECOND: Final = 1_000_000_000
 
 
@@ -79,6 +81,7 @@ class Remembered:
         parameters: Those that fit, by name.
         chosen: The profile chosen by hand, or empty.
         last: The profile that ran last, or empty.
+        context: The context chosen by hand, or empty.
         asked: By clients that may come back.
         lost: What no longer fits, each ready to read.
     """
@@ -86,6 +89,7 @@ class Remembered:
     parameters: Mapping[str, ParameterValue] = field(default_factory=dict, hash=False)
     chosen: str = ""
     last: str = ""
+    context: str = ""
     asked: Sequence[Asked] = ()
     lost: Sequence[str] = ()
 
@@ -101,7 +105,7 @@ def recall(rows: Mapping[Key, str], resource: Resource, now_ns: int) -> Remember
     parameters: dict[str, ParameterValue] = {}
     asked: list[Asked] = []
     lost: list[str] = []
-    profiles = {LAST: "", CHOSEN: ""}
+    chosen = {LAST: "", CHOSEN: "", CONTEXT: ""}
     attributes = resource.attributes
     for (kind, name), text in rows.items():
         try:
@@ -111,11 +115,11 @@ def recall(rows: Mapping[Key, str], resource: Resource, now_ns: int) -> Remember
                 one = msgspec.json.decode(text, type=Asked)
                 if one.requirement(attributes, resource.name, 0.0, now_ns) is not None:
                     asked.append(one)
-            elif (kind, name) in profiles:
-                profiles[kind, name] = _profile(resource, text)
+            elif (kind, name) in chosen:
+                chosen[kind, name] = _chosen(kind, text, resource)
         except (ConfigError, msgspec.DecodeError, RecursionError) as error:
             lost.append(f"{kind} {name}: {error}")
-    return Remembered(parameters, profiles[CHOSEN], profiles[LAST], tuple(asked), tuple(lost))
+    return Remembered(parameters, chosen[CHOSEN], chosen[LAST], chosen[CONTEXT], tuple(asked), tuple(lost))
 
 
 def _parameter(resource: Resource, name: str, text: str) -> ParameterValue:
@@ -126,8 +130,8 @@ def _parameter(resource: Resource, name: str, text: str) -> ParameterValue:
     return resource.parameters[name].check(value)
 
 
-def _profile(resource: Resource, text: str) -> str:
+def _chosen(kind: str, text: str, resource: Resource) -> str:
     name = msgspec.json.decode(text, type=str)
-    if name and name not in resource.profiles:
-        raise ConfigError(f"profile {name}", "it is declared no longer")
+    if name and name not in (resource.profiles if kind == PROFILE else resource.contexts):
+        raise ConfigError(f"{kind} {name}", "it is declared no longer")
     return name

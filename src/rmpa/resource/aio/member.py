@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource.aio.adapt import Adapter
 from rmpa.resource.aio.contexts import Contexts
+from rmpa.resource.aio.demands import Demands
 from rmpa.resource.aio.memory import Memory
 from rmpa.resource.aio.reconfigure import Reconfigure
 from rmpa.resource.aio.runtime import Runtime, RuntimePart
@@ -72,8 +73,9 @@ class Member:
         self.adapter.troubles = self._troubles
         self.contexts = Contexts(self.runtime, self.tasks, self.adapter)
         self.configuration = Reconfigure(self.runtime, self.tasks, self.adapter, self.contexts)
-        parts = [self.configuration.before, self.tasks, self.adapter, self.contexts, self.configuration]
-        self.memory = Memory(self.runtime, self.adapter, store) if store is not None else None
+        self.demands = Demands(self.runtime)
+        parts = [self.configuration.before, self.tasks, self.adapter, self.contexts, self.configuration, self.demands]
+        self.memory = Memory(self.runtime, self.adapter, self.contexts, store) if store is not None else None
         self.runtime.parts += [*parts, self.memory] if self.memory is not None else parts
         self._last_problem: dict[str, str] = {}
         self._deactivating: asyncio.Task[None] | None = None
@@ -187,6 +189,9 @@ class Member:
         for name, state in self.tasks.running.items():
             if state != "running":
                 tasks.append(f"task {name} {state}: {self._last_problem.get(name, '')}".rstrip(": "))
+        absent, short = self.demands.troubles()
+        missing += absent
+        tasks += short
         tasks += [f"rule over {problem}" for problem in self.contexts.problems]
         if self.memory is not None and self.memory.problem:
             tasks.append(self.memory.problem)

@@ -10,7 +10,7 @@ import msgspec
 
 from rmpa.resource.adaptation import Action, AlarmKind, Apply, Clear, Raise, Reacted
 from rmpa.resource.aio.runtime import RuntimePart
-from rmpa.resource.remembered import CHOSEN, LAST, PARAMETER, REQUIREMENT, Asked, recall
+from rmpa.resource.remembered import CHOSEN, CONTEXT, LAST, PARAMETER, REQUIREMENT, Asked, recall
 from rmpa.ros.diagnostic_array import Level
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from rmpa.resource.adaptation import Alarm
     from rmpa.resource.aio.adapt import Adapter
+    from rmpa.resource.aio.contexts import Contexts
     from rmpa.resource.aio.runtime import Runtime
     from rmpa.resource.aio.store import Store
     from rmpa.resource.attributes import Value
@@ -34,12 +35,14 @@ class Memory(RuntimePart):
     Args:
         runtime: Of the resource.
         adapter: Takes what clients asked before, and tells what changes.
+        contexts: Take the one that was chosen by hand.
         store: Not yet open; closed with the resource.
     """
 
-    def __init__(self, runtime: Runtime, adapter: Adapter, store: Store) -> None:
+    def __init__(self, runtime: Runtime, adapter: Adapter, contexts: Contexts, store: Store) -> None:
         self._runtime = runtime
         self._adapter = adapter
+        self._contexts = contexts
         self._store = store
         self._said: dict[Key, str] = {}
 
@@ -57,9 +60,10 @@ class Memory(RuntimePart):
             _log.warning("! %s: not remembered: %s", self._runtime.node.name, lost)
         for name, value in found.parameters.items():
             parameter = resource.parameters[name]
-            if parameter.value == parameter.default:  # else somebody has set it for this start
+            if not parameter.given:
                 parameter.value = value
         self._adapter.recalled = found
+        self._contexts.chosen = found.context
         self._said = dict(rows)
         if found.parameters or found.chosen or found.asked:
             chosen = f", profile {found.chosen} chosen by hand" if found.chosen else ""
@@ -78,6 +82,7 @@ class Memory(RuntimePart):
         adapter.on_window.append(self._window)
         adapter.on_asked.append(self._asked)
         adapter.on_missing.append(self._missing)
+        self._contexts.listeners.append(self._asked)
         descriptor = self._runtime.descriptor
         self._store.descriptor(descriptor.node, descriptor.serialize(), time.time_ns())
         for name, parameter in self._runtime.resource.parameters.items():
@@ -115,6 +120,7 @@ class Memory(RuntimePart):
             self._put((kind, name), None)
         loop = self._adapter.loop
         self._put(CHOSEN, _json(loop.pinned))
+        self._put(CONTEXT, _json(self._contexts.chosen))
         if loop.profile:
             self._put(LAST, _json(loop.profile))
 

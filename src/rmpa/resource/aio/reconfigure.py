@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
 _WHO: Final = "configuration"
 _log = logging.getLogger(__name__)
+_MIRROR = 1.0
+"""Seconds that an ending resource waits for the parameter server."""
 
 
 class Reconfigure(RuntimePart):
@@ -86,6 +88,8 @@ class Reconfigure(RuntimePart):
         """Change nothing any more."""
         self._updates = None
         if self._mirror is not None:
+            # Who starts next on this core takes what stands there.
+            await asyncio.wait([self._mirror], timeout=_MIRROR)
             self._mirror.cancel()
             await asyncio.wait([self._mirror])
 
@@ -201,7 +205,7 @@ class Reconfigure(RuntimePart):
                 self._adapter.chosen = str(value)
             elif name == CONTEXT:
                 self._contexts.chosen = str(value)
-            else:
+            elif not resource.parameters[name].given:
                 self._runtime.set_parameter(name, value)
 
 
