@@ -171,11 +171,11 @@ class MessageType:
             given = {fields[0].name: values}
         else:
             raise MessageError(f"{path or name} is made of the fields {_names(fields)}, not of {values!r}")
-        unknown = given.keys() - {field.name for field in fields}
-        if unknown:
+        if given and (unknown := given.keys() - {field.name for field in fields}):
             raise MessageError(f"{path or name} has no field {min(unknown)!r}; it has {_names(fields)}")
+        within = f"{path}." if path else ""
         made = {
-            _python_name(field.name): self._value(field, given.get(field.name), f"{path}.{field.name}".lstrip("."))
+            _python_name(field.name): self._value(field, given.get(field.name), within + field.name)
             for field in fields
         }
         if not fields:
@@ -194,6 +194,8 @@ class MessageType:
         items = value if value is not None else []
         if not isinstance(items, list):
             raise MessageError(f"{path} is a list of {field.type}, not {_short(value)}")
+        if not items and (not field.size or value is None) and field.type in _NUMBERS:
+            return _zeros(field.type, field.size or 0)
         if field.size and not items:
             items = [None] * field.size
         if field.size and len(items) != field.size:
@@ -246,6 +248,7 @@ _RANGES: Final = {
     for sign in ("u", "")
     for bits in (8, 16, 32, 64)
 } | {"byte": (0, 255), "char": (0, 255)}
+_NUMBERS: Final = _FLOATS | _RANGES.keys()
 
 
 def _primitive(kind: str, value: Plain, path: str) -> bool | float | str:
@@ -297,6 +300,12 @@ def _sequence(field: Field, value: Any, path: str) -> Any:
     return given.astype(kind)
 
 
+def _zeros(kind: str, count: int) -> object:
+    import numpy as np  # noqa: PLC0415 - see the module's docstring
+
+    return np.zeros(count, dtype=_DTYPES.get(kind, kind))
+
+
 def _short(value: object) -> str:
     text = repr(value)
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
@@ -319,12 +328,14 @@ def _names(fields: Sequence[Field]) -> str:
     return ", ".join(field.name for field in fields) or "none"
 
 
+@functools.cache
 def _inner(name: str) -> str:
     """``package/Name`` as rosbags writes it."""
     package, _, base = name.partition("/")
     return f"{package}/msg/{base}"
 
 
+@functools.cache
 def _python_name(name: str) -> str:
     from rosbags.typesys.base import normalize_fieldname  # noqa: PLC0415 - see the module's docstring
 

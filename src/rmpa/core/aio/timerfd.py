@@ -6,6 +6,7 @@ a timerfd is neither. Python has it since 3.13; before, the C library is called.
 
 from __future__ import annotations
 
+import functools
 import os
 import struct
 import sys
@@ -84,6 +85,7 @@ class TimerFd:
         self.close()
 
 
+@functools.cache
 def _libc() -> ctypes.CDLL:
     import ctypes  # noqa: PLC0415 - only who has timers pays for it
 
