@@ -11,18 +11,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rmpa.resource.answer import Answer
 from rmpa.resource.declare import Resource, Wish, at_least, at_most, between, exactly
 
 if TYPE_CHECKING:
-    from rmpa.resource.aio.client import Answer, ResourceClient
+    from rmpa.resource.aio.client import ResourceClient
 
 __all__ = ["Answer", "Resource", "ResourceClient", "Wish", "at_least", "at_most", "between", "exactly"]
 
 
 def __getattr__(name: str) -> object:
     """Load the client only where it is used: it brings asyncio and sockets."""
-    if name in ("Answer", "ResourceClient"):
-        from rmpa.resource.aio import client  # noqa: PLC0415 - as said
+    if name == "ResourceClient":
+        from rmpa.resource.aio.client import ResourceClient  # noqa: PLC0415 - as said
 
-        return getattr(client, name)
+        return ResourceClient
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

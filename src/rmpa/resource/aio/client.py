@@ -14,11 +14,11 @@ from __future__ import annotations
 import asyncio
 import secrets
 import time
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
 from rmpa.core import limits
 from rmpa.core.errors import PeerRefused, UnreachableError
+from rmpa.resource.answer import Answer
 from rmpa.resource.requirement_text import EXPIRES, PRIORITY
 from rmpa.ros.diagnostic_array import ARRAY_TYPE, Level
 
@@ -29,21 +29,6 @@ if TYPE_CHECKING:
     from rmpa.resource.declare import Wish
     from rmpa.ros.aio.node import Node
     from rmpa.ros.aio.topics import Publisher, Received, Subscriber
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """What a resource tells one client.
-
-    Args:
-        level: OK; WARN: something falls short; ERROR: no profile can serve, or the request cannot be.
-        message: In a few words.
-        values: By attribute: what was wanted, and what is given.
-    """
-
-    level: Level
-    message: str
-    values: Mapping[str, str]
 
 
 class ResourceClient:
@@ -102,12 +87,7 @@ class ResourceClient:
             PeerRefused: The request cannot be; what was asked before stays.
             UnreachableError: No such resource answers.
         """
-        values = {name.replace("__", "."): str(wish) for name, wish in wishes.items()}
-        if priority:
-            values[PRIORITY] = str(priority)
-        if expires:
-            values[EXPIRES] = expires
-        self._say(values)
+        self.ask(priority=priority, expires=expires, **wishes)
         try:
             async with asyncio.timeout(timeout):
                 while self._answer is None:
@@ -119,6 +99,20 @@ class ResourceClient:
         if self._answer.level is Level.ERROR and "non-adaptable" not in self._answer.message:
             raise PeerRefused(f"resource {self.resource}", self._answer.message)
         return self._answer
+
+    def ask(self, *, priority: int = 0, expires: str = "", **wishes: Wish) -> None:
+        """Ask as ``require`` does, without waiting: ``answers`` tells."""
+        values = {name.replace("__", "."): str(wish) for name, wish in wishes.items()}
+        if priority:
+            values[PRIORITY] = str(priority)
+        if expires:
+            values[EXPIRES] = expires
+        self._say(values)
+
+    @property
+    def there(self) -> bool:
+        """Whether such a resource is connected."""
+        return self._responses is not None and self._responses.publishers > 0
 
     async def observe(self, **values: float | str) -> None:
         """Say what this client observes of what it is given: ``await sonar.observe(rate="12 Hz")``, again and again.
