@@ -259,6 +259,29 @@ def test_a_choice_by_hand_holds_whatever_is_asked() -> None:
         one.pin("slwo", 8.0)
 
 
+def test_a_choice_by_hand_that_fails_is_tried_again_behind_its_cool_down() -> None:
+    one = running(1)
+    assert applies(one.pin("fast", 2.0)) == ["fast"]
+    assert applies(one.failed("fast", "broken", 2.0)) == ["slow"]  # not the broken one over and over
+    finish(one, 2.0)
+    assert applies(one.handle_timer(one.next_timer() or 0.0)) == ["fast"]
+    # Who chooses it anew does not wait.
+    one.failed("fast", "broken", 12.0)
+    finish(one, 12.0)
+    assert applies(one.pin("fast", 12.5)) == ["fast"]
+
+
+def test_what_none_can_serve_is_one_alarm_however_little_is_measured() -> None:
+    one = running(5)
+    raised = one.require(Requirement("/c", {"latency": bound(LATENCY, at_most=0.001, hard=True)}), 2.0)
+    assert [kind for kind, _, _ in alarms(raised)] == [AlarmKind.NON_ADAPTABLE]
+    finish(one, 2.0)
+    for now in (3.0, 4.0, 5.0):
+        assert one.window({"rate": 40.0}, now) == []
+    assert one.alarm is not None
+    assert any(isinstance(action, Clear) for action in one.release("/c", 6.0))
+
+
 def test_what_is_asked_while_a_profile_is_applied_counts_when_it_runs() -> None:
     one = loop()
     one.start(0.0)
@@ -357,3 +380,22 @@ def test_a_restart_begins_with_what_was_asked_and_the_profile_that_ran() -> None
     barred = loop()
     barred.remember([], "fast")
     assert applies(barred.bar({"fast": "no power"}, 0.0)) == ["slow"]
+
+
+def test_who_says_the_same_again_and_again_hides_no_disturbance() -> None:
+    one = running(20.0, FAST, MIDDLE)
+    for turn in range(3):  # rostopic pub -r 10
+        assert one.require(at_least(20.0, hard=True), 1.5 + turn) == []
+        if actions := one.window({"rate": 9.0}, 2.0 + turn):
+            break
+    assert applies(actions) == ["fast"]
+
+
+def test_who_says_the_same_again_does_not_skip_the_dwell() -> None:
+    one = running(20.0)
+    one.bar({"middle": "no current"}, 1.5)
+    finish(one, 1.5)
+    assert one.profile == "fast"
+    one.bar({}, 1.6)
+    assert one.require(at_least(20.0, hard=True), 1.7) == []
+    assert one.profile == "fast"

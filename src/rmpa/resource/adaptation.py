@@ -313,7 +313,10 @@ class Adaptation:
         if len(violated) >= self._settings.violations and not self._pinned:
             return self._disturbed(violated[0][0], violated[-1][1], now)
         if not short and not violated:
-            return [*self._plan(now, "a better profile can be taken"), *self._recovered()]
+            planned = self._plan(now, "a better profile can be taken")
+            if not self._pinned_or_best(now).feasible:
+                return planned  # what was not measured may fall short as it was declared to
+            return [*planned, *self._recovered()]
         return []
 
     def _shortfalls(self, measured: Mapping[str, Value]) -> tuple[Shortfall, ...]:
@@ -396,13 +399,16 @@ class Adaptation:
             if trouble.until <= now:
                 trouble.until = math.inf  # it may be taken again; how long it was out is remembered
         if over:
-            return self._asked_anew(now, f"what {', '.join(over)} asked for has expired")
+            if actions := self._asked_anew(now, f"what {', '.join(over)} asked for has expired"):
+                return actions
         return self._plan(now, "a profile's cool-down is over")
 
     # --- planning -----------------------------------------------------------------------------------------------
 
     def _asked_anew(self, now: float, why: str) -> list[Action]:
-        self._knows.merged = merge(self._knows.requirements.values())
+        before, self._knows.merged = self._knows.merged.bounds, merge(self._knows.requirements.values())
+        if self._knows.merged.bounds == before and self._state is not ProfileState.NONE:
+            return []  # said again, as `rostopic pub -r` does: it must neither hide a disturbance nor skip the dwell
         for name in self._knows.merged.bounds:
             if name not in self._attributes:
                 raise LocalProtocolError(f"a bound of {name}, which is no attribute; check it before it comes here")

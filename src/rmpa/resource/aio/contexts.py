@@ -340,11 +340,11 @@ class _Source:
 
     def read(self, kind: MessageType, raw: bytes) -> Scalar | None:
         """The field of a message; ``None`` if it has none that a rule can look at."""
+        fields = self._fields
+        if not fields and len(kind.fields) == 1:
+            fields = (kind.fields[0].name,)
         try:
             value: Any = kind.deserialize(raw)
-            fields = self._fields
-            if not fields and len(kind.fields) == 1:
-                fields = (kind.fields[0].name,)
             for name in fields:
                 value = getattr(value, name)
         except AttributeError:

@@ -1,0 +1,287 @@
+"""``rmpa resource``, ``profile``, ``context`` and ``alarm`` against a resource of this module and one of a peer."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from rmpa.cli.main import main
+from rmpa.core.errors import ConfigError
+from rmpa.resource.aio.client import ResourceClient
+from rmpa.resource.aio.member import Member
+from rmpa.resource.declare import Resource, at_least, at_most
+from rmpa.resource.descriptor import describe
+from rmpa.resource.reconfigure import read_config
+from rmpa.ros.aio.node import Node
+from rmpa.ros.environment import RosEnvironment
+from tests.resource.aio.test_member import echo
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from rmpa.ros.aio.core import RosCore
+    from tests.cli.conftest import Background
+
+Rmpa = Callable[..., tuple[int, str, str]]
+ARRAY = "diagnostic_msgs/DiagnosticArray"
+
+
+@pytest.fixture
+def rmpa(core: RosCore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Rmpa:
+    """Runs ``rmpa`` within this process: exit code, output, errors."""
+    monkeypatch.delenv("RMPA_AGENT", raising=False)
+    for name, value in (("ROS_MASTER_URI", core.uri), ("RMPA_RUNTIME_DIR", str(tmp_path)), ("NO_COLOR", "1")):
+        monkeypatch.setenv(name, value)
+
+    def run(*words: str) -> tuple[int, str, str]:
+        capsys.readouterr()
+        code = main(words)
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def sonar() -> Resource:
+    one = Resource("sonar", role="sensing", physical=False, description="three rings\x1b[2J")
+    one.output("ranges", "sensor_msgs/Range", deadline="100 ms")
+    one.parameter("gain", 1.0, low=0.5, unit="dB", description="of the amplifier")
+    one.parameter("beam", "wide", choices=("wide", "narrow"))
+    one.attribute("accuracy", better="min", unit="m")
+    one.profile(offers={"rate": 10, "accuracy": "5 cm"}, cost=1, name="slow", description="cheap")(lambda: None)
+    one.profile(offers={"rate": 40, "accuracy": "1 cm"}, cost=3, name="fast")(lambda: None)
+
+    @one.profile(offers={"rate": 40, "accuracy": "1 cm"}, cost=9, best_effort=True)
+    def broken() -> None:
+        raise OSError("no such device")
+
+    one.context("docked", when="/battery.charging and ~gain > 3")
+    one.context("away", requires={"rate": at_least("20 Hz")}, profiles=["fast"])
+    return one
+
+
+@pytest.fixture
+def running(core: RosCore, background: Background) -> Iterator[Member]:
+    """The resource of this module."""
+    made: list[Member] = []
+
+    async def start() -> None:
+        made.append(Member(sonar(), core.uri, window=0.2))
+        await made[0].start()
+
+    background.do(start())
+    yield made[0]
+    background.do(made[0].close())
+
+
+@pytest.fixture
+def remote(core: RosCore, background: Background) -> Iterator[list[dict[str, Any]]]:
+    """What a bridge would show of peer base: another sonar (its services hidden by ours), and a lidar."""
+    asked: list[dict[str, Any]] = []
+    nodes: list[Node] = []
+
+    def configured(request: Any) -> dict[str, Any]:
+        asked.append(read_config(request.config))
+        if asked[-1].get("profile") == "fast":
+            raise ConfigError("profile fast", "it could not be applied: jammed")
+        return {}
+
+    async def start() -> None:
+        for name in ("sonar", "lidar"):
+            node = Node(f"/rmpa/base/{name}", master_uri=core.uri, environment=RosEnvironment())
+            await node.__aenter__()
+            nodes.append(node)
+            decision = {"profile": "fast", "chosen": "", "scores": []}
+            texts = {
+                "descriptor": describe(sonar(), f"/{name}").serialize(), "state": "active", "profile": "fast",
+                "context": "away", "decision": json.dumps(decision),
+            }  # fmt: skip
+            for topic, text in texts.items():
+                publisher = await node.advertise(f"/{name}/{topic}", "std_msgs/String", latch=True)
+                publisher.publish(publisher.make({"data": text}))
+        await nodes[1].advertise_service("/lidar/set_parameters", "dynamic_reconfigure/Reconfigure", configured)
+        strange = await nodes[1].advertise("/strange/descriptor", "std_msgs/String", latch=True)
+        strange.publish(strange.make({"data": "{}"}))
+
+    async def stop() -> None:
+        for node in nodes:
+            await node.close()
+
+    background.do(start())
+    yield asked
+    background.do(stop())
+
+
+def as_json(rmpa: Rmpa, *words: str) -> Any:
+    code, out, err = rmpa(*words, "--json")
+    assert code == 0, err
+    return json.loads(out)
+
+
+def rows(rmpa: Rmpa, *words: str) -> list[list[str]]:
+    """A table's rows, each with its first three cells."""
+    code, out, err = rmpa(*words)
+    assert code == 0, err
+    return [line.split()[:3] for line in out.splitlines()]
+
+
+def test_resources_here_and_at_peers(rmpa: Rmpa, running: Member, remote: object) -> None:
+    assert rows(rmpa, "resource", "list") == [
+        ["RESOURCE", "STATE", "ROLE"],
+        ["/sonar", "active", "sensing"],
+        ["base:/lidar", "active", "sensing"],
+        ["base:/sonar", "active", "sensing"],
+    ]
+    assert "\x1b" not in rmpa("resource", "list")[1]
+    listed = as_json(rmpa, "resource", "list")
+    assert [(one["name"], one["peer"], one["profile"], one["context"]) for one in listed] == [
+        ("/sonar", None, "slow", ""), ("/lidar", "base", "fast", "away"), ("/sonar", "base", "fast", "away"),
+    ]  # fmt: skip
+    # One that is named without its peer is this module's, if there is one; else whose it is is known.
+    for name, peer in (("sonar", None), ("base:/sonar", "base"), ("/lidar", "base")):
+        assert as_json(rmpa, "profile", "get", name)["peer"] == peer
+    assert rmpa("profile", "get") == (0, "slow\n", "")
+    assert rmpa("resource", "info", "sonra")[2] == "rmpa: no resource /sonra; did you mean /sonar?\n"
+    assert rmpa("resource", "info", "other:/sonar")[0] == 1
+    assert rmpa("resource", "info", "a b")[0] == 2
+
+
+def test_all_of_a_resource(rmpa: Rmpa, running: Member) -> None:
+    code, out, _ = rmpa("resource", "info")
+    assert code == 0
+    lines = [" ".join(line.split()) for line in out.splitlines()]
+    for line in (
+        "Resource: /sonar (sensing, simulated)",
+        "State: active",
+        "Profile: slow",
+        "Health: OK: profile slow",
+        "/sonar/ranges sensor_msgs/Range deadline 0.1",
+        "gain 1 dB 0.5 .. of the amplifier",
+        "beam wide wide | narrow",
+        "accuracy not measured min performance",
+        "slow 1 rate 10 Hz, accuracy 0.05 m cheap",
+        "docked /battery.charging and ~gain > 3",
+        "away by hand",
+    ):
+        assert line in lines, out
+    about = as_json(rmpa, "resource", "info", "sonar")
+    assert about["parameters"] == {"gain": 1.0, "beam": "wide", "profile": "", "context": ""}
+    assert about["health"]["values"]["profile"] == "slow"
+    assert about["descriptor"]["profiles"][1]["name"] == "fast"
+
+
+def test_a_profile_by_hand(rmpa: Rmpa, running: Member, remote: list[dict[str, Any]]) -> None:
+    assert rmpa("profile", "set", "sonar", "fast") == (0, "", "")
+    assert running.adapter.loop.profile == "fast"
+    assert rows(rmpa, "profile", "list", "sonar")[2] == ["fast", "runs,", "by"]
+    code, out, err = rmpa("profile", "set", "sonar", "broken")
+    assert (code, out) == (1, "")
+    assert err == (
+        "rmpa: /sonar: profile broken: it could not be applied: OSError: no such device; "
+        "what was chosen before stays\n"
+    )
+    assert as_json(rmpa, "profile", "get", "sonar")["chosen"] == "fast"
+    assert as_json(rmpa, "profile", "list", "sonar")["left_out"] == {"broken": "OSError: no such device"}
+    assert rmpa("profile", "set", "sonar", "fsat") == (
+        2, "", "rmpa: PROFILE: there is no profile 'fsat'; did you mean fast?\n"
+    )  # fmt: skip
+    assert rmpa("profile", "set", "sonar")[0] == rmpa("profile", "set", "sonar", "fast", "--auto")[0] == 2
+    assert rmpa("profile", "set", "sonar", "--auto")[0] == 0
+    assert rmpa("profile", "get", "sonar")[1] == "slow\n"
+    # A peer's is set at the peer; one whose services ours hide cannot be.
+    assert rmpa("profile", "set", "base:/lidar", "slow")[0] == 0
+    assert rmpa("profile", "set", "lidar", "fast")[2] == (
+        "rmpa: base:/lidar: profile fast: it could not be applied: jammed\n"
+    )
+    assert remote == [{"profile": "slow"}, {"profile": "fast"}]
+    code, _, err = rmpa("profile", "set", "base:/sonar", "slow")
+    assert code == 1
+    assert "/sonar/set_parameters is served by /sonar, not by peer base" in err
+
+
+def test_a_decision_is_explained(rmpa: Rmpa, running: Member, background: Background) -> None:
+    async def ask() -> None:
+        running.adapter.require("/driver", [("rate", ">= 20 Hz hard"), ("accuracy", "<= 2 cm weight=2")])
+        await running.adapter.settled()
+
+    background.do(ask())
+    code, out, _ = rmpa("profile", "explain", "sonar")
+    assert code == 0
+    lines = [" ".join(line.split()) for line in out.splitlines()]
+    assert lines[:2] == ["/sonar: profile fast", "asked by /driver"]
+    assert any(line.startswith("slow falls short") and line.endswith("10 Hz 0.5 1") for line in lines), out
+    assert any(line.startswith("fast runs") and "rate at least 20 Hz hard 40 Hz 0 1" in line for line in lines), out
+    assert any(line == "accuracy at most 0.02 m 0.01 m 0 2" for line in lines), out
+    scores = {score["profile"]: score for score in as_json(rmpa, "profile", "explain")["scores"]}
+    assert scores["slow"]["feasible"] is False
+    assert scores["slow"]["terms"][0]["delta"] == pytest.approx(0.5)
+
+
+def test_a_context_by_hand(rmpa: Rmpa, running: Member) -> None:
+    assert rmpa("context", "get") == (0, "\n", "")
+    assert rmpa("context", "set", "sonar", "away") == (0, "", "")
+    assert running.adapter.loop.profile == "fast"
+    assert rmpa("context", "get", "sonar") == (0, "away\n", "")
+    table = [" ".join(line.split()) for line in rmpa("context", "list")[1].splitlines()]
+    assert table == [
+        "CONTEXT NOW WHEN REQUIRES PROFILES OUTPUTS",
+        "docked /battery.charging and ~gain > 3 - any all",
+        "away by hand by hand rate >= 20 Hz fast all",
+    ]
+    code, _, err = rmpa("context", "set", "sonar", "awya")
+    assert (code, err) == (2, "rmpa: CONTEXT: there is no context 'awya'; did you mean away?\n")
+    assert rmpa("context", "set", "sonar", "--auto")[0] == 0
+    assert as_json(rmpa, "context", "get")["context"] == ""
+
+
+def test_alarms(rmpa: Rmpa, core: RosCore, running: Member, background: Background) -> None:
+    assert rmpa("alarm", "list")[1].split() == ["RESOURCE", "LEVEL", "MESSAGE"]
+    assert rows(rmpa, "alarm", "list", "--all")[1] == ["/sonar", "OK", "profile"]
+
+    driver = Node("/driver", master_uri=core.uri, environment=RosEnvironment())
+
+    async def disturb() -> None:
+        await driver.__aenter__()
+        client = ResourceClient(driver, "sonar")
+        await client.__aenter__()
+        await client.require(accuracy=at_most("1 mm", hard=True))
+
+    def when_heard() -> None:
+        """From a thread: the command runs in the main one."""
+        deadline = time.monotonic() + 30
+        while not running.adapter._publishers["alarms"].subscribers and time.monotonic() < deadline:
+            time.sleep(0.02)
+        background.do(disturb())
+
+    asking = threading.Thread(target=when_heard)
+    asking.start()
+    code, out, _ = rmpa("alarm", "echo", "sonar", "-n", "1", "--json")
+    asking.join()
+    assert code == 0
+    alarm = json.loads(out)
+    assert (alarm["resource"], alarm["level"]) == ("/sonar", "ERROR")
+    assert alarm["message"].startswith("non-adaptable: no profile gives accuracy as asked")
+    others: list[Member] = []
+
+    async def start() -> None:
+        others.append(Member(echo(), core.uri, window=0.2))
+        await others[0].start()
+
+    background.do(start())
+    table = rows(rmpa, "alarm", "list", "-a")
+    assert table[1] in (["/echo", "STALE", "nobody"], ["/echo", "STALE", "it"])
+    assert len(table) == 3, table
+    assert table[2] == ["/sonar", "ERROR", "non-adaptable:"]
+    background.do(driver.close())
+    background.do(others[0].close())
+
+
+def test_nobody_is_there(rmpa: Rmpa, core: RosCore) -> None:
+    assert as_json(rmpa, "resource", "list") == []
+    text = "rmpa: there is no resource; `rmpa run` runs one, `rmpa resource list` shows all\n"
+    assert rmpa("profile", "list") == (1, "", text)
