@@ -398,9 +398,8 @@ class Adaptation:
         for trouble in self._knows.troubles.values():
             if trouble.until <= now:
                 trouble.until = math.inf  # it may be taken again; how long it was out is remembered
-        if over:
-            if actions := self._asked_anew(now, f"what {', '.join(over)} asked for has expired"):
-                return actions
+        if over and (actions := self._asked_anew(now, f"what {', '.join(over)} asked for has expired")):
+            return actions
         return self._plan(now, "a profile's cool-down is over")
 
     # --- planning -----------------------------------------------------------------------------------------------

@@ -242,3 +242,43 @@ async def test_between_pause_and_resume_no_run_is_under_way(bench: Bench, kind: 
             assert len(count.times) == ran
             bench.tasks.resume()
             await asyncio.sleep(0.01)
+
+
+@pytest.mark.parametrize("kind", ["thread", "coroutine"])
+async def test_a_task_that_leaves_by_the_back_door_is_seen_and_goes_on(bench: Bench, kind: str) -> None:
+    count = Counter(2)
+
+    def plain() -> None:
+        count()
+        raise SystemExit(3)
+
+    async def coroutine() -> None:
+        count()
+        raise asyncio.CancelledError  # what it waited for was cancelled, not it
+
+    bench.resource.task(rate=100)(plain if kind == "thread" else coroutine)
+    bench.tasks.activate()
+    assert ("SystemExit" if kind == "thread" else "CancelledError") in (await bench.problem("failed")).text
+    await count.wait()
+
+
+async def test_a_stuck_run_holds_up_no_profile_for_ever(bench: Bench) -> None:
+    release, entered = threading.Event(), threading.Event()
+    count = Counter(3)
+
+    def stuck_once() -> None:
+        count()
+        if not entered.is_set():
+            entered.set()
+            release.wait(30)
+
+    bench.resource.task(rate=100, stuck_after="300 ms")(stuck_once)
+    bench.tasks.activate()
+    await bench.problem("stuck")
+    await count.wait()
+    begin = time.monotonic()
+    for _ in range(4):  # each would wait a second for the run that was given up
+        await bench.tasks.pause()
+        bench.tasks.resume()
+    assert time.monotonic() - begin < 3.0
+    release.set()

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from rmpa.core import limits
+from rmpa.core.aio.threads import in_thread
 from rmpa.core.errors import ConfigError
 from rmpa.resource.adaptation import (
     Action,
@@ -424,7 +425,7 @@ class Adapter(RuntimePart):
             if inspect.iscoroutinefunction(function):
                 await function()
             else:
-                outcome = await asyncio.to_thread(function)
+                outcome = await in_thread(function, f"profile {profile}")
                 if outcome is not None:
                     await outcome
         except Exception as error:  # noqa: BLE001 - the top of the user's code

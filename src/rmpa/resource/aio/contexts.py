@@ -12,6 +12,7 @@ import logging
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core import limits
+from rmpa.core.aio.threads import in_thread
 from rmpa.core.config_values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource.aio.runtime import RuntimePart
@@ -311,7 +312,7 @@ async def _enter(context: Context) -> None:
         async with asyncio.timeout(timeout):
             if inspect.iscoroutinefunction(context.enter):
                 await context.enter()
-            elif (outcome := await asyncio.to_thread(context.enter)) is not None:
+            elif (outcome := await in_thread(context.enter, f"context {context.name}")) is not None:
                 await outcome
     except TimeoutError:
         raise PeerRefused(f"context {context.name}", f"its function has not ended after {timeout:g} s") from None

@@ -7,6 +7,7 @@ import inspect
 import logging
 from typing import TYPE_CHECKING
 
+from rmpa.core.aio.threads import in_thread
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource.aio.adapt import Adapter
 from rmpa.resource.aio.contexts import Contexts
@@ -156,7 +157,7 @@ class Member:
             if inspect.iscoroutinefunction(hook):
                 await hook()
             elif hook is not None:
-                outcome = await asyncio.to_thread(hook)
+                outcome = await in_thread(hook, transition.value)
                 if outcome is not None:
                     await outcome
         except Exception as error:  # noqa: BLE001 - the top of the user's code

@@ -48,22 +48,22 @@ class Gate:
     def __init__(self) -> None:
         self._change = threading.Condition()
         self._closers: set[str] = set()
-        self._within = 0
+        self._within: set[object] = set()
 
-    def enter(self, ended: Callable[[], bool]) -> bool:
+    def enter(self, who: object, ended: Callable[[], bool]) -> bool:
         """Wait in a thread until it is open, or ``ended`` says that nobody need go in any more (then false)."""
         with self._change:
             while self._closers:
                 if ended():
                     return False
                 self._change.wait(_SLICE)
-            self._within += 1
+            self._within.add(who)
             return True
 
-    def leave(self) -> None:
-        """The run has ended."""
+    def leave(self, who: object) -> None:
+        """The run has ended; or it is stuck, and nobody is to wait for it any more."""
         with self._change:
-            self._within -= 1
+            self._within.discard(who)
             self._change.notify_all()
 
     def close(self, who: str) -> None:
@@ -82,12 +82,12 @@ class Gate:
             self._closers.discard(who)
             self._change.notify_all()
 
-    async def enter_soon(self) -> None:
+    async def enter_soon(self, who: object) -> None:
         """As ``enter``, in the loop."""
         while True:
             with self._change:
                 if not self._closers:
-                    self._within += 1
+                    self._within.add(who)
                     return
             await asyncio.sleep(_GATE_LOOK)
 
@@ -294,9 +294,11 @@ class _AsyncRunner(_Runner):
         self._wake = asyncio.Event()
         self._task = asyncio.get_running_loop().create_task(self._run(), name=f"task {self.task.name}")
 
-    def stop(self, *, stuck: bool = False) -> None:  # noqa: ARG002 - a coroutine can always be cancelled
+    def stop(self, *, stuck: bool = False) -> None:
         """End, in the middle of a run too."""
         self.stopped = True
+        if stuck:
+            self._gate.leave(self)
         self._task.cancel()
 
     async def ended(self) -> None:
@@ -348,7 +350,7 @@ class _AsyncRunner(_Runner):
 
     async def _once(self, due: float, message: Received | None) -> bool:
         """One run; false after a failure and its pause."""
-        await self._gate.enter_soon()
+        await self._gate.enter_soon(self)
         self.figures.begun(due, time.monotonic())
         try:
             try:
@@ -356,8 +358,11 @@ class _AsyncRunner(_Runner):
                 if outcome is not None:
                     await outcome
             finally:
-                self._gate.leave()
-        except Exception as error:  # noqa: BLE001 - the top of the user's code
+                self._gate.leave(self)
+        except (Exception, SystemExit, asyncio.CancelledError) as error:
+            own = asyncio.current_task()
+            if isinstance(error, asyncio.CancelledError) and own is not None and own.cancelling():
+                raise  # it is us that are to end, not something that the run waited for
             text = await asyncio.to_thread(self._error, error)  # the traceback reads source files
         else:
             self.figures.ended(time.monotonic())
@@ -390,6 +395,7 @@ class _ThreadRunner(_Runner):
         self._end.set()
         self._ready.release()
         if stuck:
+            self._gate.leave(self)
             self._done.set()
 
     async def ended(self) -> None:
@@ -446,15 +452,15 @@ class _ThreadRunner(_Runner):
 
     def _once(self, due: float, message: Received | None) -> bool:
         """One run; false after a failure and its pause."""
-        if not self._gate.enter(self._end.is_set):
+        if not self._gate.enter(self, self._end.is_set):
             return False
         self.figures.begun(due, time.monotonic())
         try:
             try:
                 self.task.function(*self._arguments(message))
             finally:
-                self._gate.leave()
-        except Exception as error:  # noqa: BLE001 - the top of the user's code
+                self._gate.leave(self)
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - the top of the user's code
             text = self._error(error)
         else:
             self.figures.ended(time.monotonic())
