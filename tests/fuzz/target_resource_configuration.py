@@ -1,0 +1,64 @@
+"""Fuzz target: what any node of any module may send to a resource's configuration, and rules of contexts."""
+
+from __future__ import annotations
+
+from rmpa.core.errors import ConfigError
+from rmpa.resource.contexts import parse_rule
+from rmpa.resource.declare import Resource
+from rmpa.resource.reconfigure import CONFIG_TYPE, checked, config, entries, from_server, read_config
+from rmpa.ros.messages import MessageError, MessageType
+
+_ONE = Resource("one", role="sensing")
+_ONE.parameter("gain", 1.0, low=0.5, high=2.0)
+_ONE.parameter("count", 1, low=0)
+_ONE.parameter("word", "a", choices=("a", "b"))
+_ONE.parameter("on", True)
+_ONE.profile(offers={}, name="plain")(lambda: None)
+_ONE.context("docked", when="~on")
+_KNOWN = entries(_ONE)
+_CONFIG = MessageType(CONFIG_TYPE)
+
+
+def _message(**values: bool | float | str) -> bytes:
+    return b"C" + _CONFIG.serialize(_CONFIG.make(config(values, _KNOWN)))
+
+
+SEEDS: list[bytes] = [
+    _message(gain=1.5, count=2, word="b", on=False, profile="plain", context="docked"),
+    _message(gain=float("nan")),
+    _message(profile="automatic"),
+    b"R/battery/charging == true and ~gain > 3",
+    b"Rnot (~on or /a.b.c <= -1.5e3) and ~word != 'a b'",
+    b"R((((~on))))",
+]
+
+
+def fuzz(data: bytes) -> None:
+    """A documented error, or values that the parameters can have."""
+    if data[:1] == b"R":
+        _rule(data[1:].decode("utf-8", "replace"))
+        return
+    try:
+        values = read_config(_CONFIG.deserialize(data[1:]))
+        found = checked(values, _KNOWN, _ONE.parameters)
+    except (MessageError, ConfigError) as error:
+        str(error)
+        return
+    for name, value in found.items():
+        if name in _ONE.parameters:
+            _ONE.parameters[name].check(value)
+        elif value not in [choice.value for choice in _KNOWN[name].choices]:
+            raise AssertionError(f"{name} = {value!r} was let through")
+    from_server(values, _KNOWN, _ONE.parameters)
+
+
+def _rule(text: str) -> None:
+    try:
+        rule = parse_rule(text, _ONE.parameters)
+    except ConfigError as error:
+        str(error)
+        return
+    for value in (True, -1.5, "a"):
+        if rule.holds(dict.fromkeys((r.text for r in rule.references), value)) is None:
+            raise AssertionError(f"{text!r}: all is known, and still nothing decided")
+    rule.holds({})
