@@ -72,6 +72,27 @@ def test_gaps_in_the_numbers_are_losses_and_a_restart_is_none() -> None:
     assert quality.window(2.0)["loss"] == 0.0
 
 
+def test_each_publisher_has_its_own_numbers() -> None:
+    quality = TopicQuality(0.0, stamped=True, numbered=True)
+    for number in range(5):
+        for source, first in (("/left", 10), ("/right", 5000)):
+            quality.message(stamped(first + number, 0.0), 0.1 * number, WALL, source)
+    assert quality.window(1.0)["loss"] == 0.0
+
+
+def test_under_another_profile_everything_begins_anew() -> None:
+    quality = TopicQuality(0.0, deadline=0.15)
+    feed(quality, [0.1, 0.4, 0.8])
+    quality.restart(2.0)
+    feed(quality, [2.1, 2.2, 2.3])
+    found = quality.window(2.3)
+    assert (found["rate"], found["deadline_misses"]) == (pytest.approx(10.0), 0.0)
+    accuracy = ObservedQuality(Attribute("accuracy", Direction.MIN, "m"))
+    accuracy.observe(5.0)
+    accuracy.restart()
+    assert accuracy.window() is None
+
+
 def test_numbers_go_round() -> None:
     quality = TopicQuality(0.0, stamped=True, numbered=True)
     feed(quality, [0.1], first=(1 << 32) - 1)

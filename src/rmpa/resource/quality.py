@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 _HEADER: Final = struct.Struct("<III")
 _SECOND: Final = 1_000_000_000
-_NO_SEQUENCE: Final = -1
+_SOURCES: Final = 64
+"""Publishers of one topic whose numbers are followed; with more of them all begin anew."""
 _SEQUENCES: Final = 1 << 32
 _HALF: Final = 1 << 31
 
@@ -26,7 +27,7 @@ class TopicQuality:
     Args:
         now: Monotonic seconds.
         stamped: Whether its messages begin with a ``std_msgs/Header``.
-        numbered: Whether that header's ``seq`` counts the messages of one source (an input of one publisher).
+        numbered: Whether that header's ``seq`` counts the messages of each source, as the client libraries let it.
         deadline: Seconds from one message to the next at the most, or ``None``.
     """
 
@@ -39,7 +40,7 @@ class TopicQuality:
         self._began = now
         self._last: float | None = None
         self._last_age = math.nan
-        self._sequence = _NO_SEQUENCE
+        self._sequences: dict[str, int] = {}
         self._clear()
 
     def _clear(self) -> None:
@@ -53,13 +54,14 @@ class TopicQuality:
         self._bytes = 0
         self._lost = 0
 
-    def message(self, raw: bytes | memoryview, now: float, now_ns: int) -> None:
+    def message(self, raw: bytes | memoryview, now: float, now_ns: int, source: str = "") -> None:
         """Take one message.
 
         Args:
             raw: Its bytes, without the length.
             now: Monotonic seconds at which it left, or came.
             now_ns: The same by the wall clock, which its stamp is of.
+            source: Who sent it: each publisher has its own numbers.
         """
         last, self._last = self._last, now
         if last is not None:
@@ -78,14 +80,24 @@ class TopicQuality:
                 self._latency += self._last_age
                 self._stamps += 1
             if self._numbered:
-                self._follow(sequence)
+                self._follow(sequence, source)
 
-    def _follow(self, sequence: int) -> None:
-        before, self._sequence = self._sequence, sequence
-        if before != _NO_SEQUENCE:
+    def _follow(self, sequence: int, source: str) -> None:
+        before = self._sequences.get(source)
+        if before is None and len(self._sequences) >= _SOURCES:
+            self._sequences.clear()
+        self._sequences[source] = sequence
+        if before is not None:
             gap = (sequence - before - 1) % _SEQUENCES
             if gap < _HALF:
                 self._lost += gap
+
+    def restart(self, now: float) -> None:
+        """Another profile runs: a new window begins, without what was measured before."""
+        self._began = now
+        if self._last is not None:
+            self._last = now  # the pause between the two is nobody's period
+        self._clear()
 
     def window(self, now: float) -> dict[str, Value]:
         """What was measured since the last window, by the names of ``attributes.MEASURED``; a new window begins."""
@@ -121,10 +133,15 @@ class ObservedQuality:
     """An attribute of the user's own: the mean of a window's observations, or its last word.
 
     Without a new observation the last window's value stands: a battery's charge is not unknown because nobody looked.
+    But under another profile nothing is known before it is observed anew.
     """
 
     def __init__(self, attribute: Attribute) -> None:
         self._attribute = attribute
+        self.restart()
+
+    def restart(self) -> None:
+        """Another profile runs: what was observed before says nothing of it."""
         self._sum = 0.0
         self._count = 0
         self._value: Value | None = None

@@ -152,7 +152,7 @@ class Adapter(RuntimePart):
         self._bar()
         self._act(self.loop.pin(self.chosen, now) if self.chosen else self.loop.start(now))
         self._respond()
-        self._later("window", self._window, self._end_window)
+        self._next_window(now)
         self._later("clients", _LOOK, self._look_at_clients)
 
     async def close(self) -> None:
@@ -177,7 +177,7 @@ class Adapter(RuntimePart):
     def received(self, item: Input, message: Received) -> None:
         """Measure an input."""
         if (quality := self._topics.get(item.name)) is not None:
-            quality.message(message.raw, self._loop.time(), message.stamp_ns)
+            quality.message(message.raw, self._loop.time(), message.stamp_ns, message.caller_id)
 
     def observed(self, attribute: str, value: Value) -> None:
         """Measure an attribute of the user's own."""
@@ -189,8 +189,25 @@ class Adapter(RuntimePart):
         """The last window, by attribute."""
         return self._measured
 
-    def _end_window(self) -> None:
-        self._later("window", self._window, self._end_window)
+    def _next_window(self, began: float) -> None:
+        """By the clock, so that windows do not get longer by how late each ends."""
+        if not self._closed:
+            due = max(began + self._window, self._loop.time())
+            self._timers["window"] = self._loop.call_at(due, self._end_window, due)
+
+    def _restart_windows(self) -> None:
+        """Another profile runs: it is not judged by what was measured under the last one."""
+        now = self._loop.time()
+        for topic in self._topics.values():
+            topic.restart(now)
+        for quality in self._observed.values():
+            quality.restart()
+        if (timer := self._timers.get("window")) is not None:
+            timer.cancel()
+            self._next_window(now)
+
+    def _end_window(self, due: float) -> None:
+        self._next_window(due)
         now = self._loop.time()
         measured: dict[str, Value] = {}
         for position, (name, topic) in enumerate(self._topics.items()):
@@ -401,6 +418,7 @@ class Adapter(RuntimePart):
                     self._publish_alarm(action.alarm, cleared=True)
                 case Reacted():
                     self.reaction = action.reaction
+                    self._restart_windows()
                     _log.info("= %s: %s runs, after %.3g s", self._runtime.node.name, action.profile, action.reaction)
             for listener in self.listeners:
                 listener(action)
