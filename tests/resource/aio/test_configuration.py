@@ -279,3 +279,25 @@ async def test_a_field_that_is_not_there_is_said(lamp: Lamp, node: Node) -> None
     text = "rule over /battery/power_supply_status: std_msgs/Bool has no power_supply_status; it has data"
     await until(lambda: any(text in s.message for m in health for s in m.status), "nobody says what is wrong")
     assert lamp.member.contexts.current == ""
+
+
+async def test_a_rule_over_its_own_topics(core: RosCore, node: Node) -> None:
+    one = Resource("gauge", role="sensing")
+    orders = one.input("/orders", TEXT, required=False)
+    said = one.output("said", TEXT)
+    one.profile(offers={}, name="plain")(lambda: None)
+    one.task(on=orders, name="repeat")(lambda message: said.publish(data=message.data))
+    one.context("told", when="/orders == 'go' and /gauge/said.data == 'go'")
+    member = Member(one, core.uri)
+    member.contexts.chosen = "gone"  # of an earlier version of the file
+    await member.start()
+    assert member.contexts.chosen == member.contexts.current == ""
+    sender = await node.advertise("/orders", TEXT)
+    await sender.wait_for_subscriber()
+    contexts = member.contexts
+    for word, wanted in (("go", "told"), ("stop", "")):
+        async with asyncio.timeout(DEADLINE):
+            while contexts.current != wanted:
+                sender.publish(sender.make({"data": word}))
+                await asyncio.sleep(0.05)
+    await member.close()

@@ -69,6 +69,8 @@ class Contexts(RuntimePart):
         }
         self._parameters = {r.text: r.parameter for rule in rules.values() for r in rule.references if r.parameter}
         self._subscribers: dict[str, Subscriber] = {}
+        self._taps: dict[str, str] = {}
+        """By input or output: its topic, if a rule names it."""
         self._latest: dict[str, tuple[MessageType, bytes]] = {}
         self._current = ""
         self._retry = 0.0
@@ -104,9 +106,12 @@ class Contexts(RuntimePart):
         """Hear what is chosen, and look at the rules."""
         self._loop, self._closed = asyncio.get_running_loop(), False
         await self._runtime.say(TOPIC, "")
+        node = self._runtime.node
+        if self.chosen and self.chosen not in self._known:
+            _log.warning("! %s: there is no context %s any more", node.name, printable(self.chosen))
+            self.chosen = ""
         if not self._known:
             return
-        node = self._runtime.node
         await node.subscribe(f"{node.name}/set_context", "std_msgs/String", self._heard)
         if self.chosen:
             try:
@@ -156,11 +161,13 @@ class Contexts(RuntimePart):
 
     def received(self, item: Input, message: Received) -> None:
         """An input's topic may be a rule's too."""
-        self._take(topic_of(item.name, self._runtime.node.name), item.type, message.raw)
+        if item.name in self._taps:
+            self._take(self._taps[item.name], item.type, message.raw)
 
     def published(self, output: Output, raw: bytes, now_ns: int) -> None:  # noqa: ARG002 - as the others have it
         """An output's likewise."""
-        self._take(topic_of(output.name, self._runtime.node.name), output.type, raw)
+        if output.name in self._taps:
+            self._take(self._taps[output.name], output.type, raw)
 
     def parameter_changed(self, parameter: Parameter) -> None:
         """A parameter's value may be a rule's."""
@@ -168,9 +175,8 @@ class Contexts(RuntimePart):
             self._soon()
 
     def _take(self, topic: str, kind: MessageType, raw: bytes) -> None:
-        if any(source.topic == topic for source in self._sources.values()):
-            self._latest[topic] = kind, raw
-            self._soon()
+        self._latest[topic] = kind, raw
+        self._soon()
 
     def _values(self) -> dict[str, Scalar]:
         parameters = self._runtime.resource.parameters
@@ -199,8 +205,13 @@ class Contexts(RuntimePart):
 
     async def _listen(self, topic: str) -> None:
         runtime = self._runtime
-        own = {topic_of(name, runtime.node.name) for name in (*runtime.resource.inputs, *runtime.resource.outputs)}
-        if topic in own or topic in self._subscribers:
+        own = [
+            n
+            for n in (*runtime.resource.inputs, *runtime.resource.outputs)
+            if topic_of(n, runtime.node.name) == topic
+        ]
+        self._taps.update(dict.fromkeys(own, topic))
+        if own or topic in self._subscribers:
             return  # it comes to us anyway
 
         def heard(message: Received) -> None:
