@@ -7,7 +7,7 @@ from typing import Any
 
 from rmpa.resource import Resource, at_least, at_most
 
-keeper = Resource("keeper", role="controlling", description="keeps a distance to what the sonar sees")
+keeper = Resource("keeper", role="controlling", physical=False, description="keeps a distance to what the sonar sees")
 ranges = keeper.input("/sonar/ranges", "sensor_msgs/Range")
 speed = keeper.output("/cmd_vel", "geometry_msgs/Twist")
 distance = keeper.parameter("distance", 1.0, low=0.3, high=3.0, unit="m")

@@ -1,0 +1,111 @@
+"""The tutorial of Smart Resources, word for word: its files, its commands, and what they print."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from tests.interop.processes import Process, eventually
+from tests.interop.ros import free_port
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+ROOT: Final = Path(__file__).parents[2]
+FILES: Final = ROOT / "examples" / "resources"
+TUTORIAL: Final = (ROOT / "docs" / "tutorials" / "resources.md").read_text(encoding="utf-8")
+STEP: Final = re.compile(r"^```console\n(.*?)^```$|^<!-- ctrl-c: (\S+) -->$", re.MULTILINE | re.DOTALL)
+COMMAND: Final = re.compile(r"^\$ (.*)\n((?:[^$].*\n)*)", re.MULTILINE)
+NUMBER: Final = re.compile(r"\d+(?:\.\d+)?(?:e-?\d+)?")
+
+
+def test_its_files_are_the_examples() -> None:
+    shown = re.findall(r"`(\w+\.py)`[^`]*:\n\n```python\n(.*?)^```$", TUTORIAL, re.MULTILINE | re.DOTALL)
+    assert [name for name, _ in shown] == ["sonar.py", "keeper.py", "ask.py"]
+    for name, text in shown:
+        assert (FILES / name).read_text(encoding="utf-8") == text, name
+
+
+class Terminals:
+    """A machine's terminals, in the folder of the files; its ports are free ones, its state is nobody's."""
+
+    def __init__(self, home: str) -> None:
+        kept = {key: value for key, value in os.environ.items() if not key.startswith(("ROS_", "RMPA_", "XDG_"))}
+        self.ports = {"11322": str(free_port())}
+        self.environ = kept | {
+            "HOME": home,
+            "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+            "RMPA_RUNTIME_DIR": home,
+            "RMPA_CORE_PORT": str(free_port()),
+            "RMPA_MULTICAST": f"239.255.82.77:{20000 + os.getpid() % 12000}",
+            "NO_COLOR": "1",
+        }
+        self.running: dict[str, Process] = {}
+
+    def type(self, command: str, shown: str) -> None:
+        for port, free in self.ports.items():
+            command = command.replace(port, free)
+        words = shlex.split(command)
+        if words[0] == "export":
+            name, _, value = words[1].partition("=")
+            self.environ[name] = value
+        elif words[:2] == ["rmpa", "run"]:
+            words[2] = str(FILES / words[2])
+            self.running[Path(words[2]).name] = process = Process(words, env=self.environ, name=words[2])
+            process.wait_for(": active on ")
+        else:
+            eventually(lambda: self._prints(words, shown), 40, what=f"what is shown of {command}", every=0.3)
+
+    def interrupt(self, file: str) -> None:
+        assert self.running.pop(file).interrupt() == 0
+
+    def close(self) -> None:
+        while self.running:
+            _, process = self.running.popitem()
+            if process.returncode is None:
+                process.interrupt()
+            process.end()
+
+    def _prints(self, words: list[str], shown: str) -> bool:
+        done = subprocess.run(
+            words, env=self.environ, cwd=FILES, stdout=subprocess.PIPE, text=True, timeout=40, check=False
+        )
+        said = plain(done.stdout)
+        print(f"$ {shlex.join(words)}\n{done.stdout}")
+        wanted = ".*".join(re.escape(plain(part)) for part in shown.split("…\n"))
+        return done.returncode == 0 and re.fullmatch(wanted, said, re.DOTALL) is not None
+
+
+def plain(text: str) -> str:
+    """The text without what differs from time to time: numbers, how wide columns are, empty lines."""
+    lines = [" ".join(line.split()) for line in NUMBER.sub("N", text).splitlines()]
+    return "".join(f"{line}\n" for line in lines if line)
+
+
+@pytest.fixture
+def terminals() -> Iterator[Terminals]:
+    with tempfile.TemporaryDirectory(prefix="rmpa-test-") as home:
+        one = Terminals(home)
+        yield one
+        one.close()
+
+
+@pytest.mark.timeout(240)
+def test_its_commands_do_what_it_says(terminals: Terminals) -> None:
+    typed = 0
+    for step in STEP.finditer(TUTORIAL):
+        if step[2]:
+            terminals.interrupt(step[2])
+        for command, shown in COMMAND.findall(step[1] or ""):
+            terminals.type(command, shown)
+            typed += 1
+    assert typed == 18
+    assert all("Traceback" not in process.output for process in terminals.running.values())
