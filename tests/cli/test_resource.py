@@ -204,10 +204,21 @@ def test_a_profile_by_hand(rmpa: Rmpa, running: Member, remote: list[dict[str, A
     assert "/sonar/set_parameters is served by /sonar, not by peer base" in err
 
 
-def test_a_decision_is_explained(rmpa: Rmpa, running: Member, background: Background) -> None:
+def test_a_decision_is_explained(rmpa: Rmpa, core: RosCore, background: Background) -> None:
+    driver = Node("/driver", master_uri=core.uri, environment=RosEnvironment())
+    members: list[Member] = []
+
     async def ask() -> None:
-        running.adapter.require("/driver", [("rate", ">= 20 Hz hard"), ("accuracy", "<= 2 cm weight=2")])
-        await running.adapter.settled()
+        members.append(Member(sonar(), core.uri, window=60))  # nothing is measured meanwhile
+        await members[0].start()
+        await driver.__aenter__()
+        client = await ResourceClient(driver, "sonar").__aenter__()
+        await client.require(rate=at_least("20 Hz", hard=True), accuracy=at_most("2 cm", weight=2))
+        await members[0].adapter.settled()
+
+    async def stop() -> None:
+        await driver.close()
+        await members[0].close()
 
     background.do(ask())
     code, out, _ = rmpa("profile", "explain", "sonar")
@@ -220,6 +231,7 @@ def test_a_decision_is_explained(rmpa: Rmpa, running: Member, background: Backgr
     scores = {score["profile"]: score for score in as_json(rmpa, "profile", "explain")["scores"]}
     assert scores["slow"]["feasible"] is False
     assert scores["slow"]["terms"][0]["delta"] == pytest.approx(0.5)
+    background.do(stop())
 
 
 def test_a_context_by_hand(rmpa: Rmpa, running: Member) -> None:
