@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 
 import pytest
 
@@ -26,7 +27,9 @@ FAST = Profile("fast", {"rate": 40.0, "latency": 0.01}, cost=9)
 MIDDLE = Profile("middle", {"rate": 20.0, "latency": 0.02}, cost=5)
 SLOW = Profile("slow", {"rate": 5.0, "latency": 0.1}, cost=1)
 LIMP = Profile("limp", {"rate": 1.0, "latency": 0.5}, best_effort=True, cost=2)
-SETTINGS = AdaptationSettings(violations=2, windows=3, improvement=0.05, dwell=2.0, cool_down=10.0, apply_timeout=5.0)
+SETTINGS = AdaptationSettings(
+    violations=2, windows=3, improvement=0.05, dwell=2.0, settle=0.0, cool_down=10.0, apply_timeout=5.0
+)
 
 
 def loop(*profiles: Profile) -> Adaptation:
@@ -399,3 +402,20 @@ def test_who_says_the_same_again_does_not_skip_the_dwell() -> None:
     one.bar({}, 1.6)
     assert one.require(at_least(20.0, hard=True), 1.7) == []
     assert one.profile == "fast"
+
+
+def test_what_the_profile_before_left_in_queues_is_not_held_against_the_next_one() -> None:
+    one = Adaptation(ATTRIBUTES, Decider("camera", ATTRIBUTES, (FAST, MIDDLE, LIMP)), replace(SETTINGS, settle=1.5))
+    one.start(0.0)
+    one.require(at_least(15, hard=True), 0.0)
+    finish(one, 0.0)
+    assert one.profile == "middle"
+    for second in range(1, 5):
+        one.window({"rate": 20.0}, float(second))
+    one.window({"rate": 2.0}, 5.0)
+    assert applies(one.window({"rate": 2.0}, 6.0)) == ["fast"]
+    finish(one, 6.0)
+    # The windows that began at 6 and 7 s are of what was still on its way.
+    assert [one.window({"rate": 2.0}, 7.0), one.window({"rate": 2.0}, 8.0)] == [[], []]
+    assert one.window({"rate": 2.0}, 9.0) == []
+    assert [kind for kind, _, _ in alarms(one.window({"rate": 2.0}, 10.0))] == [AlarmKind.NON_ADAPTABLE]

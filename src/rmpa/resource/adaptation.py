@@ -49,6 +49,8 @@ class AdaptationSettings:
         windows: ``n``: … of the last so many are a disturbance.
         improvement: ``h``: a change without a disturbance must lessen the distance by more than this.
         dwell: Seconds that a profile runs at least before such a change.
+        settle: Seconds behind a change for which windows that begin in them are not judged: what the profile before
+            left in queues is still on its way.
         cool_down: Seconds that a profile is left out after it failed or disappointed.
         cool_down_max: The same at most, when it does so again and again.
         apply_timeout: Seconds after which a profile that is being applied counts as hung.
@@ -58,6 +60,7 @@ class AdaptationSettings:
     windows: int = 3
     improvement: float = 0.05
     dwell: float = 2.0
+    settle: float = 1.0
     cool_down: float = 10.0
     cool_down_max: float = 160.0
     apply_timeout: float = 5.0
@@ -302,7 +305,7 @@ class Adaptation:
         """A window of quality has ended under the active profile; what was not measured is not judged."""
         began = max(self._window, self._since) if self._window is not None else now
         self._window = now
-        if self._state is not ProfileState.ACTIVE:
+        if self._state is not ProfileState.ACTIVE or began < self._since + self._settings.settle:
             return []
         short = self._shortfalls(measured)
         windows = self._knows.windows
