@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -92,6 +92,12 @@ def test_wishes_read_as_people_write_them() -> None:
     assert shown == [">= 20 Hz hard", "<= 3 weight=2", "1 .. 3 m", "= a | b"]
 
 
+async def _later() -> bool:
+    return True
+
+
+NEEDS_ONE: Any = len
+NEEDS_LATER: Any = _later
 MISTAKES: list[tuple[Callable[[Resource], object], str]] = [
     (lambda r: r.output("ranges", "std_msgs/String"), "there is one of this name already"),
     (lambda r: r.output("a b", "std_msgs/String"), "'a b' is not a ROS name"),
@@ -127,6 +133,20 @@ MISTAKES: list[tuple[Callable[[Resource], object], str]] = [
     (lambda r: r.task(rate=1, name="measure")(lambda: None), "there are two of this name"),
     (lambda r: r.task(on=sonar().inputs["/joy"])(lambda: None), "/joy is no input of this resource"),
     (lambda r: r.task(rate=1, on_failure="retry")(lambda: None), "'retry' is not known here"),
+    (lambda r: r.output("/sonar/quality", "std_msgs/String"), "that name is the resource's own"),
+    (lambda r: r.output("/joy", "sensor_msgs/Joy"), "it is an input of the same resource"),
+    (lambda r: r.input("ranges", "std_msgs/String"), "it is an output of the same resource"),
+    (lambda r: r.parameter("p", "a", choices=("a", 1)), "1 is no str"),
+    (lambda r: r.attribute("priority", better="max"), "'priority' cannot be the name of one"),
+    (lambda r: r.attribute("how far", better="max"), "'how far' cannot be the name of one"),
+    (lambda r: r.attribute("x", better="max", scale="log", tolerance="two"), "'two' is not a number"),
+    (lambda r: r.profile(offers={}, name="x")(lambda gain: None), "<lambda> cannot be called without arguments"),
+    (lambda r: r.profile(offers={}, name="x", needs=NEEDS_ONE)(lambda: None), "precondition of profile x"),
+    (lambda r: r.profile(offers={}, name="x", needs=NEEDS_LATER)(lambda: None), "is a coroutine function"),
+    (lambda r: r.task(rate=1)(lambda message: None), "<lambda> cannot be called without arguments"),
+    (lambda r: r.task(on=r.inputs["/joy"])(lambda: None), "<lambda> cannot be called with the message"),
+    (lambda r: r.task(rate=1, stuck_after=0)(lambda: None), "stuck after 0 s"),
+    (lambda r: r.on("activate")(lambda reason: None), "<lambda> cannot be called without arguments"),
     (lambda r: r.on("activat"), "no change 'activat'; did you mean activate?"),
     (lambda r: Resource("a/b", role="sensing"), "'a/b' is not a ROS base name"),
     (lambda r: Resource("a", role="sensin"), "there is no role 'sensin'; did you mean sensing?"),
@@ -151,3 +171,20 @@ def test_a_parameter_takes_what_its_type_allows() -> None:
             gain.check(wrong)
     with pytest.raises(ConfigError, match="did you mean narrow"):
         beam.check("narow")
+
+
+def test_what_has_one_name_in_two_namespaces_is_measured_apart() -> None:
+    mixer = Resource("mixer", role="sensing")
+    for name in ("scan", "/left/scan"):
+        mixer.output(name, "sensor_msgs/LaserScan")
+    for name in ("/right/scan", "/scan", "/joy"):
+        mixer.input(name, "sensor_msgs/LaserScan")
+    assert list(mixer.labels.values()) == ["scan", "left.scan", "right.scan", "in.scan", "joy"]
+    for name in ("rate", "scan.rate", "left.scan.rate", "in.scan.loss"):
+        assert name in mixer.attributes
+
+
+@pytest.mark.parametrize("value", [None, "far", True, float("nan"), [1.0]])
+def test_what_is_no_value_is_said_by_observe(value: Any) -> None:
+    with pytest.raises(ConfigError, match="is no number"):
+        sonar().declared_attributes["accuracy"].observe(value)

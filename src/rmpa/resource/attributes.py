@@ -113,7 +113,7 @@ class Attribute:
                 remedy = f"it is one of {', '.join(self.words)}"
                 raise ConfigError(where, f"{value!r} is no value of {self.name}", remedy)
             return value
-        if isinstance(value, str | bool) or not math.isfinite(value):
+        if isinstance(value, str | bool) or not hasattr(value, "__float__") or not math.isfinite(value):
             raise ConfigError(where, f"{value!r} is no number", f"{self.name} is in {self.unit or 'parts of 1'}")
         if self.scale is Scale.LOG and value < 0:
             raise ConfigError(where, f"{value:g} is below 0", f"{self.name} has a logarithmic scale")

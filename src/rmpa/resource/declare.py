@@ -18,6 +18,7 @@ A mistake is found when it is written: each call raises ``ConfigError`` with wha
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -58,6 +59,8 @@ RESERVED: Final = frozenset(
     }
 )  # fmt: skip
 """Names below a resource's node that are its own topics and services, and parameters with a meaning of their own."""
+NOT_ATTRIBUTES: Final = frozenset({"expires", "priority", "profile", "reaction"})
+"""What stands beside the attributes in a requirement or among the quality."""
 
 
 class Role(StrEnum):
@@ -446,6 +449,9 @@ class Resource:
             DefinitionError: The type is not known.
         """
         self._new("output", name, self.outputs)
+        if name in self.inputs:
+            where = f"output {name} of {self.name}"
+            raise ConfigError(where, "it is an input of the same resource", "a global name (/scan) is another topic")
         made = Output(name, MessageType(kind), _contract(f"output {name} of {self.name}", contract), latch)
         self.outputs[name] = made
         return made
@@ -453,6 +459,9 @@ class Resource:
     def input(self, name: str, kind: str, *, required: bool = True, **contract: object) -> Input:
         """Declare a topic that it needs; arguments and errors as for ``output``."""
         self._new("input", name, self.inputs)
+        if name in self.outputs:
+            where = f"input {name} of {self.name}"
+            raise ConfigError(where, "it is an output of the same resource", "a global name (/scan) is another topic")
         made = Input(name, MessageType(kind), _contract(f"input {name} of {self.name}", contract), required)
         self.inputs[name] = made
         return made
@@ -505,7 +514,8 @@ class Resource:
         if low is not None and high is not None and low > high:
             raise ConfigError(where, f"low is {low:g} and high {high:g}", "the bounds are the wrong way round")
         made = Parameter(name, default, low, high, tuple(choices), unit, description)
-        made.check(default)
+        for value in (*choices, default):
+            made.check(value)
         self.parameters[name] = made
         return made
 
@@ -535,9 +545,12 @@ class Resource:
             ConfigError: It cannot be.
         """
         where = f"attribute {name} of {self.name}"
-        if name in self.attributes:
+        if name in self.attributes or name in MEASURED:
             raise ConfigError(where, "there is one of this name already", "name it otherwise")
-        plain = tolerance if tolerance is None or scale != "linear" else quantity(tolerance, unit, where)
+        if not is_legal_name(name) or not name or "/" in name or name in NOT_ATTRIBUTES:
+            remedy = f"letters, digits and _, a letter first, and none of {', '.join(sorted(NOT_ATTRIBUTES))}"
+            raise ConfigError(where, f"{name!r} cannot be the name of one", remedy)
+        plain = tolerance if tolerance is None else quantity(tolerance, unit if scale == "linear" else "", where)
         made = DeclaredAttribute(
             Attribute(
                 name,
@@ -545,7 +558,7 @@ class Resource:
                 unit,
                 _word(Scale, scale, where),
                 _word(Category, category, where),
-                float(plain) if plain is not None else None,
+                plain,
                 tuple(words),
             )
         )
@@ -553,18 +566,31 @@ class Resource:
         return made
 
     @property
+    def labels(self) -> dict[str, str]:
+        """What the qualities of each output and input are named by, outputs first.
+
+        The last part of its name; where that is taken, as many parts as it needs; ``in.scan`` where all are.
+        """
+        found: dict[str, str] = {}
+        for name in (*self.outputs, *self.inputs):
+            parts = name.strip("/").split("/")
+            several = [".".join(parts[-count:]) for count in range(1, len(parts) + 1)]
+            several.append(f"{'in' if name in self.inputs else 'out'}.{several[-1]}")
+            found[name] = next((label for label in several if label not in found.values()), several[-1])
+        return found
+
+    @property
     def attributes(self) -> dict[str, Attribute]:
         """Everything that can be asked for: its own attributes, and what is measured of each output and input.
 
-        ``rate`` means the first output; ``scan.rate`` names the output or input.
+        ``rate`` means the first output; ``scan.rate`` names the output or input (``labels``).
         """
         found: dict[str, Attribute] = {}
-        for position, name in enumerate((*self.outputs, *self.inputs)):
-            base = name.rsplit("/", 1)[-1]
+        for position, label in enumerate(self.labels.values()):
             for key, attribute in MEASURED.items():
                 if position == 0 and self.outputs:
                     found[key] = attribute
-                found[f"{base}.{key}"] = attribute
+                found[f"{label}.{key}"] = attribute
         return found | {name: declared.attribute for name, declared in self.declared_attributes.items()}
 
     # --- what it does -------------------------------------------------------------------------------------------
@@ -596,6 +622,11 @@ class Resource:
         def declare(function: _Function) -> _Function:
             title = name or function.__name__
             where = f"profile {title} of {self.name}"
+            _takes(function, 0, where)
+            if needs is not None:
+                _takes(needs, 0, f"the precondition of {where}")
+                if inspect.iscoroutinefunction(needs):
+                    raise ConfigError(where, "its precondition is a coroutine function", "make it a plain one")
             if title in self.profiles:
                 raise ConfigError(where, "there are two of this name", "name one of them otherwise")
             attributes = self.attributes
@@ -688,6 +719,9 @@ class Resource:
             if on is not None and on not in self.inputs.values():
                 raise ConfigError(where, f"{on.name} is no input of this resource", "declare it there first")
             seconds = quantity(stuck_after, "s", where) if stuck_after is not None else None
+            _takes(function, 1 if on is not None else 0, where)
+            if seconds is not None and seconds <= 0:
+                raise ConfigError(where, f"stuck after {seconds:g} s", "it is above 0")
             policy = _word(OnFailure, on_failure, where)
             self.tasks[title] = Task(title, function, hertz, on, policy, seconds, follows)  # type: ignore[arg-type] # as told
             return function
@@ -702,6 +736,7 @@ class Resource:
         windows: int = 3,
         improvement: float = 0.05,
         dwell: float | str = 2.0,
+        settle: float | str = 1.0,
         cool_down: float | str = 10.0,
         cool_down_max: float | str = 160.0,
         apply_timeout: float | str = 5.0,
@@ -714,6 +749,8 @@ class Resource:
             windows: … of the last so many are a disturbance.
             improvement: A change without a disturbance must lessen the distance by more than this.
             dwell: Seconds that a profile runs at least before such a change.
+            settle: Seconds behind a change for which windows are not judged: what the profile before sent is still
+                on its way.
             cool_down: Seconds that a profile is left out after it failed or disappointed; twice as long each time …
             cool_down_max: … up to this.
             apply_timeout: Seconds after which a profile that is being applied counts as hung.
@@ -729,12 +766,19 @@ class Resource:
             for name, value in (
                 ("window", window),
                 ("dwell", dwell),
+                ("settle", settle),
                 ("cool_down", cool_down),
                 ("cool_down_max", cool_down_max),
                 ("apply_timeout", apply_timeout),
             )
         }
-        for name, least in (("window", 0.05), ("dwell", 0.0), ("cool_down", 0.0), ("apply_timeout", 0.01)):
+        for name, least in (
+            ("window", 0.05),
+            ("dwell", 0.0),
+            ("settle", 0.0),
+            ("cool_down", 0.0),
+            ("apply_timeout", 0.01),
+        ):
             if not least <= seconds[name] <= 86400:
                 raise ConfigError(where, f"{name} is {seconds[name]:g} s", f"at least {least:g} s, at most a day")
         self.window = seconds.pop("window")
@@ -759,6 +803,7 @@ class Resource:
             raise ConfigError(f"resource {self.name}", f"{event} has its function already", "call both from one")
 
         def declare(function: _Function) -> _Function:
+            _takes(function, 0, f"what {self.name} does at {event}")
             self.hooks[event] = function  # type: ignore[assignment] # as told
             return function
 
@@ -780,8 +825,24 @@ class Resource:
             raise ConfigError(where, "a parameter has a base name", "leave the / out")
         if name in known:
             raise ConfigError(where, "there is one of this name already", "name it otherwise")
-        if name in RESERVED:
+        if name.removeprefix(f"/{self.name}/") in RESERVED:
             raise ConfigError(where, "that name is the resource's own", f"not one of {', '.join(sorted(RESERVED))}")
+
+
+def _takes(function: Callable[..., object], count: int, where: str) -> None:
+    """Check that a function can be called with so many arguments.
+
+    Raises:
+        ConfigError: It cannot.
+    """
+    what = "without arguments" if not count else "with the message"
+    try:
+        inspect.signature(function).bind(*[None] * count)
+    except TypeError as error:
+        name = getattr(function, "__name__", "its function")
+        raise ConfigError(where, f"{name} cannot be called {what}: {error}", "change its arguments") from None
+    except ValueError:
+        pass  # something that tells nothing of itself
 
 
 def _contract(where: str, words: Mapping[str, object]) -> Contract:

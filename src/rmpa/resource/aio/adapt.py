@@ -81,8 +81,8 @@ class Adapter(RuntimePart):
         self._attributes = resource.attributes
         profiles = [declared.profile for declared in resource.profiles.values()]
         self.loop = Adaptation(self._attributes, Decider(resource.name, self._attributes, profiles), settings)
-        first = next(iter(resource.outputs), "")
-        self._primary = first.rsplit("/", 1)[-1]
+        self._labels = resource.labels
+        self._primary = self._labels[next(iter(resource.outputs))] if resource.outputs else ""
         """The output whose qualities are also named without it; they are shown once."""
         self._topics: dict[str, TopicQuality] = {}
         self._observed: dict[str, ObservedQuality] = {}
@@ -211,7 +211,7 @@ class Adapter(RuntimePart):
         now = self._loop.time()
         measured: dict[str, Value] = {}
         for position, (name, topic) in enumerate(self._topics.items()):
-            base = name.rsplit("/", 1)[-1]
+            base = self._labels[name]
             for key, value in topic.window(now).items():
                 measured[f"{base}.{key}"] = value
                 if position == 0 and self._runtime.resource.outputs:
