@@ -46,6 +46,12 @@ class Running:
         self.process.wait_for("active on", LONG)
         return self.process
 
+    def end(self) -> None:
+        """Make sure that it is gone; what it said is shown where the test fails."""
+        if self.process is not None:
+            self.process.end()
+            print(self.process.output[-8000:])
+
     def client(self, name: str, **options: object) -> Process:
         """A rospy node that asks and listens."""
         node = self.ros.rospy("quality_client", name=name, commands=True, **options)
@@ -60,7 +66,7 @@ def pair(lab: Lab, shell: ShellFactory, tmp_path: Path) -> Iterator[tuple[Runnin
         made = []
         for host, file in zip(lab.hosts("cam", "pc"), ("camera.py", "viewer.py"), strict=True):
             one = Running(host, Agent(host, tmp_path, name=host.name), shell(host), RESOURCES / file)
-            stack.callback(lambda one=one: one.process and one.process.end())
+            stack.callback(one.end)
             made.append(one)
         yield made[0], made[1]
 

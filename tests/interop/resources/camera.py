@@ -6,7 +6,7 @@ camera = Resource("camera", role="sensing", physical=False)
 frames = camera.output("frames", "std_msgs/String")
 sharpness = camera.attribute("sharpness", better="max", unit="", category="spatial")
 exposure = camera.parameter("exposure", 1.0, low=0.0, high=10.0)
-camera.adaptation(window="500 ms", dwell="500 ms", cool_down="3 s")
+camera.adaptation(window="500 ms", dwell="500 ms", settle="1500 ms", cool_down="4 s")
 picture = {"name": "", "bytes": 0}
 
 
