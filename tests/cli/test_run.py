@@ -127,11 +127,14 @@ class Ground:
 def ground(place: Place) -> Iterator[Ground]:
     one = Ground(place)
     yield one
-    left = [c for p in one.started if p.returncode is None for c in psutil.Process(p.pid).children(recursive=True)]
     for process in one.started:
         process.end()
-    psutil.wait_procs(left, timeout=20)
-    assert not [child for child in left if child.is_running()], "an agent is left"
+    # An agent of ours is in a session of its own; by its port it is known, whoever its parent is now.
+    left = [p for p in psutil.process_iter(["cmdline"]) if str(one.port) in (p.info["cmdline"] or [])]
+    _, alive = psutil.wait_procs(left, timeout=20)
+    for orphan in alive:
+        orphan.kill()
+    assert not alive, "an agent is left"
 
 
 def agent_of(run: Process) -> psutil.Process:
