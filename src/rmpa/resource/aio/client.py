@@ -128,6 +128,17 @@ class ResourceClient:
         """
         if self._observing is None:
             self._observing = await self._node.advertise(f"{self.resource}/observed", ARRAY_TYPE)
+        if values:
+            self.report(**values)
+
+    def report(self, **values: float | str) -> None:
+        """As ``observe``, behind a first one.
+
+        Raises:
+            UnreachableError: There was no first one.
+        """
+        if self._observing is None:
+            raise UnreachableError("resource", self.resource, "await observe() once before")
         pairs: Any = [{"key": key.replace("__", "."), "value": str(value)} for key, value in values.items()]
         status: Any = [{"name": self._node.name, "values": pairs}]
         self._observing.publish(self._observing.make({"header": {"stamp": time.time()}, "status": status}))

@@ -7,14 +7,20 @@ import contextlib
 import logging
 from typing import TYPE_CHECKING, Any
 
+from rmpa.core.errors import RmpaError
 from rmpa.resource.aio.client import ResourceClient
 from rmpa.resource.aio.runtime import RuntimePart
+from rmpa.resource.descriptor import TOPIC, Descriptor
 from rmpa.ros.diagnostic_array import Level
 from rmpa.ros.tcpros import printable
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rmpa.resource.aio.runtime import Runtime
+    from rmpa.resource.attributes import Value
     from rmpa.resource.declare import Demand
+    from rmpa.ros.aio.topics import Received
 
 _log = logging.getLogger(__name__)
 
@@ -29,6 +35,8 @@ class Demands(RuntimePart):
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._clients: dict[str, ResourceClient] = {}
+        self._first: dict[str, str] = {}
+        """By resource that something is heard from: its first output."""
         self._undo = contextlib.AsyncExitStack()
 
     async def start(self) -> None:
@@ -45,6 +53,8 @@ class Demands(RuntimePart):
                 undo.push_async_callback(_ended, following)
                 if demand.wishes:
                     self._ask(demand)
+                if any(name.startswith(f"{demand.resource}/") for name in self._runtime.resource.inputs):
+                    await self._watch(demand.resource, client)
             self._undo = undo.pop_all()
 
     async def close(self) -> None:
@@ -69,6 +79,21 @@ class Demands(RuntimePart):
                 short.append(f"{name}: {printable(client.answer.message)}")
         return missing, short
 
+    def window(self, _level: Level, _message: str, measured: Mapping[str, Value]) -> None:
+        """Tell those that are asked what arrives here of what they send, as far as it is asked for."""
+        resource = self._runtime.resource
+        labels = resource.labels
+        for name, client in self._clients.items():
+            found: dict[str, Any] = {}
+            for wish in resource.demands[name].wishes if name in self._first else ():
+                output, _, attribute = wish.replace("__", ".").rpartition(".")
+                item = f"{name}/{output or self._first[name]}"
+                value = measured.get(f"{labels[item]}.{attribute}") if item in resource.inputs else None
+                if value is not None:
+                    found[wish] = value
+            if found and client.there:
+                client.report(**found)
+
     # --- inside -------------------------------------------------------------------------------------------------
 
     def _ask(self, demand: Demand) -> None:
@@ -77,6 +102,20 @@ class Demands(RuntimePart):
             demand.answer = None
             wishes: dict[str, Any] = dict(demand.wishes)
             client.ask(priority=demand.priority if wishes else 0, **wishes)
+
+    async def _watch(self, name: str, client: ResourceClient) -> None:
+        """Learn which of its outputs is the first: ``rate`` alone is that one's."""
+
+        def heard(received: Received) -> None:
+            try:
+                outputs = Descriptor.parse(str(received.message.data)).outputs
+            except RmpaError as error:
+                _log.warning("! %s: %s: %s", self._runtime.node.name, name, error)
+            else:
+                self._first[name] = outputs[0].name if outputs else ""
+
+        await client.observe()
+        await self._runtime.node.subscribe(f"{name}/{TOPIC}", "std_msgs/String", heard)
 
     async def _follow(self, demand: Demand, client: ResourceClient) -> None:
         said: tuple[Level, str] | None = None

@@ -75,6 +75,7 @@ class Member:
         self.contexts = Contexts(self.runtime, self.tasks, self.adapter)
         self.configuration = Reconfigure(self.runtime, self.tasks, self.adapter, self.contexts)
         self.demands = Demands(self.runtime)
+        self.adapter.on_window.append(self.demands.window)
         parts = [self.configuration.before, self.tasks, self.adapter, self.contexts, self.configuration, self.demands]
         self.memory = Memory(self.runtime, self.adapter, self.contexts, store) if store is not None else None
         self.runtime.parts += [*parts, self.memory] if self.memory is not None else parts
