@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import os
 import time
 from typing import TYPE_CHECKING, Any, Final
@@ -14,9 +15,10 @@ from rmpa.bridge.proxy_names import proxied_node
 from rmpa.cli.master import TopicName, choose_master, read_graph
 from rmpa.cli.options import agent_option, json_option, master_option
 from rmpa.cli.output import Column, coloured, print_json, print_line, print_table, printable
-from rmpa.cli.resources_seen import find_resources, look_around
+from rmpa.cli.resources_seen import look_around
 from rmpa.cli.stream import run_stream, with_node
 from rmpa.core.errors import RmpaError
+from rmpa.resource.descriptor import TOPIC
 from rmpa.ros.diagnostic_array import ARRAY_TYPE, Level
 
 if TYPE_CHECKING:
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
     from rmpa.ros.aio.topics import Received
 
 _COLOURS: Final = {"OK": "green", "WARN": "yellow", "ERROR": "red", "STALE": "magenta"}
-_LOOK: Final = 2.0
+_LOOK: Final = 1.0
 """Seconds between looks for resources that have come since."""
 
 
@@ -120,10 +122,15 @@ async def _keep_looking(node: Node, master: Master, printer: _Printer) -> None:
     known: set[str] = set()
     while True:
         with contextlib.suppress(RmpaError):
-            for one in await find_resources(node, await read_graph(master)):
-                if one.path not in known and (printer.only is None or one.path == printer.only.path):
-                    known.add(one.path)
-                    await node.subscribe(f"{one.path}/alarms", ARRAY_TYPE, printer.take)
+            graph = await read_graph(master)
+            for topic in graph.publishers.keys() - known:
+                path = topic.removesuffix("/alarms")
+                resource = (
+                    topic != path and graph.types.get(topic) == ARRAY_TYPE and f"{path}/{TOPIC}" in graph.publishers
+                )
+                if resource and (printer.only is None or path == printer.only.path):
+                    known.add(topic)
+                    await node.subscribe(topic, ARRAY_TYPE, functools.partial(printer.take, path))
         if not known and not printer.told:
             printer.told = True
             click.echo("! there is no resource yet; waiting", err=True)
@@ -140,12 +147,11 @@ class _Printer:
         self._left = count
         self._json = as_json
 
-    def take(self, received: Received) -> None:
-        """One message, with one alarm or several."""
+    def take(self, path: str, received: Received) -> None:
+        """One message of a resource, with one alarm or several."""
         if self.only is not None and received.caller_id != self.only.caller:
             return
         proxy = proxied_node(received.caller_id)
-        path = received.caller_id if proxy is None else proxy[1]
         peer = None if proxy is None else proxy[0]
         for status in received.message.status:
             if self._left == 0:

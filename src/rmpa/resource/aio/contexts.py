@@ -337,6 +337,9 @@ class _Source:
     def __init__(self, reference: Reference) -> None:
         self._reference = reference
         self._fields: tuple[str, ...] = ()
+        self._raw: bytes | None = None
+        self._value: Scalar | None = None
+        """Of the message that was read last: rules are looked at more often than some topics speak."""
         self.topic = ""
         """Empty until it is found."""
         self.problem = ""
@@ -352,6 +355,11 @@ class _Source:
 
     def read(self, kind: MessageType, raw: bytes) -> Scalar | None:
         """The field of a message; ``None`` if it has none that a rule can look at."""
+        if raw is not self._raw:
+            self._raw, self._value = raw, self._read(kind, raw)
+        return self._value
+
+    def _read(self, kind: MessageType, raw: bytes) -> Scalar | None:
         fields = self._fields
         if not fields and len(kind.fields) == 1:
             fields = (kind.fields[0].name,)
