@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import ctypes
+import gc
 import logging
 import os
 import signal
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Final, NoReturn, Self
 import click
 
 from rmpa.cli.output import printable
+from rmpa.core import limits
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
 
 if TYPE_CHECKING:
@@ -308,6 +310,7 @@ def _stores(module: str, state: str | None) -> Path | None:
 async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None, stores: Path | None = None) -> int:
     from rmpa.resource.aio.member import run_all
 
+    sys.setswitchinterval(limits.THREAD_SWITCH)  # a task that is due does not wait for what the loop does just then
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     threads = ThreadPoolExecutor(thread_name_prefix="profile or hook")
@@ -325,6 +328,7 @@ async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None, s
     died = asyncio.create_task(_watch(process, stop)) if process is not None else None
 
     def ready() -> None:
+        gc.freeze()  # a full collection, in the midst of a task, need not look at all that was loaded
         _log.info("= %s: active on %s", ", ".join(printable(r.name) for r in resources), uri)
 
     failure: RmpaError | None = None
