@@ -41,7 +41,7 @@ class Running:
 
     def start(self, *words: str) -> Process:
         """``rmpa run`` with an agent of its own; return when its resource is active."""
-        argv = [RMPA, "run", self.file, "--name", self.agent.name, *words]
+        argv: list[str | Path] = [RMPA, "run", self.file, "--name", self.agent.name, *words]
         self.process = Process(self.host.command(argv), env=self.agent.env, name=self.file.name)
         self.process.wait_for("active on", LONG)
         return self.process
@@ -52,9 +52,9 @@ class Running:
             self.process.end()
             print(self.process.output[-8000:])
 
-    def client(self, name: str, **options: object) -> Process:
+    def client(self, name: str, **options: str) -> Process:
         """A rospy node that asks and listens."""
-        node = self.ros.rospy("quality_client", name=name, commands=True, **options)
+        node = self.ros.rospy("quality_client", commands=True, name=name, **options)  # type: ignore[arg-type]  # of the node
         node.wait_event("up")
         return node
 

@@ -387,6 +387,7 @@ def test_a_restart_begins_with_what_was_asked_and_the_profile_that_ran() -> None
 
 def test_who_says_the_same_again_and_again_hides_no_disturbance() -> None:
     one = running(20.0, FAST, MIDDLE)
+    actions: list[Action] = []
     for turn in range(3):  # rostopic pub -r 10
         assert one.require(at_least(20.0, hard=True), 1.5 + turn) == []
         if actions := one.window({"rate": 9.0}, 2.0 + turn):

@@ -25,7 +25,7 @@ def main() -> None:
     observing = rospy.Publisher(f"{args.resource}/observed", DiagnosticArray, queue_size=1)
     count = [0]
 
-    def array(values: dict) -> DiagnosticArray:
+    def array(values: dict[str, str]) -> DiagnosticArray:
         message = DiagnosticArray()
         message.header.stamp = rospy.Time.now()
         message.status = [DiagnosticStatus(values=[KeyValue(k, v) for k, v in values.items()])]
