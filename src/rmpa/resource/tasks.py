@@ -82,6 +82,7 @@ class TaskFigures:
     def __init__(self, period: float | None, now: float) -> None:
         self._period = period
         self._window = now
+        self._due = now
         self._began: float | None = None
         self._last: float | None = None
         self.in_a_row = 0
@@ -103,8 +104,10 @@ class TaskFigures:
 
     def begun(self, due: float, now: float) -> None:
         """A run begins that was due at a time."""
-        self._began = now
-        late = max(0.0, now - due)
+        self._due, self._began = due, now  # the rest is reckoned behind the run
+
+    def _reckon(self, now: float) -> None:
+        late = max(0.0, now - self._due)
         self._late += late
         self._late_max = max(self._late_max, late)
         self._lates += 1
@@ -117,7 +120,10 @@ class TaskFigures:
 
     def ended(self, now: float, error: str = "") -> None:
         """The run has ended, well or with an error."""
-        took = now - self._began if self._began is not None else 0.0
+        took = 0.0
+        if self._began is not None:
+            self._reckon(self._began)
+            took = now - self._began
         self._began = None
         self._runs += 1
         self._busy += took

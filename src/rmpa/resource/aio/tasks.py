@@ -52,7 +52,13 @@ class Gate:
 
     def enter(self, who: object, ended: Callable[[], bool]) -> bool:
         """Wait in a thread until it is open, or ``ended`` says that nobody need go in any more (then false)."""
+        # No lock on the way of a task that is due: whoever closes looks within only after that.
+        self._within.add(who)
+        if not self._closers:
+            return True
         with self._change:
+            self._within.discard(who)
+            self._change.notify_all()
             while self._closers:
                 if ended():
                     return False
@@ -62,9 +68,10 @@ class Gate:
 
     def leave(self, who: object) -> None:
         """The run has ended; or it is stuck, and nobody is to wait for it any more."""
-        with self._change:
-            self._within.discard(who)
-            self._change.notify_all()
+        self._within.discard(who)
+        if self._closers:
+            with self._change:
+                self._change.notify_all()
 
     def close(self, who: str) -> None:
         """Let nobody in any more."""
