@@ -86,7 +86,10 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
     ),
     "idle": Measurement("what an agent costs while nothing happens", idle.measure),
     "tasks": Measurement(
-        "how evenly a resource's task runs, beside loops of rospy and roscpp", tasks.measure, (bed.why_no_ros,)
+        "how evenly a resource's task runs, beside loops of rospy and roscpp",
+        tasks.measure,
+        (bed.why_no_ros,),
+        partial(tasks.measure, realtime=True),
     ),
     "decision": Measurement("how long a resource takes to decide", decision.measure, needs=()),
     "bookkeeping": Measurement("what measuring quality costs, and how soon a resource adapts", bookkeeping.measure),

@@ -23,7 +23,8 @@ class Notes:
     """When each run was due, and when it began."""
 
     def __init__(self) -> None:
-        self.times = array.array("Q")
+        self.due = 0.0
+        self.runs: list[tuple[int, float]] = []
         self.wanted = 0
         self.full = threading.Event()
 
@@ -42,9 +43,10 @@ def only() -> None:
 
 @resource.task(rate=float(os.environ.get("RMPA_BENCH_RATE", "100")))
 def work() -> None:
-    if notes.wanted and len(notes.times) % 2:  # behind the time at which it was due
-        notes.times.append(time.monotonic_ns())
-        if len(notes.times) >= notes.wanted:
+    began = time.monotonic_ns()
+    if notes.wanted:
+        notes.runs.append((began, notes.due))
+        if len(notes.runs) >= notes.wanted:
             notes.wanted = 0
             notes.full.set()
     output.publish(data=_DATA)
@@ -54,8 +56,7 @@ _begun = TaskFigures.begun
 
 
 def _note_due(figures: TaskFigures, due: float, now: float) -> None:
-    if notes.wanted:
-        notes.times.append(round(due * 1e9))
+    notes.due = due
     _begun(figures, due, now)
 
 
@@ -66,11 +67,15 @@ def listen() -> None:
     """Serve what the measurement asks for."""
     for line in sys.stdin:
         count, path = line.split()
-        notes.times = array.array("Q")
         notes.full.clear()
-        notes.wanted = 2 * int(count)
+        notes.runs = []
+        notes.wanted = int(count)
         notes.full.wait()
-        Path(path).write_bytes(notes.times.tobytes())
+        pairs = array.array("Q")
+        for began, due in notes.runs:
+            pairs.append(round(1e9 * due))
+            pairs.append(began)
+        Path(path).write_bytes(pairs.tobytes())
         say("done")
 
 
