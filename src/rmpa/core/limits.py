@@ -573,6 +573,8 @@ TASK_QUEUE_MESSAGES: Final = 10
 """Messages of its input that wait for a task; the oldest is dropped beyond it: control acts on the newest."""
 TASK_PAUSE_TIMEOUT: Final = 1.0
 """How long a profile that is to be applied waits for the runs under way; one that takes longer is stuck or slow."""
+RESOURCE_HELD_MAX: Final = 64 * 1024 * 1024
+"""Bytes of messages that a resource keeps while a profile is applied; the oldest give way."""
 TASK_END_TIMEOUT: Final = 2.0
 """How long an ending resource waits for a task's last run; a thread that is stuck is left behind."""
 RESOURCE_ANSWER_TIMEOUT: Final = 10.0

@@ -126,3 +126,43 @@ async def test_what_is_published_while_a_profile_is_applied_waits(core: RosCore,
         assert len(ear.heard) == 1
     finally:
         await runtime.close()
+
+
+async def test_what_waits_is_bounded_and_the_oldest_gives_way(
+    core: RosCore, one: Resource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rmpa.core.limits.RESOURCE_HELD_MAX", 40)
+    runtime = Runtime(one, Node("speaker", master_uri=core.uri))
+    ear = Ear()
+    runtime.parts.append(ear)
+    await runtime.start()
+    try:
+        runtime.hold()
+        for _ in range(10):
+            one.outputs["words"].publish(data="0123456789")  # 14 bytes
+        runtime.release()
+        assert ear.heard == [("published", "words")] * 2
+    finally:
+        await runtime.close()
+
+
+async def test_messages_are_numbered_so_that_losses_are_seen(core: RosCore) -> None:
+    nose = Resource("nose", role="sensing")
+    smells = nose.output("smells", "sensor_msgs/Range")
+    runtime = Runtime(nose, Node("nose", master_uri=core.uri))
+    sent: list[int] = []
+
+    class Eye(RuntimePart):
+        def published(self, output: Output, raw: bytes, now_ns: int) -> None:
+            sent.append(int.from_bytes(raw[:4], "little"))
+
+    runtime.parts.append(Eye())
+    await runtime.start()
+    try:
+        again = smells.type.make({"range": 1.0})
+        smells.publish(range=1.0)
+        smells.publish(again)
+        smells.publish(again)
+        assert sent == [1, 2, 3]
+    finally:
+        await runtime.close()

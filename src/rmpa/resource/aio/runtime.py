@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import logging
 import threading
 import time
+from collections import deque
 from typing import TYPE_CHECKING, Any
 
+from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError
 from rmpa.resource.descriptor import TOPIC, describe, topic_of
 from rmpa.ros.messages import MessageError
@@ -65,7 +68,8 @@ class Runtime:
         self._publishers: dict[str, Publisher] = {}
         self._subscribers: dict[str, Subscriber] = {}
         self._texts: dict[str, tuple[Publisher, str | None]] = {}
-        self._held: list[tuple[Output, bytes]] = []
+        self._held: deque[tuple[Output, bytes]] = deque()
+        self._held_bytes = 0
         self._holders: set[str] = set()
         self.flowing: frozenset[str] | None = None
         """The only outputs whose messages leave in the present context; ``None``: all."""
@@ -151,11 +155,9 @@ class Runtime:
     def release(self, who: str = "profile", *, drop: bool = False) -> None:
         """Let what was kept leave, in order; or drop it, for it belongs to a profile that was not applied."""
         self._holders.discard(who)
-        if drop:
-            self._held = []
-        if not self._holders:
-            held, self._held = self._held, []
-            for output, raw in held:
+        if drop or not self._holders:
+            held, self._held, self._held_bytes = self._held, deque(), 0
+            for output, raw in held if not drop else ():
                 self._send(output, raw)
 
     def call_in_loop(self, function: Any, *args: Any) -> None:
@@ -180,6 +182,9 @@ class Runtime:
         """Send one message of an output, or keep it while a profile is being applied."""
         if self._holders:
             self._held.append((output, raw))
+            self._held_bytes += len(raw)
+            while self._held_bytes > limits.RESOURCE_HELD_MAX and len(self._held) > 1:
+                self._held_bytes -= len(self._held.popleft()[1])  # the oldest gives way
         else:
             self._send(output, raw)
 
@@ -204,6 +209,9 @@ class _Outlet:
     def __init__(self, runtime: Runtime, output: Output) -> None:
         self._runtime = runtime
         self._output = output
+        fields = output.type.fields
+        self._numbered = bool(fields) and fields[0].name == "header"
+        self._number = itertools.count(1)
 
     def publish(self, values: Mapping[str, Any], message: object | None) -> None:
         """Serialize here, where the mistake is the caller's, and send in the loop."""
@@ -217,6 +225,9 @@ class _Outlet:
             if given != kind.name:
                 shown = given or type(message).__name__
                 raise MessageError(f"{self._output.name} has messages of type {kind.name}, not {shown}")
+        header: Any = getattr(message, "header", None)
+        if self._numbered and hasattr(header, "seq"):
+            header.seq = next(self._number) & 0xFFFF_FFFF  # as rospy does: whoever receives it sees what was lost
         self._runtime.call_in_loop(self._runtime.send, self._output, kind.serialize(message))
 
 
