@@ -146,9 +146,9 @@ class Adapter(RuntimePart):
         self._publishers["diagnostics"] = await node.advertise("/diagnostics", ARRAY_TYPE)
         for name in ("profile", "decision"):
             await self._runtime.say(name, "")
+        self._recall(now)
         self._asking = await node.subscribe(f"{node.name}/requirements", ARRAY_TYPE, self._asked)
         await node.subscribe(f"{node.name}/observed", ARRAY_TYPE, self._told_of)
-        self._recall(now)
         self._bar()
         self._act(self.loop.pin(self.chosen, now) if self.chosen else self.loop.start(now))
         self._respond()
@@ -317,7 +317,6 @@ class Adapter(RuntimePart):
             if asked.stamp and requirement.expires is not None:
                 self._expiries[asked.client, asked.stamp] = requirement.expires
         self.loop.remember(found, self.recalled.last)
-        self.chosen = self.chosen or self.recalled.chosen
 
     def shift(self, context: str, bounds: Mapping[str, Bound], bars: Mapping[str, str]) -> None:
         """A context begins: what it requires counts above the clients', and some profiles may not run in it."""

@@ -63,6 +63,7 @@ class Memory(RuntimePart):
             if not parameter.given:
                 parameter.value = value
         self._adapter.recalled = found
+        self._adapter.chosen = found.chosen
         self._contexts.chosen = found.context
         self._said = dict(rows)
         if found.parameters or found.chosen or found.asked:
@@ -75,14 +76,14 @@ class Memory(RuntimePart):
                 chosen,
             )
 
-    async def start(self) -> None:
-        """Hear of changes from now on."""
-        adapter = self._adapter
-        adapter.listeners.append(self._acted)
-        adapter.on_window.append(self._window)
-        adapter.on_asked.append(self._asked)
-        adapter.on_missing.append(self._missing)
+        self._adapter.listeners.append(self._acted)
+        self._adapter.on_window.append(self._window)
+        self._adapter.on_asked.append(self._asked)
+        self._adapter.on_missing.append(self._missing)
         self._contexts.listeners.append(self._asked)
+
+    async def start(self) -> None:
+        """Remember what there is now."""
         descriptor = self._runtime.descriptor
         self._store.descriptor(descriptor.node, descriptor.serialize(), time.time_ns())
         for name, parameter in self._runtime.resource.parameters.items():
