@@ -185,7 +185,8 @@ async def test_a_profile_is_chosen_by_hand_until_it_is_not(lamp: Lamp, node: Nod
 
 
 async def test_what_the_parameter_server_holds_counts_at_the_start(core: RosCore, node: Node) -> None:
-    await node.set_param("/lamp", {"level": 20, "red": "much", "green": 4, "profile": "fast", "context": "away", "else": [1]})
+    chosen = {"profile": "fast", "context": "away"}
+    await node.set_param("/lamp", {"level": 20, "red": "much", "green": 4, "else": [1], **chosen})
     lamp = Lamp(core)
     lamp.green.value, lamp.green.given = 5, True  # rmpa run --set
     await lamp.member.start()
