@@ -145,7 +145,7 @@ def agent_of(run: Process) -> psutil.Process:
 
 def test_a_file_with_an_agent_of_its_own_works_and_ends_in_order(ground: Ground) -> None:
     run = ground.run(HEAD + TALK, "--set", "volume=7")
-    run.wait_for(f"nose: active on {ground.uri}")
+    run.wait_for(f"nose: active on {ground.uri}", 60)
     agent = agent_of(run)
     ground.hears("7")
     # As a terminal does: to the whole foreground group. The agent is in a session of its own.
@@ -163,7 +163,7 @@ def test_an_agent_that_runs_already_is_used_and_stays(ground: Ground) -> None:
     assert late.wait() == 2
     assert "an agent head runs already; its options were given when it was started" in late.output
     run = ground.run(HEAD + TALK, "--name", "head", options=False)
-    run.wait_for(f"nose: active on {ground.uri}")
+    run.wait_for(f"nose: active on {ground.uri}", 60)
     assert not psutil.Process(run.pid).children()
     twin = ground.run(HEAD + TALK, "--name", "head", options=False)
     assert twin.wait() == 1
@@ -177,7 +177,7 @@ def test_an_agent_that_runs_already_is_used_and_stays(ground: Ground) -> None:
 
 def test_without_its_agent_a_resource_ends_and_says_so(ground: Ground) -> None:
     run = ground.run(HEAD + TALK)
-    run.wait_for("nose: active on")
+    run.wait_for("nose: active on", 60)
     agent_of(run).kill()
     assert run.wait() == 1
     assert "rmpa: the module's agent: it ended with code -9" in run.output
@@ -205,14 +205,15 @@ def test_what_raises_harms_nobody_and_what_crashes_ends_in_order(ground: Ground)
     run.wait_for("task sulk failed: OSError: no air")
     ground.hears("5")
     agent = agent_of(run)
+    assert list(ground.place.path.glob("**/nose.sock"))
     (ground.place.path / "now").touch()
     assert run.wait() == -signal.SIGABRT
     psutil.wait_procs([agent], timeout=20)
     assert not agent.is_running(), "no agent is left behind"
-    eventually(lambda: "= ending" in run.output, what="its goodbye")
+    assert not list(ground.place.path.glob("**/nose.sock")), "it has ended in order, and taken its socket with it"
     (ground.place.path / "now").unlink()
     again = ground.run(text, "--set", "volume=6")
-    again.wait_for("nose: active on")
+    again.wait_for("nose: active on", 60)
     assert again.interrupt() == 0, again.output
 
 
@@ -222,7 +223,7 @@ def test_what_hangs_does_not_keep_it_from_its_end(ground: Ground, what: str) -> 
     text = HEAD.replace("def plain(): pass\n", hung) if what == "profile" else HEAD + hung.replace("plain", "mine")
     mine = 'threading.Thread(target=mine, name="of mine").start()\n' if what == "thread" else ""
     run = ground.run(text + TALK + mine)
-    run.wait_for("nose: active on")
+    run.wait_for("nose: active on", 60)
     run.wait_for("hangs")
     agent = agent_of(run)
     # A profile's thread is ours, and ends with us; the interpreter would wait for the user's own for ever.
@@ -234,7 +235,7 @@ def test_what_hangs_does_not_keep_it_from_its_end(ground: Ground, what: str) -> 
 def test_told_twice_it_ends_at_once(ground: Ground) -> None:
     hook = '@nose.on("finalize")\ndef last():\n    print("finalizing", flush=True)\n    time.sleep(1000)\n'
     run = ground.run(HEAD + TALK + hook)
-    run.wait_for("nose: active on")
+    run.wait_for("nose: active on", 60)
     agent = agent_of(run)
     run.send(signal.SIGINT)
     run.wait_for("finalizing")
