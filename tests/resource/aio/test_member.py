@@ -78,10 +78,14 @@ async def test_a_resource_lives_and_says_what_it_lacks(core: RosCore) -> None:
                 break
         orders.publish(orders.make({"data": "fail"}))
         assert "it is inactive" in await health(diagnostics, WARN)
+        await member.activate()
+        assert await health(diagnostics, OK) == "profile plain"
+        orders.publish(orders.make({"data": "fail"}))  # and again
+        assert "it is inactive" in await health(diagnostics, WARN)
         await orders.close()
         assert "nobody publishes /orders" in await health(diagnostics, STALE)
     await member.close()
-    assert events == ["configure", "activate", "deactivate", "finalize"]
+    assert events == ["configure", *("activate", "deactivate") * 2, "finalize"]
     assert core.state().nodes.keys() <= {"/rosout"}
 
 

@@ -255,7 +255,8 @@ class Adapter(RuntimePart):
         """A client says what it asks."""
         client = message.caller_id
         self._grace.pop(client, None)
-        self._marks[client] = next((str(s.hardware_id) for s in message.message.status), "")
+        mark = next((str(s.hardware_id) for s in message.message.status), "")
+        self._marks[client] = mark[: limits.REQUIREMENT_TEXT_MAX]  # it goes to everybody, again and again
         stamp = message.message.header.stamp
         self._stamps[client] = f"{stamp.sec}.{stamp.nanosec:09}" if stamp.sec or stamp.nanosec else ""
         try:

@@ -176,7 +176,8 @@ class Member:
         self._last_problem[problem.task.name] = str(problem)
 
     def _deactivate_soon(self, why: str) -> None:
-        if self._deactivating is None and self.life.state is State.ACTIVE:
+        over = self._deactivating is None or self._deactivating.done()
+        if over and self.life.state is State.ACTIVE and self.life.under_way is None:
             _log.error("! %s is deactivated: %s", self.runtime.node.name, why)
             self._deactivating = asyncio.get_running_loop().create_task(self.deactivate(), name="deactivate")
 
