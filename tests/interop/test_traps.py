@@ -384,7 +384,7 @@ async def test_header_seq_and_every_other_byte_arrive_as_they_were_sent(two: Two
     kind = MessageType("sensor_msgs/Joy")
     sequences = (4711, 3, 4294967295)
     values = [{"header": {"seq": seq, "frame_id": "pad"}, "axes": [0.5]} for seq in sequences]
-    messages = [kind.serialize(kind.make(value)) for value in values]  # type: ignore[arg-type]  # plain values
+    messages = [kind.serialize(kind.make(value)) for value in values]
     messages.append(messages[0] + b"trailing bytes")  # rospy and roscpp take such a message without a word
     got: list[bytes] = []
     async with node("ours", two.a) as ours, node("hears", two.b) as hears:
