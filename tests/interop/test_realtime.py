@@ -156,6 +156,7 @@ def test_any_user_is_told_and_the_agent_runs_on(agent: AgentFactory, home_of_nob
 
 def told_what_to_do(made: Agent, user: str) -> None:
     """Fail unless both refusals are in the log, with what grants each."""
+    made.process.wait_for("ROS_MASTER_URI=")  # the log's thread writes a moment after the agent is ready
     fifo, memory = said(made, "warning")
     assert fifo.startswith("! realtime: no SCHED_FIFO: ")
     assert memory.startswith("! realtime: no memory lock: ")

@@ -397,7 +397,8 @@ async def test_a_slow_subscriber_among_fast_ones_gets_whole_messages_or_none() -
     assert dropped > 10
     got = [await slow.message() for _ in range(30 - dropped)]
     assert got == [message for message in sent if message in got], "in order, none torn, none twice"
-    assert got[-2:] == sent[-2:]
+    # The one that was on its way when the rest came may be one of the two that the queue holds.
+    assert got[-1] == sent[-1]
     for link in (slow, *fast):
         link.close()
     owner.close()
