@@ -154,6 +154,7 @@ def _decide(model: Model, decisions: int, anew: int) -> dict[str, list[float]]:
     others = [model.requirement(n % model.clients, attributes, chance) for n in range(997)]
     took: dict[str, list[float]] = {"merge": [], "decide": [], _WHOLE: [], "explain": []}
     gc.collect()
+    gc.freeze()  # as `rmpa run` does
     for turn in range(_WARM_UP + decisions):
         for number in range(turn * anew, (turn + 1) * anew):
             asked[number % model.clients] = others[number % len(others)]
