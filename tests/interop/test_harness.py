@@ -60,7 +60,7 @@ def test_latched_talker_reaches_a_late_listener(shell: ShellFactory) -> None:
 def test_roscore_and_tools(shell: ShellFactory) -> None:
     ros = shell()
     ros.roscore()
-    assert "/rosout" in ros.tool("rosnode", "list").split()
+    eventually(lambda: "/rosout" in ros.tool("rosnode", "list").split(), what="roscore's own node, which comes later")
 
 
 @pytest.mark.netns
