@@ -31,7 +31,7 @@ from bench import (
     tasks,
     throughput,
 )
-from tests.interop import namespaces
+from rmpa.experiments.bed import namespaces
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -7,9 +7,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
-from tests.interop import namespaces, ros
-from tests.interop.agents import Agent
-from tests.interop.namespaces import MACHINE, Host, Lab
+from rmpa.experiments.bed import namespaces
+from rmpa.experiments.bed.agents import Agent
+from rmpa.experiments.bed.namespaces import MACHINE, Host, Lab
+from tests.interop import ros
 from tests.interop.ros import Ros, free_port
 
 if TYPE_CHECKING:

@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING, Final
 
 from rich.table import Table
 
-from bench import plot, profile, results, samples, schedule
+from bench import plot, profile, results, schedule
 from bench.bed import Bed
 from bench.tables import Target, dash, show_targets, us
+from rmpa.experiments import samples
 from rmpa.resource.adaptation import AdaptationSettings, Apply, Reacted
 from rmpa.resource.aio.client import ResourceClient
 from rmpa.resource.aio.member import Member

@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from bench.bed import NODES, Bed
-from bench.usage import Meter, Usage
-from tests.interop.namespaces import MACHINE
+from rmpa.experiments.bed.namespaces import MACHINE
+from rmpa.experiments.usage import Meter, Usage
 from tests.interop.ros import Ros, compiled
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from tests.interop.agents import Agent
-    from tests.interop.processes import Process
+    from rmpa.experiments.bed.agents import Agent
+    from rmpa.experiments.bed.processes import Process
 
 RELAY: Final = Path("/usr/lib/topic_tools/relay")
 _ROUND_DEADLINE: Final = 120.0

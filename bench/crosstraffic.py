@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from tests.interop.namespaces import Host
+    from rmpa.experiments.bed.namespaces import Host
 
 _LINK: Final = 100e6
 """Bits a second, as tbf counts them: with Ethernet's headers."""

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Final
 
 from rich.table import Table
 
-from bench import plot, results, samples
+from bench import plot, results
 from bench.tables import Target, show_targets, us
+from rmpa.experiments import samples
 from rmpa.resource.attributes import Attribute, Direction, Scale
 from rmpa.resource.decision import Decider
 from rmpa.resource.profiles import Profile

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from bench import results
 from bench.bed import Bed
-from bench.usage import Meter
+from rmpa.experiments.usage import Meter
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -21,8 +21,8 @@ from rich.table import Table
 from bench import results
 from bench.bed import NODES, Bed
 from bench.tables import Target, show_targets
-from bench.usage import Meter
 from rmpa.core.errors import RmpaError
+from rmpa.experiments.usage import Meter
 from rmpa.monitor.aio.control_client import ControlClient
 
 if TYPE_CHECKING:
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+    from rmpa.experiments.bed.agents import Agent
     from rmpa.monitor.snapshot import Snapshot
-    from tests.interop.agents import Agent
 
 _MESH_WITHIN: Final = 2.0
 _MIRRORED_WITHIN: Final = 1.0

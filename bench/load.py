@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Final
 
 from rich.table import Table
 
-from bench import machine, plot, results, samples, schedule
+from bench import plot, results, schedule
 from bench.bed import Bed
 from bench.tables import Target, dash, ratio, show_targets, us, usage_table
-from tests.interop.processes import Process
+from rmpa.experiments import machine, samples
+from rmpa.experiments.bed.processes import Process
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Final
 
 from rich.table import Table
 
-from bench import contenders, machine, plot, results, samples, tables
+from bench import contenders, plot, results, tables
 from bench.bed import Bed, why_no_hosts, why_no_ros
-from bench.usage import Usage, add
-from tests.interop.processes import Deadline
+from rmpa.experiments import machine, samples
+from rmpa.experiments.bed.processes import Deadline
+from rmpa.experiments.usage import Usage, add
 
 if TYPE_CHECKING:
     from pathlib import Path

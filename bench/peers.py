@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Final
 
 from rich.table import Table
 
-from bench import contenders, plot, results, samples, tables
+from bench import contenders, plot, results, tables
 from bench.bed import NODES, Bed, why_no_hosts, why_no_ros
 from bench.contenders import Contender
 from bench.schedule import HostLateness
-from bench.usage import Usage, add
-from tests.interop.processes import Deadline
+from rmpa.experiments import samples
+from rmpa.experiments.bed.processes import Deadline
+from rmpa.experiments.usage import Usage, add
 from tests.interop.ros import free_port
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from tests.interop.processes import Process
+    from rmpa.experiments.bed.processes import Process
 
 _SIZES: Final = (64, 64 * 1024, 1024 * 1024)
 _WARM_UP: Final = 20

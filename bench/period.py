@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Final
 
 from rich.table import Table
 
-from bench import plot, results, samples, schedule
+from bench import plot, results, schedule
 from bench.bed import Bed
 from bench.tables import Target, dash, ratio, show_targets, us, usage_row, usage_table
-from bench.usage import Usage, add
+from rmpa.experiments import samples
+from rmpa.experiments.usage import Usage, add
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from typing import TYPE_CHECKING, Any, Final
 
-from bench.samples import percentile
+from rmpa.experiments.samples import percentile
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

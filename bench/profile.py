@@ -29,9 +29,9 @@ from bench import plot, results, schedule
 from bench.bed import NODES, Bed
 from bench.scale import per_message
 from bench.tables import us
-from bench.usage import Meter
-from tests.interop.agents import Agent
-from tests.interop.processes import eventually
+from rmpa.experiments.bed.agents import Agent
+from rmpa.experiments.bed.processes import eventually
+from rmpa.experiments.usage import Meter
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping

@@ -7,7 +7,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Final
 
-from bench import machine
+from rmpa.experiments import machine
 
 RESULTS: Final = Path(__file__).parent / "results"
 

@@ -18,8 +18,8 @@ from rich.table import Table
 from bench import results
 from bench.bed import Bed
 from bench.tables import Target, show_targets
-from bench.usage import Meter
 from rmpa.core.aio.loop import AgentLoop
+from rmpa.experiments.usage import Meter
 from rmpa.ros.aio.external_core import ExternalCore
 from rmpa.ros.aio.http_client import call
 from rmpa.ros.master.survey import one_call
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+    from rmpa.experiments.bed.processes import Process
     from rmpa.ros.xmlrpc import XmlRpcValue
-    from tests.interop.processes import Process
 
 GRAPHS: Final = ((10, 50, 20), (50, 500, 100), (200, 4000, 800))
 """Nodes, topics with a publisher and a subscriber each, services."""

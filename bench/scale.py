@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING, Final
 
 from rich.table import Table
 
-from bench import plot, results, samples, schedule
+from bench import plot, results, schedule
 from bench.bed import NODES, Bed
 from bench.tables import Target, dash, ratio, show_targets, us
-from bench.usage import Meter, Usage, add
-from tests.interop.processes import eventually
+from rmpa.experiments import samples
+from rmpa.experiments.bed.processes import eventually
+from rmpa.experiments.usage import Meter, Usage, add
 from tests.interop.ros import compiled
 
 if TYPE_CHECKING:
@@ -30,8 +31,8 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from tests.interop.agents import Agent
-    from tests.interop.processes import Process
+    from rmpa.experiments.bed.agents import Agent
+    from rmpa.experiments.bed.processes import Process
 
 _SIZE: Final = 64
 _LIMIT: Final = 1.1

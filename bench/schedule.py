@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 
-from bench import machine, samples
 from bench.bed import NODES, Bed
 from bench.tables import usage_row
-from bench.usage import Meter, Usage, add
-from tests.interop.agents import RMPA
-from tests.interop.processes import Deadline
+from rmpa.experiments import machine, samples
+from rmpa.experiments.bed.agents import RMPA
+from rmpa.experiments.bed.processes import Deadline
+from rmpa.experiments.usage import Meter, Usage, add
 from tests.interop.ros import NODES as TEST_NODES
 from tests.interop.ros import compiled
 
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from tests.interop.agents import Agent
-    from tests.interop.processes import Process
+    from rmpa.experiments.bed.agents import Agent
+    from rmpa.experiments.bed.processes import Process
     from tests.interop.ros import Ros
 
 LEAD_IN: Final = 0.2

@@ -12,15 +12,16 @@ from typing import TYPE_CHECKING, Final
 
 from rich.table import Table
 
-from bench import results, samples, tables
+from bench import results, tables
 from bench.bed import NODES, Bed
+from rmpa.experiments import samples
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from rich.console import Console
 
-    from tests.interop.processes import Process
+    from rmpa.experiments.bed.processes import Process
     from tests.interop.ros import Ros
 
 _SIZES: Final = (64, 64 * 1024, 1024 * 1024)

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Final
 
 from rich.table import Table
 
-from bench import results, samples
+from bench import results
 from bench.bed import Bed
+from rmpa.experiments import samples
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -15,18 +15,19 @@ from typing import TYPE_CHECKING, Final
 
 from rich.table import Table
 
-from bench import plot, results, samples, schedule
+from bench import plot, results, schedule
 from bench.bed import NODES, Bed
 from bench.tables import Target, dash, ratio, show_targets, us, usage_table
-from bench.usage import Meter, Usage, add
-from tests.interop.agents import RMPA
+from rmpa.experiments import samples
+from rmpa.experiments.bed.agents import RMPA
+from rmpa.experiments.usage import Meter, Usage, add
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from rich.console import Console
 
-    from tests.interop.processes import Process
+    from rmpa.experiments.bed.processes import Process
 
 _SIZE, _RATE = 64, 1000.0
 _CALLS: Final = 200.0

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from bench.usage import Usage
+    from rmpa.experiments.usage import Usage
 
 
 @dataclass(frozen=True, slots=True)

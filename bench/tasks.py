@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING, Final
 
 from rich.table import Table
 
-from bench import plot, results, samples, schedule
+from bench import plot, results, schedule
 from bench.bed import NODES, Bed
 from bench.tables import Target, dash, ratio, show_targets, us, usage_row
-from bench.usage import Meter, Usage, add
-from tests.interop.agents import RMPA
+from rmpa.experiments import samples
+from rmpa.experiments.bed.agents import RMPA
+from rmpa.experiments.usage import Meter, Usage, add
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from tests.interop.processes import Process
+    from rmpa.experiments.bed.processes import Process
 
 _TITLES: Final = {"resource": "task of a resource", "rospy": "rospy.Rate", "roscpp": "ros::Rate"}
 _RATE: Final = 100

@@ -22,7 +22,7 @@ from rich.table import Table
 from bench import plot, results
 from bench.bed import NODES, Bed
 from bench.tables import Target, dash, ratio, show_targets, size, usage_row, usage_table
-from bench.usage import Meter, Usage
+from rmpa.experiments.usage import Meter, Usage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from tests.interop.agents import Agent
+    from rmpa.experiments.bed.agents import Agent
     from tests.interop.ros import Ros
 
 _MB: Final = 1024 * 1024

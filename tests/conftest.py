@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Final
 import pytest
 from blockbuster import blockbuster_ctx
 
-from tests.interop import namespaces, ros
+from rmpa.experiments.bed import namespaces
+from tests.interop import ros
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator

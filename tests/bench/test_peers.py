@@ -12,7 +12,7 @@ from rich.console import Console
 from bench import peers
 from bench.bed import NODES, Bed
 from bench.peers import FIELD, Entry, Score
-from tests.interop.processes import Deadline, Process
+from rmpa.experiments.bed.processes import Deadline, Process
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from bench.machine import histogram
-from bench.samples import percentile, summary
-from bench.usage import Usage, add
+from rmpa.experiments.machine import histogram
+from rmpa.experiments.samples import percentile, summary
+from rmpa.experiments.usage import Usage, add
 
 
 def test_nearest_rank() -> None:

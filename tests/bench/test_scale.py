@@ -15,7 +15,7 @@ import pytest
 
 from bench.bed import NODES
 from bench.scale import Step, _of_copy, _panels, _targets, copies, per_message
-from bench.usage import Usage
+from rmpa.experiments.usage import Usage
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any, Final
 import psutil
 import pytest
 
+from rmpa.experiments.bed.processes import Process, eventually
 from rmpa.monitor.aio.control_client import ControlClient, choose_agent
 from rmpa.resource import ResourceClient, at_least, at_most
 from rmpa.ros.aio.node import Node
 from stick import AXIS, BUTTON, EVENT
-from tests.interop.processes import Process, eventually
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from tests.interop.processes import Process, eventually
+from rmpa.experiments.bed.processes import Process, eventually
 from tests.interop.ros import free_port
 
 if TYPE_CHECKING:

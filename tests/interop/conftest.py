@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.interop import namespaces
-from tests.interop.agents import Agent
+from rmpa.experiments.bed import namespaces
+from rmpa.experiments.bed.agents import Agent
+from rmpa.experiments.bed.namespaces import MACHINE, Host, Lab
 from tests.interop.modules import Module
-from tests.interop.namespaces import MACHINE, Host, Lab
 from tests.interop.ros import Ros, free_port
 
 if TYPE_CHECKING:

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.interop.processes import eventually
+from rmpa.experiments.bed.processes import eventually
 from tests.interop.ros import lacks
 
 if TYPE_CHECKING:
+    from rmpa.experiments.bed.processes import Event, Process
     from tests.interop.conftest import ModuleFactory
     from tests.interop.modules import Module
-    from tests.interop.processes import Event, Process
 
 pytestmark = [
     pytest.mark.ros,

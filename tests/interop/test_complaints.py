@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
+from rmpa.experiments.bed.processes import CommandFailed, eventually
 from tests.interop.modules import Module, flows
-from tests.interop.processes import eventually
 from tests.interop.ros import PYTHON
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from rmpa.experiments.bed.namespaces import Host, Lab
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
-    from tests.interop.namespaces import Host, Lab
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
@@ -70,7 +70,7 @@ def test_names_that_only_their_own_machine_knows_and_a_bag_from_the_first_messag
             del module.ros.env["ROS_IP"]
             module.ros.env["ROS_HOSTNAME"] = f"{module.host.name}-robot"
         a.agent.wait_peer("b")
-        with pytest.raises(AssertionError):
+        with pytest.raises(CommandFailed):
             b.ros.tool("getent", "hosts", "a-robot")
         bag = b.ros.home / "it.bag"
         record = b.ros.start("rosbag", "record", "-O", bag, "-l", "30", "/chatter", name="record")

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
-from tests.interop.agents import RMPA
-from tests.interop.processes import Process, eventually
+from rmpa.experiments.bed.agents import RMPA
+from rmpa.experiments.bed.processes import Process, eventually
 from tests.interop.ros import PYTHON, lacks
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from rmpa.experiments.bed.processes import Event
     from tests.interop.conftest import ModuleFactory
     from tests.interop.modules import Module
-    from tests.interop.processes import Event
 
 pytestmark = [
     pytest.mark.ros,

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.experiments.bed.processes import eventually
 from tests.interop.modules import flows
-from tests.interop.processes import eventually
 from tests.interop.recordings import recorded, wait_last
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from rmpa.experiments.bed.processes import Process
     from tests.interop.conftest import ModuleFactory
     from tests.interop.modules import Module
-    from tests.interop.processes import Process
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 

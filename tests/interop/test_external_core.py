@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
+from rmpa.experiments.bed.processes import eventually
 from tests.interop.modules import Module, flows
-from tests.interop.processes import eventually
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tests.interop.agents import Agent
+    from rmpa.experiments.bed.agents import Agent
+    from rmpa.experiments.bed.namespaces import Lab
+    from rmpa.experiments.bed.processes import Process
     from tests.interop.conftest import AgentFactory, ShellFactory
-    from tests.interop.namespaces import Lab
-    from tests.interop.processes import Process
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 

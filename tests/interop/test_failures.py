@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.experiments.bed.processes import eventually
 from tests.interop.modules import Module, flows
-from tests.interop.processes import eventually
 
 if TYPE_CHECKING:
     from tests.interop.conftest import ModuleFactory

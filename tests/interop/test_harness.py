@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.interop import namespaces
-from tests.interop.agents import NotifySocket
-from tests.interop.namespaces import Lab
-from tests.interop.processes import Deadline, Process, eventually, run
+from rmpa.experiments.bed import namespaces
+from rmpa.experiments.bed.agents import NotifySocket
+from rmpa.experiments.bed.namespaces import Lab
+from rmpa.experiments.bed.processes import Deadline, Process, eventually, run
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core import limits
+from rmpa.experiments.bed.processes import Process, eventually, run
 from rmpa.monitor.aio.control_client import ControlClient
 from tests.interop.modules import Module, flows
-from tests.interop.processes import Process, eventually, run
 from tests.interop.ros import NODES
 
 if TYPE_CHECKING:
+    from rmpa.experiments.bed.namespaces import Lab
     from rmpa.monitor.snapshot import Snapshot
     from tests.interop.conftest import ModuleFactory
-    from tests.interop.namespaces import Lab
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 

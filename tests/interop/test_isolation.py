@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 if TYPE_CHECKING:
+    from rmpa.experiments.bed.processes import Event, Process
     from tests.interop.conftest import ModuleFactory
-    from tests.interop.processes import Event, Process
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 

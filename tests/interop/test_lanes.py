@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.experiments.bed.processes import eventually
 from tests.interop.modules import flows
-from tests.interop.processes import eventually
 from tests.interop.recordings import in_order, recorded, wait_last
 
 if TYPE_CHECKING:

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.interop.processes import eventually
+from rmpa.experiments.bed.processes import eventually
 
 if TYPE_CHECKING:
+    from rmpa.experiments.bed.namespaces import Host
+    from rmpa.experiments.bed.processes import Event, Process
     from tests.interop.conftest import ModuleFactory
     from tests.interop.modules import Module
-    from tests.interop.namespaces import Host
-    from tests.interop.processes import Event, Process
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.experiments.bed.processes import eventually
 from tests.interop.modules import Module, flows
-from tests.interop.processes import eventually
 
 if TYPE_CHECKING:
+    from rmpa.experiments.bed.namespaces import Lab
+    from rmpa.experiments.bed.processes import Event, Process
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
-    from tests.interop.namespaces import Lab
-    from tests.interop.processes import Event, Process
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 

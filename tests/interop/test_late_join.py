@@ -9,8 +9,8 @@ import pytest
 from tests.interop.modules import Module, flows, whole
 
 if TYPE_CHECKING:
+    from rmpa.experiments.bed.namespaces import Lab
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
-    from tests.interop.namespaces import Lab
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.experiments.bed.processes import eventually
 from tests.interop.modules import flows
-from tests.interop.processes import eventually
 from tests.interop.ros import lacks
 
 if TYPE_CHECKING:
+    from rmpa.experiments.bed.processes import Process
     from tests.interop.conftest import ModuleFactory
     from tests.interop.modules import Module
-    from tests.interop.processes import Process
 
 pytestmark = [
     pytest.mark.ros,

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.experiments.bed.processes import eventually
 from tests.interop.modules import Module, flows
-from tests.interop.processes import eventually
 from tests.interop.ros import lacks
 
 if TYPE_CHECKING:
+    from rmpa.experiments.bed.namespaces import Lab
     from tests.interop.conftest import AgentFactory, ShellFactory
-    from tests.interop.namespaces import Lab
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
 

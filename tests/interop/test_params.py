@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.interop.agents import RMPA
+from rmpa.experiments.bed.agents import RMPA
+from rmpa.experiments.bed.processes import Process, eventually
 from tests.interop.modules import Module
-from tests.interop.processes import Process, eventually
 from tests.interop.ros import free_port
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from rmpa.experiments.bed.namespaces import Lab
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
-    from tests.interop.namespaces import Lab
     from tests.interop.ros import Ros
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(150)]

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.experiments.bed.processes import eventually
 from tests.interop.modules import flows
-from tests.interop.processes import eventually
 from tests.interop.ros import PYTHON
 
 if TYPE_CHECKING:

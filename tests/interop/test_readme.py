@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from tests.interop.agents import RMPA
-from tests.interop.processes import Process
+from rmpa.experiments.bed.agents import RMPA
+from rmpa.experiments.bed.processes import Process
 
 if TYPE_CHECKING:
-    from tests.interop.agents import Agent
+    from rmpa.experiments.bed.agents import Agent
+    from rmpa.experiments.bed.namespaces import Lab
     from tests.interop.conftest import AgentFactory, ShellFactory
-    from tests.interop.namespaces import Lab
 
 pytestmark = [pytest.mark.netns, pytest.mark.timeout(120)]
 

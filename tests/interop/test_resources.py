@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from tests.interop.agents import RMPA, Agent
-from tests.interop.processes import Event, Process, eventually
+from rmpa.experiments.bed.agents import RMPA, Agent
+from rmpa.experiments.bed.processes import Event, Process, eventually
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from rmpa.experiments.bed.namespaces import Host, Lab
     from tests.interop.conftest import ShellFactory
-    from tests.interop.namespaces import Host, Lab
     from tests.interop.ros import Ros
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]

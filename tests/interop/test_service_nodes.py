@@ -18,8 +18,8 @@ from tests.interop.nodes.payload import Pattern
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from rmpa.experiments.bed.processes import Process
     from tests.interop.conftest import ShellFactory
-    from tests.interop.processes import Process
     from tests.interop.ros import Ros
 
 pytestmark = pytest.mark.ros

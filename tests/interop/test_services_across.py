@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.interop.processes import eventually
+from rmpa.experiments.bed.processes import CommandFailed, eventually
 from tests.interop.ros import PYTHON
 
 if TYPE_CHECKING:
+    from rmpa.experiments.bed.namespaces import Lab
+    from rmpa.experiments.bed.processes import Event, Process
     from tests.interop.conftest import ModuleFactory, ShellFactory
     from tests.interop.modules import Module
-    from tests.interop.namespaces import Lab
-    from tests.interop.processes import Event, Process
     from tests.interop.ros import Ros
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
@@ -186,10 +186,10 @@ def test_the_stock_tools_say_what_they_say_under_one_roscore(
         said["list"] = "".join(
             line for line in there.tool("rosservice", "list").splitlines(True) if line.startswith("/arm")
         )
-        with pytest.raises(AssertionError) as caught:
+        with pytest.raises(CommandFailed) as caught:
             there.tool("rosservice", "call", "/arm/switch", "false")
         said["error"] = str(caught.value).partition("status")[2]
-        with pytest.raises(AssertionError) as caught:
+        with pytest.raises(CommandFailed) as caught:
             there.tool("rosservice", "call", "/arm/nothing")
         said["unknown"] = str(caught.value).partition("status")[2]
         answers.append(said)

@@ -9,8 +9,8 @@ import pytest
 from tests.interop.modules import flows, whole
 
 if TYPE_CHECKING:
+    from rmpa.experiments.bed.processes import Event
     from tests.interop.conftest import ModuleFactory
-    from tests.interop.processes import Event
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 

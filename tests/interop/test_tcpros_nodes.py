@@ -27,9 +27,9 @@ from tests.interop.ros import PYTHON
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from rmpa.experiments.bed.processes import Process
     from rmpa.ros.aio.node import Publisher, Received
     from tests.interop.conftest import ShellFactory
-    from tests.interop.processes import Process
     from tests.interop.ros import Ros
 
 pytestmark = pytest.mark.ros

@@ -18,6 +18,7 @@ from rmpa.bridge.messages import Description as About
 from rmpa.bridge.messages import Source
 from rmpa.core.contract import Contract
 from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.experiments.bed.processes import eventually
 from rmpa.ros.aio.core import RosCore
 from rmpa.ros.aio.http_client import call_api
 from rmpa.ros.aio.node import Node
@@ -26,16 +27,15 @@ from rmpa.ros.messages import MessageType
 from rmpa.ros.tcpros import encode_header, frame_message, subscriber_header
 from tests.interop.modules import flows, whole
 from tests.interop.nodes.payload import Pattern
-from tests.interop.processes import eventually
 from tests.interop.ros import PYTHON
 from tests.ros.aio.peers import RawSubscriber
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from tests.interop.agents import Agent
+    from rmpa.experiments.bed.agents import Agent
+    from rmpa.experiments.bed.processes import Process
     from tests.interop.conftest import AgentFactory, ShellFactory
-    from tests.interop.processes import Process
     from tests.interop.ros import Ros
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.interop.agents import Agent
+from rmpa.experiments.bed.agents import Agent
+from rmpa.experiments.bed.namespaces import MACHINE
 from tests.interop.modules import whole
-from tests.interop.namespaces import MACHINE
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from rmpa.experiments.bed.processes import eventually, run
 from tests.interop.modules import Module, flows
-from tests.interop.processes import eventually, run
 
 if TYPE_CHECKING:
-    from tests.interop.agents import Agent
+    from rmpa.experiments.bed.agents import Agent
+    from rmpa.experiments.bed.namespaces import Lab
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
-    from tests.interop.namespaces import Lab
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
 
@@ -173,6 +173,6 @@ def test_the_doctor_finds_the_firewall_of_a_host(lab: Lab, agent: AgentFactory) 
 
 
 def _rmpa() -> list[str]:
-    from tests.interop.agents import RMPA
+    from rmpa.experiments.bed.agents import RMPA
 
     return [str(RMPA)]

@@ -14,7 +14,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from tests.interop import namespaces, ros
+from rmpa.experiments.bed import namespaces
+from rmpa.experiments.bed.processes import BedError
+from tests.interop import ros
 from tests.soak import chaos
 from tests.soak.held import MB, Held, growth, left, look, too_much
 from tests.soak.stage import STEADY, Stage, leftovers
@@ -52,7 +54,7 @@ class Soak:
                 while self._now < self._seconds and len(self.problems) < 20:
                     self._disturb(stage)
                 self._end(stage, before)
-        except AssertionError as error:
+        except (AssertionError, BedError) as error:
             self.problems.append(str(error))
         self.problems += [f"network namespace {name} is left" for name in leftovers()]
 

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 
+from rmpa.experiments.bed.processes import eventually
 from rmpa.monitor.aio.control_client import ControlClient
-from tests.interop.processes import eventually
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tests.interop.agents import Agent
+    from rmpa.experiments.bed.agents import Agent
 
 MB: Final = 1 << 20
 FLOOR_SPAN: Final = 5

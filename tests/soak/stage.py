@@ -14,16 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
-from tests.interop.agents import Agent
+from rmpa.experiments.bed.agents import Agent
+from rmpa.experiments.bed.namespaces import Lab
 from tests.interop.modules import Module
-from tests.interop.namespaces import Lab
 from tests.interop.ros import Ros
 from tests.soak.held import held_path
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tests.interop.processes import Process
+    from rmpa.experiments.bed.processes import Process
 
 CONFIG: Final = """
 [[contract]]

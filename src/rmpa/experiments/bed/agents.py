@@ -17,13 +17,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
-from tests.interop.processes import DEADLINE, Deadline, Process, eventually
-from tests.interop.ros import free_port
+from rmpa.experiments.bed.processes import DEADLINE, BedError, CommandFailed, Deadline, Process, eventually
+from rmpa.experiments.bed.ros import free_port
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tests.interop.namespaces import Host
+    from rmpa.experiments.bed.namespaces import Host
 
 RMPA: Final = Path(sys.executable).with_name("rmpa")
 _numbers = itertools.count(1)
@@ -140,7 +140,8 @@ class Agent:
 
     def wait_ready(self, timeout: float = DEADLINE) -> None:
         """Wait until it notifies READY=1."""
-        assert self._notify, "start() first"
+        if self._notify is None:
+            raise BedError(f"{self.name}: start() comes first")
         self.ready_after = self._notify.wait_for("READY=1", self.process, timeout) - self.process.started
 
     def restart(self) -> None:
@@ -180,7 +181,8 @@ class Agent:
     def peers(self) -> dict[str, dict[str, object]]:
         """What ``rmpa peer list --json`` says, by peer name."""
         code, output = self.rmpa("peer", "list", "--json")
-        assert code == 0, f"{output}\n{self.process.output[-4000:]}"
+        if code:
+            raise CommandFailed(f"rmpa peer list: {output}\n{self.process.output[-4000:]}")
         answer = json.loads(output)
         rows = answer["peers"] if isinstance(answer, dict) else answer
         return {str(row["name"]): row for row in rows}
@@ -205,8 +207,7 @@ class Agent:
 
     def sockets(self) -> list[Path]:
         """The sockets that it left, or has, in its runtime directory."""
-        assert self.runtime_dir
-        return sorted(path for path in self.runtime_dir.rglob("*") if path.is_socket())
+        return sorted(path for path in self.runtime_dir.rglob("*") if path.is_socket()) if self.runtime_dir else []
 
     def _close_notify(self) -> None:
         if self._notify:

@@ -26,6 +26,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
+from rmpa.core.errors import RmpaError
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -49,7 +51,7 @@ def why_not() -> str:
     return ""
 
 
-class NetworkError(RuntimeError):
+class NetworkError(RmpaError):
     """``ip`` or ``tc`` refused a command."""
 
 
@@ -241,7 +243,7 @@ class Lab:
 
 
 def remove_stale() -> list[str]:
-    """Remove namespaces left behind by test runs whose process is gone; return their names."""
+    """Remove namespaces left behind by runs whose process is gone; return their names."""
     stale = []
     for line in _ip("netns", "list").splitlines():
         name = line.split()[0] if line.strip() else ""

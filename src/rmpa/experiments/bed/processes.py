@@ -1,6 +1,6 @@
-"""Child processes of the tests and measurements: their lines, their signals, and their certain end.
+"""Child processes of experiments, measurements and tests: their lines, their signals, and their certain end.
 
-A program of ``nodes/`` writes what a test wants to know as lines of ``@ {"event": …}``; everything else is log.
+A program of ``nodes/`` writes what its caller wants to know as lines of ``@ {"event": …}``; everything else is log.
 Start processes from the main thread: the kernel then kills them when this process dies in any way.
 """
 
@@ -20,11 +20,13 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self, TypeVar
 
+from rmpa.core.errors import RmpaError
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
 DEADLINE: Final = 20.0
-"""Seconds that a test waits for a line at the most: generous, because machines are shared."""
+"""Seconds that a caller waits for a line at the most: generous, because machines are shared."""
 _END_AFTER: Final = 4.0
 """Seconds from SIGTERM to SIGKILL when a process is only to be gone."""
 
@@ -32,8 +34,16 @@ Event = dict[str, object]
 T = TypeVar("T")
 
 
-class Deadline(AssertionError):  # noqa: N818 - reads as what happened
-    """A process did not say or do in time what the test waited for; the text ends with its last lines."""
+class BedError(RmpaError):
+    """What takes part in an experiment did not do what it should; the text says what, with its last lines."""
+
+
+class Deadline(BedError):  # noqa: N818 - reads as what happened
+    """A process did not say or do in time what was waited for."""
+
+
+class CommandFailed(BedError):  # noqa: N818 - likewise
+    """A command that was run to its end did not end well."""
 
 
 class Process:
@@ -155,7 +165,8 @@ class Process:
 
     def tell(self, line: str) -> None:
         """Write one line to its standard input."""
-        assert self._child.stdin, "made without commands"
+        if self._child.stdin is None:
+            raise BedError(f"{self.name} was started without commands: it hears nothing")
         self._child.stdin.write(line + "\n")
         self._child.stdin.flush()
 
@@ -238,8 +249,7 @@ class Process:
     # --- inside -------------------------------------------------------------------------------------------------
 
     def _read(self) -> None:
-        assert self._child.stdout
-        for raw in self._child.stdout:
+        for raw in self._child.stdout or ():
             line = raw.rstrip("\n")
             event = _event_of(line)
             with self._news:
@@ -276,10 +286,16 @@ class Process:
 
 
 def run(argv: Sequence[str | Path], *, env: Mapping[str, str] | None = None, timeout: float = DEADLINE) -> str:
-    """Run a command to its end and return its output; a non-zero status or no end in time fails the test."""
+    """Run a command to its end and return its output; a bad end raises.
+
+    Raises:
+        CommandFailed: It ended with another status than 0.
+        Deadline: It did not end in time.
+    """
     with Process(argv, env=env) as process:
         code = process.wait(timeout)
-        assert code == 0, f"{' '.join(process.argv)} ended with status {code}\n{process.output}"
+        if code:
+            raise CommandFailed(f"{' '.join(process.argv)} ended with status {code}\n{process.output}")
         return process.output
 
 

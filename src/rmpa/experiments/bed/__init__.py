@@ -1,0 +1,1 @@
+"""What experiments run on: hosts and cables, processes, ROS shells, agents."""
