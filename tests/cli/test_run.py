@@ -13,7 +13,7 @@ import pytest
 
 from rmpa.cli.run import prepared
 from rmpa.core.errors import ConfigError
-from tests.interop.processes import Process, eventually
+from rmpa.experiments.bed.processes import Process, eventually
 from tests.interop.ros import free_port
 
 if TYPE_CHECKING:
