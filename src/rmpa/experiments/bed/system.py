@@ -75,7 +75,7 @@ class System(Protocol):
         ...
 
     def traffic(self, host: str) -> Mapping[str, int]:
-        """Packets and bytes that a host's cable carried so far: ``{"tx_bytes": …, "rx_bytes": …, "tx_packets": …}``."""
+        """Packets and bytes of a host's cable so far: ``tx_bytes``, ``rx_bytes``, ``tx_packets``, ``rx_packets``."""
         ...
 
 
