@@ -16,9 +16,9 @@ from rmpa.bridge.imports import Imports
 from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, Source, decode, encode
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.relay import Linked, Relay, Ways, may_have
-from rmpa.bridge.service_exports import ExportAction, LocalService, ServiceExports
-from rmpa.bridge.service_rules import ServiceRules
-from rmpa.bridge.services import ImportAction, Provide, ServiceImports, Withdraw
+from rmpa.bridge.services.exports import ExportAction, LocalService, ServiceExports
+from rmpa.bridge.services.imports import ImportAction, Provide, ServiceImports, Withdraw
+from rmpa.bridge.services.rules import ServiceRules
 from rmpa.core import limits
 from rmpa.core.config import PolicySettings, ServiceSettings
 from rmpa.core.guid import Guid

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.bridge import param_transfer as transfer
+from rmpa.bridge.params import transfer
 from rmpa.cli.param_yaml import read_documents, read_yaml, show_yaml, write_yaml
 from rmpa.core import limits
 from rmpa.core.errors import PeerRefused, RmpaError

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from rmpa.bridge import param_transfer as transfer
-from rmpa.bridge.params import key_problem, leaves
+from rmpa.bridge.params import transfer
+from rmpa.bridge.params.rules import key_problem, leaves
 from rmpa.core import limits
 from rmpa.core.errors import RmpaError
 

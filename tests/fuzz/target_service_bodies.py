@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.bridge.aio.service_bodies import BodyTaker, Budget
+from rmpa.bridge.services.aio.bodies import BodyTaker, Budget
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
 

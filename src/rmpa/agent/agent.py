@@ -22,11 +22,11 @@ from rmpa.agent.view import View
 from rmpa.agent.view_services import ServicesView
 from rmpa.agent.why import Why
 from rmpa.bridge.aio.bridge import Bridge
-from rmpa.bridge.aio.params import Params
-from rmpa.bridge.aio.services import Services
 from rmpa.bridge.naming import Names
+from rmpa.bridge.params.aio.part import Params
 from rmpa.bridge.policy import Policy
-from rmpa.bridge.service_rules import ServiceRules
+from rmpa.bridge.services.aio.part import Services
+from rmpa.bridge.services.rules import ServiceRules
 from rmpa.core import limits
 from rmpa.core.aio import realtime
 from rmpa.core.aio.collector import Collector

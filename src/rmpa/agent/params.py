@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rmpa.bridge.param_transfer import QUESTIONS
+from rmpa.bridge.params.transfer import QUESTIONS
 from rmpa.core import limits
 from rmpa.core.config_values import did_you_mean
 from rmpa.core.errors import ConfigError
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.aio.asks import Asks
     from rmpa.bridge.aio.bridge import Attached
-    from rmpa.bridge.aio.params import Params
+    from rmpa.bridge.params.aio.part import Params
 
 
 class ParamOps:
@@ -33,7 +33,7 @@ class ParamOps:
         self._attached = attached
 
     async def ask(self, args: dict[str, object]) -> Any:
-        """Pass a question of ``bridge.param_transfer`` on to a peer: ``{peer, what, args}``."""
+        """Pass a question of ``bridge.params.transfer`` on to a peer: ``{peer, what, args}``."""
         what, inner = str(args.get("what", "")), args.get("args")
         if what not in QUESTIONS:
             near = did_you_mean(what, QUESTIONS)

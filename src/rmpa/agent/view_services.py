@@ -10,10 +10,10 @@ from rmpa.monitor.snapshot import ServiceInfo, Spread
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.bridge.aio.service_calls import CallStats
-    from rmpa.bridge.aio.services import Services
-    from rmpa.bridge.service_exports import LocalService
-    from rmpa.bridge.services import RemoteService
+    from rmpa.bridge.services.aio.calls import CallStats
+    from rmpa.bridge.services.aio.part import Services
+    from rmpa.bridge.services.exports import LocalService
+    from rmpa.bridge.services.imports import RemoteService
 
 
 class ServicesView:

@@ -20,7 +20,7 @@ from rmpa.monitor.why_services import FarService, walk_service
 if TYPE_CHECKING:
     from rmpa.agent.view import View
     from rmpa.bridge.aio.bridge import Attached, Bridge
-    from rmpa.bridge.aio.services import Services
+    from rmpa.bridge.services.aio.part import Services
     from rmpa.core.config import Settings
     from rmpa.monitor.snapshot import PeerInfo
     from rmpa.ros.aio.core_api import Core

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rmpa.agent.why_topics import name_in
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import OWN_NODE, Policy, is_own
-from rmpa.bridge.service_rules import ServiceRules
+from rmpa.bridge.services.rules import ServiceRules
 from rmpa.core import limits
 from rmpa.core.aio.loop import breathing
 from rmpa.core.config_values import did_you_mean
@@ -19,7 +19,7 @@ from rmpa.ros.aio.service_client import ServiceConnection
 
 if TYPE_CHECKING:
     from rmpa.bridge.aio.bridge import Attached, Bridge
-    from rmpa.bridge.aio.services import Services
+    from rmpa.bridge.services.aio.part import Services
     from rmpa.core.config import Settings
     from rmpa.ros.aio.core_api import Core
 

@@ -8,8 +8,8 @@ import secrets
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from rmpa.bridge import param_transfer as transfer
-from rmpa.bridge.params import key_problem, leaves
+from rmpa.bridge.params import transfer
+from rmpa.bridge.params.rules import key_problem, leaves
 from rmpa.cli.master import Master, choose_master
 from rmpa.core import limits
 from rmpa.core.config_values import did_you_mean

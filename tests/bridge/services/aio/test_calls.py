@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.bridge.aio.service_bodies import BodySender, BodyTaker, Budget
-from rmpa.bridge.aio.service_calls import Budgets, Caller, CallStats, Server
+from rmpa.bridge.services.aio.bodies import BodySender, BodyTaker, Budget
+from rmpa.bridge.services.aio.calls import Budgets, Caller, CallStats, Server
 from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST, Outbox, Parcel
@@ -19,7 +19,7 @@ from rmpa.core.outbox import ABORT, FIRST, LAST, Outbox, Parcel
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.bridge.aio.service_pool import ServicePool
+    from rmpa.bridge.services.aio.pool import ServicePool
     from rmpa.core.aio.stream import Buffer
     from rmpa.ros.aio.service_server import ServiceCall
 

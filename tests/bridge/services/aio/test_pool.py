@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.bridge.aio.service_pool import ServicePool
-from rmpa.bridge.service_exports import LocalService
+from rmpa.bridge.services.aio.pool import ServicePool
+from rmpa.bridge.services.exports import LocalService
 from rmpa.core import limits
 from rmpa.core.errors import RmpaError
 from rmpa.ros.aio.service_server import ServiceCall, ServiceEndpoint

@@ -6,9 +6,9 @@ import asyncio
 import time
 from typing import TYPE_CHECKING, Final
 
-from rmpa.bridge.aio.service_calls import Budgets, CallStats, Server
-from rmpa.bridge.aio.service_pool import ServicePool
-from rmpa.bridge.service_exports import (
+from rmpa.bridge.services.aio.calls import Budgets, CallStats, Server
+from rmpa.bridge.services.aio.pool import ServicePool
+from rmpa.bridge.services.exports import (
     About,
     EndRoute,
     ExportAction,

@@ -8,12 +8,12 @@ import pytest
 
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
-from rmpa.bridge.service_rules import ServiceRules
+from rmpa.bridge.services.rules import ServiceRules
 from rmpa.core.config import PeerRule, PolicySettings, ServiceRule, ServiceSettings
 
 if TYPE_CHECKING:
-    from rmpa.bridge.service_exports import ServiceExports
-    from rmpa.bridge.services import ServiceImports
+    from rmpa.bridge.services.exports import ServiceExports
+    from rmpa.bridge.services.imports import ServiceImports
 
 
 def rules(settings: ServiceSettings | None = None, peers: tuple[PeerRule, ...] = ()) -> ServiceRules:

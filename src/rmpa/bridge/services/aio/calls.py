@@ -7,13 +7,13 @@ from collections import OrderedDict
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from rmpa.bridge.aio.service_bodies import BodySender, BodyTaker, Budget
+from rmpa.bridge.services.aio.bodies import BodySender, BodyTaker, Budget
 from rmpa.core import limits
 from rmpa.core.stats import Ring
 
 if TYPE_CHECKING:
-    from rmpa.bridge.aio.service_bodies import BodyLink
-    from rmpa.bridge.aio.service_pool import ServicePool
+    from rmpa.bridge.services.aio.bodies import BodyLink
+    from rmpa.bridge.services.aio.pool import ServicePool
     from rmpa.core.aio.stream import Buffer
     from rmpa.ros.aio.service_server import ServiceCall
 

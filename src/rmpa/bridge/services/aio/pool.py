@@ -16,7 +16,7 @@ from rmpa.core.errors import LocalProtocolError, RmpaError
 from rmpa.ros.aio.service_client import ServiceConnection, ServiceFailed
 
 if TYPE_CHECKING:
-    from rmpa.bridge.service_exports import LocalService
+    from rmpa.bridge.services.exports import LocalService
     from rmpa.core.aio.stream import Buffer
     from rmpa.ros.services import ServiceDescription
 

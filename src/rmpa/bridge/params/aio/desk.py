@@ -8,9 +8,9 @@ import logging
 from collections import defaultdict
 from typing import TYPE_CHECKING, Any
 
-from rmpa.bridge import param_transfer as transfer
-from rmpa.bridge.aio.param_core import PEERS, ParamCore, read_text, write_text
-from rmpa.bridge.params import key_problem, leaves
+from rmpa.bridge.params import transfer
+from rmpa.bridge.params.aio.core import PEERS, ParamCore, read_text, write_text
+from rmpa.bridge.params.rules import key_problem, leaves
 from rmpa.core import limits
 from rmpa.core.aio.loop import breathe, breathing
 from rmpa.core.config_param import overlap
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.aio.asks import Asks
     from rmpa.bridge.aio.bridge import Attached
-    from rmpa.bridge.params import ParamPolicy
+    from rmpa.bridge.params.rules import ParamPolicy
     from rmpa.ros.xmlrpc import XmlRpcValue
 
 _log = logging.getLogger(__name__)

@@ -13,8 +13,8 @@ from rmpa.bridge.messages import (
     ServiceOffer,
     ServiceOpened,
 )
-from rmpa.bridge.service_exports import About
-from rmpa.bridge.services import (
+from rmpa.bridge.services.exports import About
+from rmpa.bridge.services.imports import (
     EndedService,
     ForgetAbout,
     OpenedService,
@@ -26,7 +26,7 @@ from rmpa.bridge.services import (
 from rmpa.core import limits
 from rmpa.core.config import PeerRule, PolicySettings, ServiceSettings
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
-from tests.bridge.test_service_rules import obey, rules
+from tests.bridge.services.test_rules import obey, rules
 
 MD5 = "6a2e34150c00229791cc89ff309fff21"
 ROUTE = limits.SERVICE_ROUTES + 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Final
 
-from rmpa.bridge.param_transfer import too_large
+from rmpa.bridge.params.transfer import too_large
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.core import limits
 from rmpa.core.aio.loop import breathe, breathing

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from rmpa.bridge.messages import Origin
-    from rmpa.bridge.service_rules import ServiceRules
+    from rmpa.bridge.services.rules import ServiceRules
 
 
 @dataclass(frozen=True, slots=True)

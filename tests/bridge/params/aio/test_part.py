@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from rmpa.bridge import param_transfer as transfer
 from rmpa.bridge.aio.asks import Asks
-from rmpa.bridge.aio.param_core import read_text, write_text
-from rmpa.bridge.aio.params import Params
 from rmpa.bridge.messages import decode
+from rmpa.bridge.params import transfer
+from rmpa.bridge.params.aio.core import read_text, write_text
+from rmpa.bridge.params.aio.part import Params
 from rmpa.core import limits
 from rmpa.core.config import FollowRule, ParamSettings, Settings, TimeSettings
 from rmpa.core.counters import Counters

@@ -6,9 +6,9 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Any
 
-from rmpa.bridge import param_transfer as transfer
-from rmpa.bridge.aio.param_core import ParamCore, read_text
-from rmpa.bridge.params import Following, learn
+from rmpa.bridge.params import transfer
+from rmpa.bridge.params.aio.core import ParamCore, read_text
+from rmpa.bridge.params.rules import Following, learn
 from rmpa.core import limits
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import RemoteProtocolError, RmpaError
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.aio.asks import Asks
     from rmpa.bridge.aio.bridge import Attached
-    from rmpa.bridge.params import Followed
+    from rmpa.bridge.params.rules import Followed
     from rmpa.core.config import FollowRule
     from rmpa.ros.xmlrpc import XmlRpcValue
 

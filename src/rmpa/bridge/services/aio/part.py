@@ -1,7 +1,7 @@
 """Services across the mesh: what this module provides is called by peers, and what they provide stands here.
 
-The two plans are pure (``bridge.services``, ``bridge.service_exports``); this part of the bridge carries them out. A
-call takes this way::
+The two plans are pure (``services.imports``, ``services.exports``); this part of the bridge carries
+them out. A call takes this way::
 
     client → proxy's ServiceEndpoint → Caller ⇢ link ⇢ Server → ServicePool → server
                                               ⇠      ⇠
@@ -18,8 +18,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge.actions import Send, Warn
 from rmpa.bridge.aio.part import Part
-from rmpa.bridge.aio.service_calls import Budgets, Caller, CallStats
-from rmpa.bridge.aio.service_serving import Serving
 from rmpa.bridge.messages import (
     AdvertiseServices,
     CloseService,
@@ -31,9 +29,10 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy, is_own
-from rmpa.bridge.service_exports import About, ExportAction, LocalService, ServiceExports
-from rmpa.bridge.service_rules import ServiceRules
-from rmpa.bridge.services import (
+from rmpa.bridge.services.aio.calls import Budgets, Caller, CallStats
+from rmpa.bridge.services.aio.serving import Serving
+from rmpa.bridge.services.exports import About, ExportAction, LocalService, ServiceExports
+from rmpa.bridge.services.imports import (
     EndedService,
     ForgetAbout,
     ImportAction,
@@ -43,6 +42,7 @@ from rmpa.bridge.services import (
     SessionState,
     Withdraw,
 )
+from rmpa.bridge.services.rules import ServiceRules
 from rmpa.core import limits
 from rmpa.core.aio.loop import breathe, breathing
 from rmpa.core.counters import RefusalLog

@@ -7,11 +7,11 @@ import contextlib
 import logging
 from typing import TYPE_CHECKING
 
-from rmpa.bridge.aio.param_core import ParamCore
-from rmpa.bridge.aio.param_desk import ParamDesk
-from rmpa.bridge.aio.param_follower import ParamFollower
 from rmpa.bridge.aio.part import Part
-from rmpa.bridge.params import ParamPolicy, follow_rules
+from rmpa.bridge.params.aio.core import ParamCore
+from rmpa.bridge.params.aio.desk import ParamDesk
+from rmpa.bridge.params.aio.follower import ParamFollower
+from rmpa.bridge.params.rules import ParamPolicy, follow_rules
 from rmpa.core import limits
 from rmpa.core.errors import RmpaError, UnreachableError
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from rmpa.bridge.aio.bridge import Attached, Bridge
-    from rmpa.bridge.params import Followed
+    from rmpa.bridge.params.rules import Followed
     from rmpa.core.config import ParamSettings, Settings, TimeSettings
     from rmpa.ros.aio.core_api import Core
     from rmpa.ros.xmlrpc import XmlRpcValue

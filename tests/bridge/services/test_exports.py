@@ -13,7 +13,7 @@ from rmpa.bridge.messages import (
     ServiceOffer,
     ServiceOpened,
 )
-from rmpa.bridge.service_exports import (
+from rmpa.bridge.services.exports import (
     About,
     EndRoute,
     LocalService,
@@ -25,7 +25,7 @@ from rmpa.bridge.service_exports import (
 from rmpa.core import limits
 from rmpa.core.config import PeerRule, PolicySettings, ServiceSettings
 from rmpa.core.errors import RemoteProtocolError
-from tests.bridge.test_service_rules import obey, rules
+from tests.bridge.services.test_rules import obey, rules
 
 ADD = LocalService("/adder", "rosrpc://127.0.0.1:5")
 ABOUT = About("a/Add", "6a2e34150c00229791cc89ff309fff21")

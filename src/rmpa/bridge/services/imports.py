@@ -31,7 +31,7 @@ from rmpa.bridge.messages import (
     is_crossing_name,
 )
 from rmpa.bridge.relay import Linked, Ways
-from rmpa.bridge.service_exports import About
+from rmpa.bridge.services.exports import About
 from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.core.guid import Guid
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
 
     from rmpa.bridge.messages import Origin
-    from rmpa.bridge.service_rules import ServiceRules
+    from rmpa.bridge.services.rules import ServiceRules
 
 
 class SessionState(Enum):

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.bridge.params import ParamPolicy, follow_rules, key_problem, leaves
+from rmpa.bridge.params.rules import ParamPolicy, follow_rules, key_problem, leaves
 from rmpa.core.config import FollowRule, ParamSettings, TimeSettings
 
 if TYPE_CHECKING:

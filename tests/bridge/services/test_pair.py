@@ -20,7 +20,7 @@ from rmpa.bridge.messages import (
     decode,
     encode,
 )
-from rmpa.bridge.service_exports import (
+from rmpa.bridge.services.exports import (
     About,
     EndRoute,
     ExportAction,
@@ -30,7 +30,7 @@ from rmpa.bridge.service_exports import (
     ServeRoute,
     ServiceExports,
 )
-from rmpa.bridge.services import (
+from rmpa.bridge.services.imports import (
     EndedService,
     ForgetAbout,
     ImportAction,
@@ -43,7 +43,7 @@ from rmpa.bridge.services import (
 from rmpa.core import limits
 from rmpa.core.config import ServiceSettings
 from rmpa.core.errors import RemoteProtocolError
-from tests.bridge.test_service_rules import obey, rules
+from tests.bridge.services.test_rules import obey, rules
 
 SERVICES = ["/a", "/b", "/c"]
 ABOUT = About("a/Add", "6a2e34150c00229791cc89ff309fff21")

@@ -1,0 +1,1 @@
+"""Questions answered, owners followed, the local core read and written."""

@@ -1,0 +1,1 @@
+"""Services across the mesh: which stand where, and the calls between them."""
