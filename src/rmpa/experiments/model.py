@@ -130,14 +130,15 @@ class Series:
         label: For the legend.
         x: In the panel's unit.
         y: As many.
-        style: ``points`` for samples, ``line``, ``steps`` for a distribution function, ``bars``.
+        style: ``points`` for samples, ``line``, ``steps`` for a distribution function, ``bars``; ``spans`` for thick
+            horizontal bars, one for each pair of points: ``x`` where it begins and ends, ``y`` its row, twice.
         system: Decides the colour, the same in all figures: ``classic``, ``rmpa`` or something else.
     """
 
     label: str
     x: Sequence[float]
     y: Sequence[float]
-    style: Literal["points", "line", "steps", "bars"] = "points"
+    style: Literal["points", "line", "steps", "bars", "spans"] = "points"
     system: str = ""
 
 
@@ -153,6 +154,8 @@ class Panel:
         logx: A logarithmic axis.
         logy: Likewise.
         marks: Horizontal lines by what they say: ``{"to reach": 1.0}``.
+        moments: Vertical lines likewise: ``{"pc killed": 0.0}``.
+        names: What ``y`` = 0, 1, 2 … are called, from the top down, in place of numbers.
     """
 
     title: str
@@ -162,6 +165,8 @@ class Panel:
     logx: bool = False
     logy: bool = False
     marks: Mapping[str, float] = field(default_factory=dict)
+    moments: Mapping[str, float] = field(default_factory=dict)
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

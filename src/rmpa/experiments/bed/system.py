@@ -38,13 +38,14 @@ class System(Protocol):
         """The host of the one master; empty where each has its own."""
         ...
 
-    def node(self, host: str, program: str, client: Client, **options: object) -> Process:
-        """Start one of our nodes on a host: ``source``, ``velocity`` or ``sink``; returns when it said ``up``.
+    def node(self, host: str, program: str, client: Client, *, wait: bool = True, **options: object) -> Process:
+        """Start one of our nodes on a host: ``source``, ``velocity`` or ``sink``.
 
         Args:
             host: Where.
             program: Which.
             client: With which library.
+            wait: Whether to return only when it said ``up``: one whose master is away never does.
             options: Its options: ``topic="/cmd"``, ``nodelay=True``.
         """
         ...
@@ -57,8 +58,19 @@ class System(Protocol):
         """End a host as a pulled plug does: every process there at once by SIGKILL, and its cable is out."""
         ...
 
-    def start(self, host: str) -> None:
-        """Switch a killed host on again: cable, then agent or master; its nodes are the caller's to start."""
+    def start(self, host: str) -> float:
+        """Switch a killed host on again: cable, then agent or master; its nodes are the caller's to start.
+
+        Returns when the agent is ready, or the master answers, and says when that was executed (``time.monotonic``);
+        at once where a host has neither.
+        """
+        ...
+
+    def linked(self) -> float:
+        """Wait until every agent is linked with every other; the time (``time.monotonic``) of the last link.
+
+        Classic: until the master answers, and when it was seen to.
+        """
         ...
 
     def cut(self, host: str) -> None:
