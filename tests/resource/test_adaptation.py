@@ -420,3 +420,57 @@ def test_what_the_profile_before_left_in_queues_is_not_held_against_the_next_one
     assert [one.window({"rate": 2.0}, 7.0), one.window({"rate": 2.0}, 8.0)] == [[], []]
     assert one.window({"rate": 2.0}, 9.0) == []
     assert [kind for kind, _, _ in alarms(one.window({"rate": 2.0}, 10.0))] == [AlarmKind.NON_ADAPTABLE]
+
+
+def hung(now: float) -> Adaptation:
+    """A loop whose ``fast`` hangs, and that applies ``middle`` instead."""
+    one = loop()
+    one.start(0.0)
+    finish(one, 0.0)
+    one.require(at_least(30), 0.0)
+    assert not one.overdue(now - 0.1)
+    assert one.overdue(now)
+    assert applies(one.handle_timer(now)) == ["middle"]
+    return one
+
+
+def test_a_profile_whose_function_still_hangs_is_not_taken_again() -> None:
+    one = hung(5.0)
+    finish(one, 5.1)
+    assert not applies(one.handle_timer(100.0))  # its cool-down is over
+    fast = next(score for score in one.explain(100.0) if score.profile == "fast")
+    assert fast.excluded == "not applied within 5 s, and its function still runs"
+    one.pin("fast", 100.0)
+    assert one.applying == ""
+    one.pin("", 100.0)
+    assert applies(one.ended_late("fast", 101.0, touched=False)) == ["fast"]
+
+
+def test_what_runs_is_applied_once_more_when_a_hung_function_has_ended() -> None:
+    one = hung(5.0)
+    finish(one, 5.1)
+    assert applies(one.ended_late("fast", 7.0, touched=True)) == ["middle"]
+    assert one.applied("middle", 7.5) == [Reacted("middle", 0.5)]
+    assert not one.applying
+
+
+def test_a_hung_function_that_ends_amid_the_next_one_has_that_applied_twice() -> None:
+    one = hung(5.0)
+    assert one.ended_late("fast", 5.5, touched=True) == []
+    assert applies(one.applied("middle", 6.0)) == ["middle"]
+    assert one.applied("middle", 6.5) == [Reacted("middle", 6.5)]
+    assert not one.applying
+
+
+def test_a_hung_function_that_ends_amid_another_question_has_nothing_applied_for_nothing() -> None:
+    one = hung(5.0)
+    one.ended_late("fast", 5.5, touched=True)
+    one.require(at_least(1), 5.6)
+    assert applies(one.applied("middle", 6.0)) == ["slow"]
+    assert not applies(one.applied("slow", 6.5))
+
+
+def test_a_hung_function_that_ended_before_the_next_one_began_changes_nothing() -> None:
+    one = hung(5.0)
+    assert one.ended_late("fast", 5.1, touched=False) == []
+    assert finish(one, 5.2) == [Reacted("middle", 5.2)]

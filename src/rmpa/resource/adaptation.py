@@ -177,6 +177,8 @@ class _Knowledge:
     barred: dict[str, str] = field(default_factory=dict)
     """Profiles whose preconditions do not hold, and why."""
     troubles: dict[str, _Trouble] = field(default_factory=dict)
+    hanging: set[str] = field(default_factory=set)
+    """Profiles that were given up while their functions ran, and still run."""
     windows: deque[tuple[float, tuple[Shortfall, ...]]] = field(default_factory=deque)
     """When each of the last windows began, and what fell short in it; since the profile became active."""
 
@@ -208,6 +210,7 @@ class Adaptation:
         self._caused = math.inf
         self._alarm: Alarm | None = None
         self._asked_meanwhile = False
+        self._spoilt = ""
 
     @property
     def state(self) -> ProfileState:
@@ -345,7 +348,7 @@ class Adaptation:
         if decision.feasible:
             self._disappoint(self._profile, f"{_named(short)} fell short", now)
             alarm = Alarm(AlarmKind.ADAPTATION, short, self._profile, decision.profile, now)
-            return [*self._raise(alarm), *self._apply(decision, f"{_named(short)} fell short", now, since)]
+            return [*self._raise(alarm), *self._apply(decision.profile, f"{_named(short)} fell short", now, since)]
         # Where nothing better can be had the profile stays, unless a best effort was declared for just this.
         best = self._decider.decide(self._knows.merged.bounds, self._left_out(now))
         after = decision if decision.best_effort else best
@@ -355,7 +358,7 @@ class Adaptation:
             actions += self._raise(Alarm(AlarmKind.NON_ADAPTABLE, short, self._profile, after.profile, now))
         if decision.best_effort and decision.profile != self._profile:
             self._disappoint(self._profile, f"{_named(short)} fell short", now)
-            actions += self._apply(decision, "none can serve: best effort", now, since)
+            actions += self._apply(decision.profile, "none can serve: best effort", now, since)
         return actions
 
     # --- what the driver reports --------------------------------------------------------------------------------
@@ -369,10 +372,14 @@ class Adaptation:
         self._since, self._deadline = now, math.inf
         self._knows.windows.clear()
         reaction = max(0.0, now - self._caused)
-        self._caused = math.inf
         # What was asked, or failed, meanwhile may want another one at once.
         at_once, self._asked_meanwhile = self._asked_meanwhile, False
-        return [Reacted(profile, reaction), *self._plan(now, "what is asked has changed meanwhile", at_once=at_once)]
+        why = "what is asked has changed meanwhile"
+        if spoilt := self._spoilt:
+            planned = self._plan(now, why, at_once=at_once)
+            return planned if self._target or not self._profile else [*planned, *self._again(spoilt, now)]
+        self._caused = math.inf
+        return [Reacted(profile, reaction), *self._plan(now, why, at_once=at_once)]
 
     def failed(self, profile: str, why: str, now: float) -> list[Action]:
         """The profile that was asked for could not be applied: the next best is."""
@@ -384,6 +391,27 @@ class Adaptation:
         # Half of the profile that failed may be in force: the one that ran before is to be applied again too.
         return self._plan(now, f"{profile} failed: {why}", again=True)
 
+    def overdue(self, now: float) -> bool:
+        """Whether the profile that is being applied hangs; ``handle_timer`` gives it up."""
+        return self._deadline <= now
+
+    def ended_late(self, profile: str, now: float, *, touched: bool) -> list[Action]:
+        """The function of a profile that was given up has ended after all; the profile may be taken again.
+
+        Args:
+            profile: Which one; until this is called it is left out, for two calls of one function would mix.
+            now: The time.
+            touched: Whether it may have touched the device since the function of the present profile began: that
+                one is applied once more then, behind what is being applied. Where none runs there is nothing to do.
+        """
+        self._knows.hanging.discard(profile)
+        why = f"the function of {profile} has ended late"
+        if touched and self._state is ProfileState.APPLYING:
+            self._spoilt = why
+        elif touched and self._state is ProfileState.ACTIVE:
+            return self._again(why, now)
+        return self._plan(now, why)
+
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due, monotonic seconds."""
         due = [self._deadline, *(trouble.until for trouble in self._knows.troubles.values())]
@@ -394,7 +422,8 @@ class Adaptation:
     def handle_timer(self, now: float) -> list[Action]:
         """A requirement expires, a cool-down is over, or a profile hangs."""
         if self._deadline <= now:
-            return self.failed(self._target, f"not applied within {self._settings.apply_timeout:g} s", now)
+            self._knows.hanging.add(self._target)
+            return self.failed(self._target, self._hangs, now)
         over = [c for c, r in self._knows.requirements.items() if r.expires is not None and r.expires <= now]
         for client in over:
             del self._knows.requirements[client]
@@ -438,7 +467,7 @@ class Adaptation:
             return actions
         if not again and not at_once and not self._worth_it(decision, now):
             return actions
-        return [*actions, *self._apply(decision, why, now, now)]
+        return [*actions, *self._apply(decision.profile, why, now, now)]
 
     def _pinned_or_best(self, now: float) -> Decision:
         bounds = self._knows.merged.bounds
@@ -486,12 +515,17 @@ class Adaptation:
         )
         return self._raise(Alarm(AlarmKind.NON_ADAPTABLE, short, self._profile, decision.profile, now))
 
-    def _apply(self, decision: Decision, why: str, now: float, since: float) -> list[Action]:
+    def _apply(self, profile: str, why: str, now: float, since: float) -> list[Action]:
         self._state = ProfileState.APPLYING
-        self._target = decision.profile
+        self._target = profile
         self._deadline = now + self._settings.apply_timeout
         self._caused = min(self._caused, since)
-        return [Apply(decision.profile, why)]
+        self._spoilt = ""
+        return [Apply(profile, why)]
+
+    def _again(self, why: str, now: float) -> list[Action]:
+        """Apply the profile that runs once more."""
+        return self._apply(self._profile, why, now, now)
 
     def _score(self, profile: str, now: float) -> Score:
         return next(score for score in self.explain(now) if score.profile == profile)
@@ -500,7 +534,12 @@ class Adaptation:
         return self._cooling(now) | self._knows.barred
 
     def _cooling(self, now: float) -> dict[str, str]:
-        return {name: t.why for name, t in self._knows.troubles.items() if now < t.until < math.inf}
+        cooling = {name: t.why for name, t in self._knows.troubles.items() if now < t.until < math.inf}
+        return cooling | dict.fromkeys(self._knows.hanging, f"{self._hangs}, and its function still runs")
+
+    @property
+    def _hangs(self) -> str:
+        return f"not applied within {self._settings.apply_timeout:g} s"
 
     def _disappoint(self, profile: str, why: str, now: float) -> None:
         before = self._knows.troubles.get(profile)

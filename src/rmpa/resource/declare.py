@@ -34,6 +34,7 @@ from rmpa.core.names import is_legal_name
 from rmpa.resource.adaptation import AdaptationSettings
 from rmpa.resource.attributes import MEASURED, Attribute, Category, Direction, Scale
 from rmpa.resource.contexts import parse_rule
+from rmpa.resource.fence import passage
 from rmpa.resource.profiles import Profile, check_profiles
 from rmpa.resource.requirements import Bound, bound, find_attribute
 from rmpa.resource.units import quantity
@@ -187,7 +188,7 @@ class Output:
 
         Raises:
             MessageError: It does not fit the output's type.
-            LocalProtocolError: The resource does not run.
+            LocalProtocolError: The resource does not run, or the profile whose function calls was given up.
         """
         if self.outlet is None:
             raise LocalProtocolError(f"{self.name} has nowhere to go: its resource does not run (rmpa run)")
@@ -241,14 +242,18 @@ class Parameter:
 
     @property
     def value(self) -> Any:
-        """What it is now; whoever sets it, in any thread, is told by a ``ConfigError`` if it cannot be that."""
+        """What it is now; whoever sets it, in any thread, is told by a ``ConfigError`` if it cannot be that.
+
+        From the function of a profile that was given up it cannot be set any more (``LocalProtocolError``).
+        """
         return self._value
 
     @value.setter
     def value(self, value: ParameterValue) -> None:
-        before, self._value = self._value, self.check(value)
-        if self.watch is not None and self._value != before:
-            self.watch.changed(self)
+        with passage(f"set parameter {self.name}"):
+            before, self._value = self._value, self.check(value)
+            if self.watch is not None and self._value != before:
+                self.watch.changed(self)
 
     @property
     def type(self) -> str:
@@ -303,10 +308,12 @@ class DeclaredAttribute:
 
         Raises:
             ConfigError: It is no value of this attribute.
+            LocalProtocolError: The profile whose function calls was given up.
         """
         checked = self.attribute.check(value, f"observation of {self.attribute.name}")
         if self.observer is not None:
-            self.observer.observe(self.attribute.name, checked)
+            with passage(f"observe {self.attribute.name}"):
+                self.observer.observe(self.attribute.name, checked)
 
 
 class Asker(Protocol):
@@ -335,10 +342,15 @@ class Demand:
     asker: Asker | None = field(default=None, repr=False)
 
     def ask(self, **wishes: Wish) -> None:
-        """Ask for this instead, from now on; from a profile or a task, in any thread. Nothing: ask for nothing."""
-        self.wishes = wishes
-        if self.asker is not None:
-            self.asker.asked(self)
+        """Ask for this instead, from now on; from a profile or a task, in any thread. Nothing: ask for nothing.
+
+        Raises:
+            LocalProtocolError: The profile whose function calls was given up.
+        """
+        with passage(f"ask {self.resource}"):
+            self.wishes = wishes
+            if self.asker is not None:
+                self.asker.asked(self)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,6 @@ from any node in any module. ``resource.adaptation`` decides; this drives it.
 from __future__ import annotations
 
 import asyncio
-import inspect
 import logging
 import time
 from dataclasses import replace
@@ -16,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from rmpa.core import limits
-from rmpa.core.aio.threads import in_thread
 from rmpa.core.errors import ConfigError
 from rmpa.resource.adaptation import (
     Action,
@@ -29,6 +27,7 @@ from rmpa.resource.adaptation import (
     Raise,
     Reacted,
 )
+from rmpa.resource.aio.applying import Applier
 from rmpa.resource.aio.runtime import RuntimePart
 from rmpa.resource.decision import Decider, wanted
 from rmpa.resource.observed import Missing, Observed
@@ -53,7 +52,6 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 _LOOK: Final = 0.25
 """Seconds between looks whether clients are still connected."""
-_SOON: Final = 0.02
 
 
 class Adapter(RuntimePart):
@@ -76,7 +74,6 @@ class Adapter(RuntimePart):
     ) -> None:
         resource = runtime.resource
         self._runtime = runtime
-        self._tasks = tasks
         self._window = window
         self._attributes = resource.attributes
         profiles = [declared.profile for declared in resource.profiles.values()]
@@ -93,8 +90,9 @@ class Adapter(RuntimePart):
         self._publishers: dict[str, Publisher] = {}
         self._sequence = 0
         self._asking: Subscriber | None = None
-        self._applying: asyncio.Task[None] | None = None
-        self._reports: set[asyncio.Task[None]] = set()
+        self._applier = Applier(
+            runtime, tasks, on_applied=self._applied, on_ended_late=self._ended_late, on_late=self.late
+        )
         self._timers: dict[str, asyncio.TimerHandle] = {}
         self._context_bars: dict[str, str] = {}
         self._closed = False
@@ -118,6 +116,8 @@ class Adapter(RuntimePart):
         """By client and stamp: when a request expires, so that the same message, latched, does not begin anew."""
         self.on_missing: list[Callable[[str, bool], None]] = []
         """Called when something that is needed is missing (true), and when it is back."""
+        self.on_late: list[Callable[[str], None]] = []
+        """Called when a function that was given up does something, or ends; with the text."""
         self._observed_by = Observed(self._attributes, resource.name, limits.RESOURCE_REPORT_WINDOWS * window)
         self._missing = Missing()
         self._grace: dict[str, float] = {}
@@ -160,12 +160,7 @@ class Adapter(RuntimePart):
         self._closed = True
         for timer in self._timers.values():
             timer.cancel()
-        tasks = [*self._reports]
-        if self._applying is not None:
-            tasks.append(self._applying)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await self._applier.close()
 
     # --- measuring ----------------------------------------------------------------------------------------------
 
@@ -355,10 +350,8 @@ class Adapter(RuntimePart):
 
     async def settled(self) -> None:
         """Wait until no profile is being applied; a hanging one is given up in a while."""
-        while self.loop.applying and self._applying is not None and not self._closed:
-            if self._applying.done():
-                await asyncio.sleep(_SOON)  # it died; the loop gives it up at its time-out
-            await asyncio.wait([self._applying], timeout=_LOOK)
+        while self.loop.applying and not self._closed:
+            await self._applier.wait()
 
     def _look_at_clients(self) -> None:
         """Forget those that are gone: killed, unplugged, or simply over."""
@@ -409,7 +402,7 @@ class Adapter(RuntimePart):
             match action:
                 case Apply():
                     _log.info("= %s: profile %s: %s", self._runtime.node.name, action.profile, action.why)
-                    self._begin(action.profile)
+                    self._applier.begin(action.profile)
                 case Raise():
                     _log.warning("! %s: %s", self._runtime.node.name, self.told(action.alarm))
                     self._publish_alarm(action.alarm, cleared=False)
@@ -426,37 +419,29 @@ class Adapter(RuntimePart):
             self._say()
         self._arm()
 
-    def _begin(self, profile: str) -> None:
-        if self._applying is not None and not self._applying.done():
-            self._applying.cancel()  # it hangs
-            self._reports.add(self._applying)
-            self._applying.add_done_callback(self._reports.discard)
-        self._applying = self._loop.create_task(self._apply(profile), name=f"apply {profile}")
-
-    async def _apply(self, profile: str) -> None:
-        """Apply a profile between two runs of the tasks, so that no message mixes two of them."""
-        why = ""
-        try:
-            await self._tasks.pause()
-            self._runtime.hold()
-            function = self._runtime.resource.profiles[profile].apply
-            if inspect.iscoroutinefunction(function):
-                await function()
-            else:
-                outcome = await in_thread(function, f"profile {profile}")
-                if outcome is not None:
-                    await outcome
-        except Exception as error:  # noqa: BLE001 - the top of the user's code
-            why = f"{type(error).__name__}: {error}"
-            _log.warning("! %s: profile %s: %s", self._runtime.node.name, profile, why)
-        if self.loop.applying != profile:
-            return  # it took so long that another one is applied; that one opens what is closed
-        self._runtime.release(drop=bool(why))
-        self._tasks.resume()
+    def _applied(self, profile: str, why: str) -> None:
         self._observed_by.clear()
         now = self._loop.time()
         self._act(self.loop.failed(profile, why, now) if why else self.loop.applied(profile, now))
         self._respond()
+
+    def _ended_late(self, profile: str, touched: bool, text: str) -> None:
+        """A function that was given up has ended."""
+        again = (self.loop.applying or self.loop.profile) if touched else ""
+        if again:
+            self.late(profile, f"{text}; {again} is applied once more")
+        else:
+            _log.info("= %s: %s", self._runtime.node.name, text)
+        self._act(self.loop.ended_late(profile, self._loop.time(), touched=touched))
+        self._respond()
+
+    def late(self, before: str, text: str) -> None:
+        """Tell what the function of a profile or a context that was given up did."""
+        _log.warning("! %s: %s", self._runtime.node.name, text)
+        values = {"before": before, "after": self.loop.applying or self.loop.profile}
+        self._publish("alarms", [self._status(Level.WARN, self._runtime.resource.name, text, values)])
+        for hear in self.on_late:
+            hear(text)
 
     def _arm(self) -> None:
         due = self.loop.next_timer()
@@ -466,13 +451,14 @@ class Adapter(RuntimePart):
             self._timers["loop"] = self._loop.call_at(due, self._due)
 
     def _due(self) -> None:
-        hung = self.loop.applying
-        self._act(self.loop.handle_timer(self._loop.time() + 0.001))
-        if hung and self.loop.applying != hung:
-            if not self.loop.applying:
-                self._runtime.release(drop=True)
-                self._tasks.resume()
-            _log.warning("! %s: profile %s hangs; it is given up", self._runtime.node.name, hung)
+        now = self._loop.time() + 0.001
+        hung = self.loop.applying if self.loop.overdue(now) else ""
+        goes_on = self._applier.give_up() if hung else False
+        self._act(self.loop.handle_timer(now))
+        if hung and not self.loop.applying:
+            self._applier.let_go()
+        if hung and not goes_on:
+            self._act(self.loop.ended_late(hung, now, touched=False))
         self._respond()
 
     def _later(self, name: str, delay: float, function: Callable[[], None]) -> None:
@@ -536,6 +522,7 @@ class Adapter(RuntimePart):
 
     def _health(self) -> tuple[Level, str]:
         missing, broken = self.troubles()
+        broken += [f"the function of profile {name} hangs; it was given up" for name in self._applier.hanging]
         alarm = self.loop.alarm
         if alarm is not None and alarm.kind is AlarmKind.NON_ADAPTABLE:
             return Level.ERROR, self.told(alarm)

@@ -7,14 +7,13 @@ has ended, its outputs flow, its requirements count, and the profile that follow
 from __future__ import annotations
 
 import asyncio
-import inspect
 import logging
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core import limits
-from rmpa.core.aio.threads import in_thread
 from rmpa.core.config_values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
+from rmpa.resource.aio.fence import Call
 from rmpa.resource.aio.runtime import RuntimePart
 from rmpa.resource.contexts import Chooser, parse_rule
 from rmpa.resource.descriptor import topic_of
@@ -276,7 +275,7 @@ class Contexts(RuntimePart):
             runtime.hold(_WHO)
             try:
                 if context is not None:
-                    await _enter(context)
+                    await self._enter(context)
                 outputs = context.outputs if context is not None else None
                 runtime.flowing = frozenset(outputs) if outputs is not None else None
                 self._shift(name, context)
@@ -288,6 +287,29 @@ class Contexts(RuntimePart):
                 self._tasks.resume(_WHO)
             _log.info("= %s: %s", runtime.node.name, f"context {name}" if name else "no context any more")
         self._told()
+
+    async def _enter(self, context: Context) -> None:
+        """Call a context's function."""
+        if context.enter is None:
+            return
+        timeout, call = limits.CONTEXT_ENTER_TIMEOUT, Call("context", context.name, self._stopped)
+        limit = asyncio.timeout(timeout)
+        try:
+            async with limit:
+                await call.run(context.enter)
+        except Exception as error:
+            call.give_up()  # also where it has raised: a coroutine that it began may go on
+            why = f"{type(error).__name__}: {error}"
+            if isinstance(error, TimeoutError) and limit.expired():
+                why = f"its function has not ended after {timeout:g} s"
+            raise PeerRefused(f"context {context.name}", why) from error
+
+    def _stopped(self, call: Call, what: str) -> None:
+        """A function that was given up wanted to do something; called in any thread."""
+        if what not in call.said:
+            call.said.add(what)
+            text = f"the function of context {call.name} was given up; it has no effect: {what}"
+            self._runtime.call_in_loop(self._adapter.late, call.name, text)
 
     def _shift(self, name: str, context: Context | None) -> None:
         resource = self._runtime.resource
@@ -312,23 +334,6 @@ class Contexts(RuntimePart):
         self._work.add(task)
         task.add_done_callback(self._work.discard)
         return task
-
-
-async def _enter(context: Context) -> None:
-    """Call a context's function."""
-    if context.enter is None:
-        return
-    timeout = limits.CONTEXT_ENTER_TIMEOUT
-    try:
-        async with asyncio.timeout(timeout):
-            if inspect.iscoroutinefunction(context.enter):
-                await context.enter()
-            elif (outcome := await in_thread(context.enter, f"context {context.name}")) is not None:
-                await outcome
-    except TimeoutError:
-        raise PeerRefused(f"context {context.name}", f"its function has not ended after {timeout:g} s") from None
-    except Exception as error:
-        raise PeerRefused(f"context {context.name}", f"{type(error).__name__}: {error}") from error
 
 
 class _Source:

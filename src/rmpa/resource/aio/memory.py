@@ -80,6 +80,7 @@ class Memory(RuntimePart):
         self._adapter.on_window.append(self._window)
         self._adapter.on_asked.append(self._asked)
         self._adapter.on_missing.append(self._missing)
+        self._adapter.on_late.append(lambda text: self._event("late", Level.WARN, text, {}))
         self._contexts.listeners.append(self._asked)
 
     async def start(self) -> None:

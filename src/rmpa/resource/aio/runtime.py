@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError
 from rmpa.resource.descriptor import TOPIC, describe, topic_of
+from rmpa.resource.fence import around
 from rmpa.ros.messages import MessageError
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
     from rmpa.resource.attributes import Value
     from rmpa.resource.declare import Input, Output, Parameter, ParameterValue, Resource
+    from rmpa.resource.fence import Fence
     from rmpa.ros.aio.node import Node
     from rmpa.ros.aio.topics import Publisher, Received, Subscriber
 
@@ -68,7 +70,7 @@ class Runtime:
         self._publishers: dict[str, Publisher] = {}
         self._subscribers: dict[str, Subscriber] = {}
         self._texts: dict[str, tuple[Publisher, str | None]] = {}
-        self._held: deque[tuple[Output, bytes]] = deque()
+        self._held: deque[tuple[Output, bytes, Fence | None]] = deque()
         self._held_bytes = 0
         self._holders: set[str] = set()
         self.flowing: frozenset[str] | None = None
@@ -157,8 +159,13 @@ class Runtime:
         self._holders.discard(who)
         if drop or not self._holders:
             held, self._held, self._held_bytes = self._held, deque(), 0
-            for output, raw in held if not drop else ():
+            for output, raw, _ in held if not drop else ():
                 self._send(output, raw)
+
+    def drop(self) -> None:
+        """Drop what was kept: it belongs to a profile that was given up. What comes is kept as before."""
+        self._held.clear()
+        self._held_bytes = 0
 
     def call_in_loop(self, function: Any, *args: Any) -> None:
         """Call a function in the loop: now if this is its thread, else soon."""
@@ -178,10 +185,19 @@ class Runtime:
         topic = topic_of(item.name, self.node.name)
         self._subscribers[item.name] = await self.node.subscribe(topic, item.type, received)
 
-    def send(self, output: Output, raw: bytes) -> None:
-        """Send one message of an output, or keep it while a profile is being applied."""
+    def send(self, output: Output, raw: bytes, fence: Fence | None = None) -> None:
+        """Send one message of an output, or keep it while a profile is being applied.
+
+        Args:
+            output: Which one.
+            raw: The message.
+            fence: Around the function that published it, if that may be given up.
+        """
+        if fence is not None and fence.closed:
+            fence.stopped(f"publish on {output.name}")  # it was on its way from another thread
+            return
         if self._holders:
-            self._held.append((output, raw))
+            self._held.append((output, raw, fence))
             self._held_bytes += len(raw)
             while self._held_bytes > limits.RESOURCE_HELD_MAX and len(self._held) > 1:
                 self._held_bytes -= len(self._held.popleft()[1])  # the oldest gives way
@@ -228,7 +244,12 @@ class _Outlet:
         header: Any = getattr(message, "header", None)
         if self._numbered and hasattr(header, "seq"):
             header.seq = next(self._number) & 0xFFFF_FFFF  # as rospy does: whoever receives it sees what was lost
-        self._runtime.call_in_loop(self._runtime.send, self._output, kind.serialize(message))
+        raw, fence = kind.serialize(message), around()
+        if fence is None:
+            self._runtime.call_in_loop(self._runtime.send, self._output, raw)
+            return
+        with fence.passage(f"publish on {self._output.name}"):
+            self._runtime.call_in_loop(self._runtime.send, self._output, raw, fence)
 
 
 class _Observer:

@@ -6,7 +6,7 @@ everything that is known at that moment. Tables, for ``sqlite3 FILE``::
 
     state(kind, name, value, at_ns)                      value: JSON; see resource.remembered
     windows(at_ns, profile, level, message, quality)     quality: JSON, attribute -> value in the attribute's unit
-    events(at_ns, event, level, message, details)        event: apply, alarm, over, reacted; details: JSON
+    events(at_ns, event, level, message, details)        event: apply, alarm, over, reacted, late; details: JSON
     descriptors(node, text, first_ns, last_ns)
 """
 
