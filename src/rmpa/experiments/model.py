@@ -131,14 +131,15 @@ class Series:
         x: In the panel's unit.
         y: As many.
         style: ``points`` for samples, ``line``, ``steps`` for a distribution function, ``bars``; ``spans`` for thick
-            horizontal bars, one for each pair of points: ``x`` where it begins and ends, ``y`` its row, twice.
+            horizontal bars, one for each pair of points: ``x`` where it begins and ends, ``y`` its row, twice;
+            ``box`` for samples ``y`` grouped by their ``x`` (quartiles, p5 to p95, p99), the groups equally far apart.
         system: Decides the colour, the same in all figures: ``classic``, ``rmpa`` or something else.
     """
 
     label: str
     x: Sequence[float]
     y: Sequence[float]
-    style: Literal["points", "line", "steps", "bars", "spans"] = "points"
+    style: Literal["points", "line", "steps", "bars", "spans", "box"] = "points"
     system: str = ""
 
 
@@ -156,6 +157,8 @@ class Panel:
         marks: Horizontal lines by what they say: ``{"to reach": 1.0}``.
         moments: Vertical lines likewise: ``{"pc killed": 0.0}``.
         names: What ``y`` = 0, 1, 2 … are called, from the top down, in place of numbers.
+        ticks: What stands below the horizontal axis in place of numbers: ``{"1 KB": 1024.0}``.
+        distribution: Draw beside it how often its points have which ``y``, on the same axis.
     """
 
     title: str
@@ -167,6 +170,8 @@ class Panel:
     marks: Mapping[str, float] = field(default_factory=dict)
     moments: Mapping[str, float] = field(default_factory=dict)
     names: tuple[str, ...] = ()
+    ticks: Mapping[str, float] = field(default_factory=dict)
+    distribution: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,12 +183,15 @@ class Figure:
         title: Above it, with the paper's number.
         caption: What is to be seen.
         panels: From left to right.
+        columns: How many stand side by side, the next ones below them; 0: as it fits. Those below each other share
+            their horizontal axis if they have the same label there.
     """
 
     name: str
     title: str
     caption: str
     panels: tuple[Panel, ...]
+    columns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
