@@ -89,11 +89,3 @@ async def test_a_longer_one_ends_the_link_before_it_is_read(bridge: Bridge) -> N
     assert payload.startswith(b'{"op":"advertise"')
     with pytest.raises(LimitExceeded):
         bridge.control(link, payload)
-
-
-async def test_mismatches_of_a_peer_that_is_gone_are_forgotten(bridge: Bridge) -> None:
-    source = Source("/cmd", "/joy")
-    for who in ("base", "base/viewer", "base2/viewer", "/viewer"):
-        bridge._remember(source, who, f"of {who}")
-    bridge._forget_mismatches("base")
-    assert bridge.mismatches(source) == ("of base2/viewer", "of /viewer")

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge import actions as act
 from rmpa.bridge.aio.asks import Asks
 from rmpa.bridge.aio.inbound import Inbound
+from rmpa.bridge.aio.local_sources import LocalSources
 from rmpa.bridge.aio.outbound import Outbound
 from rmpa.bridge.aio.presence import Presence
-from rmpa.bridge.exports import Exports, LocalSource
+from rmpa.bridge.exports import Exports
 from rmpa.bridge.imports import Imports
 from rmpa.bridge.messages import (
     Advertise,
@@ -31,8 +32,9 @@ from rmpa.bridge.messages import (
     decode,
     encode,
 )
+from rmpa.bridge.mismatches import Mismatches
 from rmpa.bridge.naming import Names
-from rmpa.bridge.policy import OWN_NODE, Policy, is_own
+from rmpa.bridge.policy import OWN_NODE, Policy
 from rmpa.bridge.proxy_names import proxy_name, proxy_prefix
 from rmpa.bridge.relay import Linked, Relay
 from rmpa.core import limits
@@ -42,13 +44,12 @@ from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
-from rmpa.core.names import is_type_name
 from rmpa.mesh.frames import Kind as FrameKind
 from rmpa.ros.aio.slave_server import SlaveNode
 from rmpa.ros.master.effects import GraphChange, Kind
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator
 
     from rmpa.bridge.aio.part import DataTaker, Part
     from rmpa.bridge.relay import Place
@@ -127,7 +128,6 @@ class Bridge:
         self._reconciler: asyncio.TimerHandle | None = None
         self._rescan: asyncio.Handle | None = None
         self._closed = False
-        self._types: dict[Source, str] = {}
         # Topics of the local graph to look at, advertisements to learn, and what is to be done: each is worked off a
         # little at a time, so that a graph of thousands delays no message.
         self._changed: dict[str, None] = {}
@@ -137,12 +137,13 @@ class Bridge:
         self._rejudging: Iterator[list[act.Action]] = iter(())
         self._actions: deque[act.Action] = deque()
         self._acting = False
-        self._mismatches: dict[Source, dict[str, str]] = {}
+        self._mismatches = Mismatches()
         self._refusals = RefusalLog(_log, self.counters)
         self.asks = Asks(self.counters)
         self._presence = Presence(self._exports, self._imports, self._by_number.get, self._refusals)
         self.relay = Relay(enabled=relay)
         """What is passed on between peers."""
+        self._local = LocalSources(core, self.relay)
         self._relayed: dict[str, str] = {}
         self._parts: list[Part] = [self.asks, self._presence]
 
@@ -189,7 +190,7 @@ class Bridge:
 
     def mismatches(self, source: Source) -> tuple[str, ...]:
         """What did not fit a source, here or over there, ready to read; forgotten with the source."""
-        return tuple(self._mismatches.get(source, {}).values())
+        return self._mismatches.texts(source)
 
     def attached(self) -> Iterator[Attached]:
         """Every peer whose link is up, for the monitor."""
@@ -424,11 +425,12 @@ class Bridge:
         source = self._exports.local(attached.peer, message.source)
         if source is None:
             return  # it went meanwhile
-        who = f"{attached.link.name}: {source}"
+        subscriber = f"{attached.link.name}{message.subscriber}"
         if not message.text:
-            self._mismatches.get(source, {}).pop(f"{attached.link.name}{message.subscriber}", None)
+            self._mismatches.mended(source, subscriber)
             return
-        self._remember(source, f"{attached.link.name}{message.subscriber}", message.text)
+        self._mismatches.add(source, subscriber, message.text)
+        who = f"{attached.link.name}: {source}"
         self._warn("mismatch.remote", who, f"{who}: {message.text}")
 
     def _claim(self, link: MeshLink) -> Attached | None:
@@ -450,7 +452,7 @@ class Bridge:
             if timer is not None:
                 timer.cancel()
         self._by_number.pop(attached.peer, None)
-        self._forget_mismatches(attached.link.name)
+        self._mismatches.peer_gone(attached.link.name)
         if self._by_link.pop(attached.link, None) is not None:
             for part in self._parts:
                 part.link_down(attached)
@@ -481,14 +483,8 @@ class Bridge:
     # --- the local graph's side --------------------------------------------------------------------------------
 
     def _graph_changed(self, change: GraphChange) -> None:
-        if change.kind is Kind.PUBLISHER:
-            # The master keeps one type a topic, the last that anybody said; we need each publisher's own.
-            source = Source(change.name, change.node)
-            if not change.added:
-                self._types.pop(source, None)
-            elif is_type_name(change.type):
-                self._types[source] = change.type
-        elif change.kind is Kind.SUBSCRIBER and self._mismatches:
+        self._local.changed(change)
+        if change.kind is Kind.SUBSCRIBER and self._mismatches:
             self._comes_anew(change.name, change.node)
         if change.kind is not Kind.SERVICE:
             self._changed[change.name] = None
@@ -526,9 +522,7 @@ class Bridge:
         if self._changed or self._learning or self._forgetting or rejudged or self._exports.untold:
             self._schedule()
         elif self._mismatches:
-            for source in [s for s in self._mismatches if s not in self._exports.offered]:
-                if not self._imports.knows(source):
-                    del self._mismatches[source]
+            self._mismatches.keep(lambda source: source in self._exports.offered or self._imports.knows(source))
 
     def _learn(self, attached: Attached, lesson: bytes | Iterator[Advertise]) -> None:
         """Read an advertisement, or take in the next portion of one that was read."""
@@ -561,23 +555,9 @@ class Bridge:
         return self._imports.portions(attached.peer, message)
 
     def _look_at(self, topic: str) -> None:
-        publishers = self._core.publishers(topic)
-        nodes = {node: uri for node, uri in publishers.items() if not is_own(node)}
-        said = self._core.type_of(topic) if nodes else ""
-        local = {node: LocalSource(self._types.get(Source(topic, node)) or said, uri) for node, uri in nodes.items()}
-        self._act(self._exports.graph(topic, local | self._to_relay(topic, publishers)))
+        local = self._local.of(topic)
+        self._act(self._exports.graph(topic, local | self._local.relayed(topic)))
         self._act(self._imports.local_type(topic, next((one.type for one in reversed(local.values())), None)))
-
-    def _to_relay(self, topic: str, publishers: Mapping[str, str]) -> dict[str, LocalSource]:
-        """What of a topic is passed on for other modules."""
-        if not self.relay.enabled:
-            return {}
-        said = self._core.type_of(topic)
-        return {
-            node: LocalSource(self._types.get(Source(topic, node)) or said, uri, origin)
-            for node, uri in publishers.items()
-            if (origin := self.relay.origin((topic, node))) is not None
-        }
 
     def _reconcile(self) -> None:
         self._reconciler = self._loop.call_later(limits.RECONCILE_INTERVAL, self._reconcile)
@@ -607,25 +587,14 @@ class Bridge:
             self._ticker = self._loop.call_later(limits.STALE_TICK, self._tick)
 
     def _mismatched(self, peer: int, source: Source, subscriber: str, text: str) -> None:
-        self._remember(source, subscriber, text)
+        self._mismatches.add(source, subscriber, text)
         self._act(self._imports.mismatched(peer, source, subscriber, text))
-
-    def _remember(self, source: Source, who: str, text: str) -> None:
-        known = self._mismatches.setdefault(source, {})
-        if who in known or len(known) < limits.MISMATCHES_MAX:
-            known[who] = text
 
     def _comes_anew(self, topic: str, subscriber: str) -> None:
         """A local subscriber has gone, or begins again: that it did not fit before is over, here and over there."""
         for peer, source in list(self._imports.at(topic)):
-            if self._mismatches.get(source, {}).pop(subscriber, None) is not None:
+            if self._mismatches.mended(source, subscriber):
                 self._act([act.Send(peer, Mismatch(source.topic, source.node, subscriber, ""))])
-
-    def _forget_mismatches(self, name: str) -> None:
-        """A peer is gone, with all its nodes that were refused."""
-        for known in self._mismatches.values():
-            for who in [who for who in known if who == name or who.startswith(name + "/")]:
-                del known[who]
 
     def _described(self, source: Source, description: Description) -> None:
         self._act(self._exports.described(source, description))
