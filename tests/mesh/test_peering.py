@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from ipaddress import IPv4Address
 
@@ -312,3 +313,137 @@ def test_in_every_order_of_two_calls_the_lower_ones_link_stays() -> None:
             ends += 1
             assert world.used == {"low": 1, "high": 1}, path
     assert ends >= 6
+
+
+# --- peers that nobody has linked yet, of which many may be invented ---------------------------------------------
+
+
+def stranger(number: int) -> Identity:
+    return Identity(Guid.of(f"10.1.{number // 250}.{1 + number % 250}", 40000), number.to_bytes(16, "big"), "forged")
+
+
+class Network:
+    """Answers the dials of one peering at once: who is there is linked, nobody else answers."""
+
+    def __init__(self, *there: Identity) -> None:
+        self.peering = of(LOW)
+        self.there = {identity.guid: identity for identity in there}
+        self.now = 0.0
+        self.dialled: list[tuple[float, Guid]] = []
+        self.links = 0
+
+    def find(self, *identities: Identity) -> None:
+        for identity in identities:
+            self.peering.peer_found(identity, self.now)
+            self.answer()
+
+    def answer(self) -> None:
+        while outputs := self.peering.take():
+            for output in outputs:
+                if not isinstance(output, Dial):
+                    continue
+                self.dialled.append((self.now, output.guid))
+                identity = self.there.get(output.guid)
+                if identity is None:
+                    self.peering.dial_failed(output.guid, "nobody there", self.now)
+                else:
+                    self.links += 1
+                    self.peering.link_up(
+                        self.links, identity, self.now, dialled=True, endpoint=identity.guid.endpoint
+                    )
+
+    def run(self, seconds: float) -> int:
+        """Let time pass; return how many dials that were."""
+        before, end = len(self.dialled), self.now + seconds
+        while (due := self.peering.next_timer()) is not None and due <= end:
+            self.now = max(self.now, due)
+            self.peering.handle_timer(self.now)
+            self.answer()
+        self.now = end
+        return len(self.dialled) - before
+
+    def first(self, identity: Identity) -> float:
+        return next(at for at, guid in self.dialled if guid == identity.guid)
+
+    def linked(self) -> list[str]:
+        return [status.identity.name for status in self.peering.peers() if status.state == "linked"]
+
+
+@pytest.mark.parametrize("count", [100, 512])
+def test_peers_that_never_answer_share_what_all_of_them_may_be_dialled(count: int) -> None:
+    network = Network()
+    network.find(*map(stranger, range(count)))
+    first = network.run(60.0) + limits.DIAL_STRANGERS_BURST
+    assert first <= limits.DIAL_STRANGERS_BURST + 60 * limits.DIAL_STRANGERS_RATE + 1
+    assert {guid for _, guid in network.dialled} == {stranger(n).guid for n in range(count)}, "each had its turn"
+    # And they are dialled for ever, as seldom as there are many of them.
+    assert 30 * limits.DIAL_STRANGERS_RATE <= network.run(60.0) <= 60 * limits.DIAL_STRANGERS_RATE + 1
+
+
+def test_a_few_peers_that_do_not_answer_are_dialled_as_if_there_were_no_bound() -> None:
+    network = Network()
+    network.find(*map(stranger, range(10)))
+    network.run(10.0)
+    for number in range(10):
+        at = [when for when, guid in network.dialled if guid == stranger(number).guid]
+        assert at[0] == 0.0
+        assert max(b - a for a, b in itertools.pairwise(at)) <= limits.BACKOFF_MAX
+
+
+def test_a_newcomer_among_many_that_do_not_answer_is_dialled_at_once() -> None:
+    network = Network(HIGH)
+    network.find(*map(stranger, range(512)))
+    network.run(0.5)
+    network.find(HIGH)
+    network.run(2.0)
+    assert network.linked() == ["high"]
+    assert network.first(HIGH) - 0.5 <= 2 / limits.DIAL_STRANGERS_RATE + 1e-6
+
+
+def test_one_that_was_linked_before_is_dialled_as_often_as_ever() -> None:
+    network = Network(HIGH)
+    network.find(HIGH)
+    network.find(*map(stranger, range(512)))
+    network.run(30.0)
+    here = network.there.pop(HIGH.guid)
+    network.peering.link_down(network.links, "its power failed", network.now)
+    network.run(60.0)
+    assert network.linked() == []
+    network.there[HIGH.guid] = here
+    network.run(limits.BACKOFF_MAX)
+    assert network.linked() == ["high"]
+
+
+def test_invented_peers_that_come_and_go_do_not_keep_one_waiting_for_ever() -> None:
+    """Each second a hundred new ones, of which none was dialled; a real one that was not there at first comes up."""
+    network = Network()
+    network.find(HIGH)
+    network.now = 1.0
+    network.there[HIGH.guid] = HIGH
+    for second in range(60):
+        for number in range(100):
+            network.find(stranger(second % 5 * 100 + number))
+            network.run(0.01)
+        for number in range(100):
+            network.peering.peer_gone(stranger(second % 5 * 100 + number).guid, network.now)
+    assert network.linked() == ["high"]
+
+
+def test_many_real_peers_at_once_are_not_held_up() -> None:
+    crowd = [stranger(number) for number in range(300)]
+    network = Network(*crowd)
+    network.find(*crowd)
+    assert (len(network.linked()), network.now) == (300, 0.0)
+
+
+def test_a_stranger_that_leaves_the_line_is_not_dialled() -> None:
+    peering = of(LOW)
+    crowd = [stranger(number) for number in range(limits.DIAL_STRANGERS_BURST + 2)]
+    for identity in crowd:
+        peering.peer_found(identity, 0.0)
+    *_, gone, kept = crowd
+    assert len(dials(peering.take())) == limits.DIAL_STRANGERS_BURST
+    peering.peer_gone(gone.guid, 0.0)
+    peering.handle_timer(1.0)
+    assert dials(peering.take()) == [kept.guid.endpoint]
+    assert peering.next_timer() is None

@@ -19,14 +19,15 @@ class Backoff:
 
     def __init__(self, first: float, cap: float, rng: Callable[[], float]) -> None:
         self._first = first
-        self._cap = cap
+        self.cap = cap
+        """The longest delay, from the next one on."""
         self._rng = rng
         self._next = first
 
     def delay(self) -> float:
         """The next delay in seconds."""
-        base = self._next
-        self._next = min(self._cap, base * 2)
+        base = min(self._next, self.cap)
+        self._next = min(self.cap, base * 2)
         return base * (0.5 + 0.5 * self._rng())
 
     def reset(self) -> None:

@@ -162,6 +162,11 @@ BACKOFF_FIRST: Final = 0.1
 """Before the second attempt to dial."""
 BACKOFF_MAX: Final = 2.0
 """Between attempts at the most: a peer that comes back is linked within this time."""
+DIAL_STRANGERS_RATE: Final = 20.0
+"""Dials a second to peers that were never linked, over all of them: beacons can be forged, and a dial that fails
+takes half a millisecond. Their back-off's cap grows with their number; up to 40 of them notice nothing."""
+DIAL_STRANGERS_BURST: Final = 64
+"""Such dials at once. One that ends in a link is not counted, so a network that starts up is not held up."""
 FRAME_HEADER_BYTES: Final = 24
 """See docs/design/protocol.md."""
 MESSAGE_MAX: Final = 256 * MIB
@@ -573,6 +578,8 @@ TASK_QUEUE_MESSAGES: Final = 10
 """Messages of its input that wait for a task; the oldest is dropped beyond it: control acts on the newest."""
 TASK_PAUSE_TIMEOUT: Final = 1.0
 """How long a profile that is to be applied waits for the runs under way; one that takes longer is stuck or slow."""
+PRECONDITION_TIMEOUT: Final = 1.0
+"""Seconds for which a profile whose precondition does not answer counts as before; then it is left out."""
 RESOURCE_HELD_MAX: Final = 64 * 1024 * 1024
 """Bytes of messages that a resource keeps while a profile is applied; the oldest give way."""
 TASK_END_TIMEOUT: Final = 2.0

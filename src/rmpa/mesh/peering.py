@@ -3,6 +3,9 @@
 A peer's place is its address and port; its incarnations follow each other there. Outputs are collected and
 taken with ``take``: ``Dial`` and ``CloseLink`` are orders to the driver, ``LinkUp`` and ``LinkDown`` tell the
 rooms above. Each ``Dial`` is answered by exactly one of ``link_up``, ``dial_refused`` or ``dial_failed``.
+
+Anybody can invent peers. So those that were never linked, strangers, stand in line for their dials, which are bounded
+over all of them; who was linked before does not notice.
 """
 
 from __future__ import annotations
@@ -13,7 +16,9 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from rmpa.core import limits
 from rmpa.core.backoff import Backoff
+from rmpa.core.bucket import Bucket
 from rmpa.core.clock import earliest
+from rmpa.core.timetable import Timetable
 from rmpa.mesh.handshake import Hello, KnownLink, Refusal, Refuse, Verdict, judge
 
 if TYPE_CHECKING:
@@ -122,6 +127,8 @@ class _Peer:
     lower: bool
     backoff: Backoff
     announced: bool = False
+    stranger: bool = True
+    paid: bool = False
     gone: bool = False
     source: str | None = None
     good: Endpoint | None = None
@@ -161,6 +168,14 @@ class Peering:
         self._peers: dict[int, _Peer] = {}
         self._by_link: dict[int, _Peer] = {}
         self._outputs: list[Output] = []
+        self._timers: Timetable[int] = Timetable()
+        self._strangers: set[int] = set()
+        # Strangers whose dials are due, who came first in front, and of these the ones that were never dialled.
+        self._line: dict[int, None] = {}
+        self._untried: dict[int, None] = {}
+        self._untried_next = True
+        self._line_at: float | None = None
+        self._allowed = Bucket(limits.DIAL_STRANGERS_RATE, limits.DIAL_STRANGERS_BURST)
 
     # --- what discovery says --------------------------------------------------------------------------------
 
@@ -182,13 +197,14 @@ class Peering:
         if restarted and identity.guid < peer.identity.guid and peer.link is not None:
             return  # old news: the link is with a newer instance
         peer.announced, peer.gone, peer.forget_at = True, False, None
+        self._set_timer(peer)
         peer.source = source or peer.source
         peer.identity = identity
         if restarted:
             peer.lower = self._ours.guid < identity.guid
             self._restart(peer, now)
         if fresh and peer.link is None and not peer.dialling:
-            peer.next_attempt = now if peer.lower else now + limits.DIAL_FALLBACK
+            self._dial_at(peer, now if peer.lower else now + limits.DIAL_FALLBACK)
         self._dial_due(peer, now)
 
     def peer_gone(self, guid: Guid, now: float) -> None:  # noqa: ARG002 - all machines are told the time
@@ -196,7 +212,7 @@ class Peering:
         peer = self._peers.get(guid.place)
         if peer is None or peer.identity.guid != guid:
             return
-        peer.announced, peer.gone, peer.next_attempt = False, True, None
+        peer.announced, peer.gone = False, True
         self._forget_if_idle(peer)
 
     # --- what the driver says -------------------------------------------------------------------------------
@@ -239,7 +255,9 @@ class Peering:
             peer.lower = self._ours.guid < identity.guid
             peer.backoff.reset()
         peer.link = new
-        peer.next_attempt = peer.forget_at = peer.refused = None
+        peer.forget_at = peer.refused = None
+        self._dial_at(peer, None)
+        self._met(peer, now)
         peer.attempts = 0
         peer.gone = False
         peer.tried.clear()
@@ -272,8 +290,9 @@ class Peering:
             return
         if not peer.announced:
             peer.forget_at = now + limits.FORGET_UNANNOUNCED
+            self._set_timer(peer)
         if not peer.dialling:
-            peer.next_attempt = now + peer.backoff.delay() + (0.0 if peer.lower else limits.DIAL_FALLBACK)
+            self._dial_at(peer, now + self._pause(peer) + (0.0 if peer.lower else limits.DIAL_FALLBACK))
 
     def dial_failed(self, guid: Guid, error: str, now: float, endpoint: Endpoint | None = None) -> None:
         """Nobody answered a ``Dial``, or the connection ended before the handshake did.
@@ -299,13 +318,14 @@ class Peering:
         if refuse.code == Refusal.ALREADY_LINKED:
             # They hold a link that we lost, or that is about to be welcomed here: it falls within the lease.
             if peer.link is None:
-                peer.next_attempt = now + max(limits.LINK_LEASE, peer.backoff.delay())
+                self._dial_at(peer, now + max(limits.LINK_LEASE, self._pause(peer)))
             return
         if refuse.code in _ELSEWHERE or refuse.code not in _SLOW:
             self._again(peer, now)
         elif peer.link is None:
             peer.refused = refuse
-            peer.next_attempt = now + limits.REFUSED_RETRY * (1 + 0.5 * self._rng())
+            pause = max(limits.REFUSED_RETRY, self._cap(peer))
+            self._dial_at(peer, now + pause * (1 + 0.5 * self._rng()))
         if refuse.code not in _ELSEWHERE and refuse.code not in peer.said:
             peer.said.add(refuse.code)
             self._outputs.append(LinkRefused(peer.identity, refuse))
@@ -314,16 +334,19 @@ class Peering:
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due, in monotonic seconds."""
-        return earliest(*(earliest(p.next_attempt, p.forget_at) for p in self._peers.values()))
+        return earliest(self._timers.next(), self._line_at)
 
     def handle_timer(self, now: float) -> None:
         """Dial and forget what is due."""
-        for peer in list(self._peers.values()):
+        for place in self._timers.take(now):
+            peer = self._peers[place]
             if peer.forget_at is not None and now >= peer.forget_at:
                 peer.gone = True
                 self._forget_if_idle(peer)
             else:
+                self._set_timer(peer)
                 self._dial_due(peer, now)
+        self._admit(now)
 
     def take(self) -> list[Output]:
         """What was decided since the last call, in order."""
@@ -345,13 +368,25 @@ class Peering:
         backoff = Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng)
         peer = _Peer(identity, self._ours.guid < identity.guid, backoff)
         self._peers[identity.guid.place] = peer
+        self._strangers.add(identity.guid.place)
         return peer
+
+    def _met(self, peer: _Peer, now: float) -> None:
+        """A peer is linked: it exists, and a dial that led there was none too many."""
+        peer.stranger = False
+        self._strangers.discard(peer.identity.guid.place)
+        if peer.paid:
+            peer.paid = False
+            self._allowed.put_back()
+            self._admit(now)
 
     def _forget_if_idle(self, peer: _Peer) -> None:
         """Forget a peer that is gone; one that we are dialling only when the dial was answered."""
-        peer.next_attempt = peer.forget_at = None
+        peer.forget_at = None
+        self._dial_at(peer, None)
         if peer.link is None and not peer.dialling:
             self._peers.pop(peer.identity.guid.place, None)
+            self._strangers.discard(peer.identity.guid.place)
 
     def _restart(self, peer: _Peer, now: float) -> None:
         """A new instance announced itself: nothing that its ghost did counts."""
@@ -364,7 +399,7 @@ class Peering:
         if link is not None and ghost and (link.identity.guid < peer.identity.guid or not self._alive(link.id)):
             self._drop(peer, link, "the peer restarted", close=True)
         if peer.link is None and not peer.dialling:
-            peer.next_attempt = now if peer.lower else now + limits.DIAL_FALLBACK
+            self._dial_at(peer, now if peer.lower else now + limits.DIAL_FALLBACK)
 
     def _keeps(self, old: _LinkInfo, new: _LinkInfo) -> bool:
         """Of two links with one instance: the one that the lower GUID dialled; of one direction, the newer."""
@@ -390,6 +425,7 @@ class Peering:
             peer.tried.add(endpoint)
             peer.last_endpoint = endpoint
         peer.dialling = ()
+        peer.paid = False
         if peer.gone:
             self._forget_if_idle(peer)
             return None
@@ -402,21 +438,73 @@ class Peering:
         if peer.tried.issuperset(peer.endpoints()):
             peer.tried.clear()
             peer.good = None
-            peer.next_attempt = now + peer.backoff.delay()
+            self._dial_at(peer, now + self._pause(peer))
         else:
-            peer.next_attempt = now
+            self._dial_at(peer, now)
+
+    # --- when to dial ---------------------------------------------------------------------------------------
+
+    def _cap(self, peer: _Peer) -> float:
+        """The longest pause between dials: strangers share what all of them may have."""
+        if not peer.stranger:
+            return limits.BACKOFF_MAX
+        return max(limits.BACKOFF_MAX, len(self._strangers) / limits.DIAL_STRANGERS_RATE)
+
+    def _pause(self, peer: _Peer) -> float:
+        peer.backoff.cap = self._cap(peer)
+        return peer.backoff.delay()
+
+    def _set_timer(self, peer: _Peer) -> None:
+        place = peer.identity.guid.place
+        attempt = None if place in self._line else peer.next_attempt
+        self._timers.set(place, earliest(attempt, peer.forget_at))
+
+    def _dial_at(self, peer: _Peer, when: float | None) -> None:
+        """Let the next dial be due then, or not at all."""
+        place = peer.identity.guid.place
+        peer.next_attempt = when
+        self._line.pop(place, None)
+        self._untried.pop(place, None)
+        self._set_timer(peer)
 
     def _dial_due(self, peer: _Peer, now: float) -> None:
+        """Dial if it is time; a stranger when its turn comes."""
         due = peer.next_attempt
         if due is None or now < due or peer.link is not None or peer.dialling:
             return
+        if not peer.stranger:
+            self._dial(peer)
+            return
+        place = peer.identity.guid.place
+        self._line[place] = None
+        if not peer.attempts:
+            self._untried[place] = None
+        self._set_timer(peer)
+        self._admit(now)
+
+    def _admit(self, now: float) -> None:
+        """Dial strangers as far as all of them may be.
+
+        In turn the newest that was never dialled, for a real one must not wait behind many invented ones, and who
+        waits longest, for it must not wait for ever.
+        """
+        while self._line and self._allowed.take(now):
+            newest = self._untried_next and self._untried
+            place = next(reversed(self._untried) if newest else iter(self._line))
+            self._untried_next = not self._untried_next
+            peer = self._peers[place]
+            peer.paid = True
+            self._dial(peer)
+        self._line_at = self._allowed.next(now) if self._line else None
+
+    def _dial(self, peer: _Peer) -> None:
+        self._dial_at(peer, None)
         left = [e for e in peer.endpoints() if e not in peer.tried]
         if not left:
             peer.tried.clear()
             left = peer.endpoints()
         peer.dialling = tuple(left)
         peer.last_endpoint = left[0]
-        peer.next_attempt = None
         peer.attempts += 1
         self._outputs.append(Dial(peer.identity.guid, peer.dialling))
 

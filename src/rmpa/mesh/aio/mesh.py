@@ -141,6 +141,7 @@ class Mesh:
         self._rng = rng
         self._ids = count(1)
         self._timer: asyncio.TimerHandle | None = None
+        self._timer_at: float | None = None
         self._accept_timer: asyncio.TimerHandle | None = None
         self._acting = False
         self._running = False
@@ -318,15 +319,18 @@ class Mesh:
             _log.warning("! %s refuses a link: %s", output.identity, output.refuse.text)
 
     def _arm(self) -> None:
+        due = self._peering.next_timer() if self._running else None
+        if due == self._timer_at:
+            return
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        due = self._peering.next_timer()
-        if due is not None and self._running:
+        self._timer_at = due
+        if due is not None:
             self._timer = asyncio.get_running_loop().call_later(max(0.0, due - self._clock.now()), self._due)
 
     def _due(self) -> None:
-        self._timer = None
+        self._timer = self._timer_at = None
         self._peering.handle_timer(self._clock.now())
         self._act()
 
