@@ -11,6 +11,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from rmpa.experiments.code import code_here
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -28,8 +30,9 @@ def facts() -> dict[str, object]:
         "python": platform.python_version(),
         "python_optimised": _optimised(),
         "rmpa": version("rmpa"),
-        "commit": _output("git", "rev-parse", "--short", "HEAD"),
+        "commit": code_here().commit,
         "roscpp": _output("dpkg-query", "-W", "-f", "${Version}", "libroscpp-dev"),
+        "rospy": _output("dpkg-query", "-W", "-f", "${Version}", "python3-rospy"),
         "load": os.getloadavg(),
         "governor": _first_line(Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")),
     }
