@@ -17,6 +17,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import itertools
+import json
 import os
 import shutil
 import signal
@@ -142,6 +143,12 @@ class Host:
         if bands:
             _run([*qdisc, "parent", "1:1", "handle", "10:", "pfifo_fast"])
 
+    def traffic(self, cable: int = 0) -> dict[str, int]:
+        """What went through a cable since it was plugged: ``tx_bytes``, ``tx_packets`` and the same with ``rx``."""
+        shown = self.ip("-json", "-statistics", "link", "show", "dev", self.cables[cable].interface)
+        counters = json.loads(shown)[0]["stats64"]
+        return {f"{way}_{unit}": int(counters[way][unit]) for way in ("tx", "rx") for unit in ("bytes", "packets")}
+
     def unshape(self, cable: int = 0) -> None:
         """Take the limit away."""
         _run(["tc", "-n", self.namespace, "qdisc", "del", "dev", self.cables[cable].interface, "root"])
@@ -165,7 +172,9 @@ class Network:
             octet, self._next = self._next, self._next + 1
         interface, port = f"eth{len(host.cables)}", f"port{octet}"
         cable = Cable(interface, f"10.77.{self.number}.{octet}", self.switch, port)
-        names = ["link", "add", interface, "netns", host.namespace]
+        # The hardware address is the address's, so that a host that was off comes back as itself.
+        hardware = f"02:4d:50:00:{self.number:02x}:{octet:02x}"
+        names = ["link", "add", interface, "address", hardware, "netns", host.namespace]
         _ip(*names, "type", "veth", "peer", "name", port, "netns", self.switch)
         _ip("-n", self.switch, "link", "set", port, "master", "switch", "up")
         host.ip("address", "add", f"{cable.address}/24", "brd", "+", "dev", interface)
@@ -213,6 +222,24 @@ class Lab:
     def hosts(self, *names: str, network: int = 0) -> list[Host]:
         """Several hosts on one network."""
         return [self.host(name, network) for name in names]
+
+    def power_off(self, host: Host) -> None:
+        """Pull a host's plug: its cables fall silent, its processes end, and its sockets with them, without a word.
+
+        A killed process alone would be unlike it: the kernel closes its connections, and tells the others.
+        """
+        for wire in host.cables:
+            _ip("-n", wire.switch, "link", "del", wire.port)
+        _remove(host.namespace)
+
+    def power_on(self, host: Host) -> None:
+        """Switch such a host on again, with the cables that it had; shape them anew."""
+        _ip("netns", "add", host.namespace)
+        host.ip("link", "set", "lo", "up")
+        wires, host.cables[:] = list(host.cables), []
+        for wire in wires:
+            number, octet = (int(part) for part in wire.address.split(".")[2:])
+            self.network(number).plug(host, octet=octet)
 
     def router(self, first: int, second: int, name: str = "router") -> Host:
         """A host that forwards between two networks; tell the hosts there by ``route``. No multicast crosses."""

@@ -112,6 +112,11 @@ class Ros:
         """The master's URI."""
         return self.env["ROS_MASTER_URI"]
 
+    @property
+    def processes(self) -> list[Process]:
+        """What was started here."""
+        return list(self._started)
+
     def close(self) -> None:
         """End what was started here, last first."""
         while self._started:
@@ -148,7 +153,7 @@ class Ros:
     ) -> Process:
         """Start ``nodes/PROGRAM.py``; ``remaps`` are ROS arguments such as ``__name:=x``."""
         env = {"PYTHONPATH": str(self.nodes)}
-        argv: list[str | Path] = [PYTHON, (nodes or self.nodes) / f"{program}.py", *_words(options), *remaps]
+        argv: list[str | Path] = [PYTHON, (nodes or self.nodes) / f"{program}.py", *words(options), *remaps]
         return self.start(*argv, name=f"{program}.py", env=env, commands=commands)
 
     def roscpp(
@@ -157,7 +162,7 @@ class Ros:
         """Compile ``nodes/PROGRAM.cpp`` if that was not done yet, and start it."""
         return self.start(
             compiled(program, nodes or self.nodes, self.nodes),
-            *_words(options),
+            *words(options),
             *remaps,
             name=program,
             commands=commands,
@@ -204,12 +209,13 @@ def compiled(program: str, nodes: Path = NODES, headers: Path = NODES) -> Path:
     return binary
 
 
-def _words(options: Mapping[str, object]) -> list[str]:
-    words: list[str] = []
+def words(options: Mapping[str, object]) -> list[str]:
+    """Options as nodes take them: ``--word value``, a bare ``--word`` for ``True``, nothing for ``False``, ``None``."""
+    made: list[str] = []
     for key, value in options.items():
         if value is not False and value is not None:
-            words += [f"--{key.replace('_', '-')}"] if value is True else [f"--{key.replace('_', '-')}", str(value)]
-    return words
+            made += [f"--{key.replace('_', '-')}"] if value is True else [f"--{key.replace('_', '-')}", str(value)]
+    return made
 
 
 def _clean_environment() -> dict[str, str]:
