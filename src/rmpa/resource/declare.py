@@ -623,7 +623,8 @@ class Resource:
             offers: The quality under it: attribute to value, with a unit (``"40 Hz"``) or in the attribute's own.
             cost: What it takes, beside the others.
             best_effort: Whether it runs when none can serve.
-            needs: Its precondition.
+            needs: Its precondition: asked once a window, in a thread of its own, so that it may block. It returns
+                true or ``None`` while the profile can be taken, else false or a text why it cannot.
             name: By default the function's.
             description: By default the first line of the function's docstring.
 

@@ -28,6 +28,7 @@ from rmpa.resource.adaptation import (
     Reacted,
 )
 from rmpa.resource.aio.applying import Applier
+from rmpa.resource.aio.preconditions import Preconditions
 from rmpa.resource.aio.runtime import RuntimePart
 from rmpa.resource.decision import Decider, wanted
 from rmpa.resource.observed import Missing, Observed
@@ -79,8 +80,6 @@ class Adapter(RuntimePart):
         profiles = [declared.profile for declared in resource.profiles.values()]
         self.loop = Adaptation(self._attributes, Decider(resource.name, self._attributes, profiles), settings)
         self._labels = resource.labels
-        self._primary = self._labels[next(iter(resource.outputs))] if resource.outputs else ""
-        """The output whose qualities are also named without it; they are shown once."""
         self._topics: dict[str, TopicQuality] = {}
         self._observed: dict[str, ObservedQuality] = {}
         self._answers: dict[str, Status] = {}
@@ -93,6 +92,7 @@ class Adapter(RuntimePart):
         self._applier = Applier(
             runtime, tasks, on_applied=self._applied, on_ended_late=self._ended_late, on_late=self.late
         )
+        self._preconditions = Preconditions(resource.profiles, self._bar)
         self._timers: dict[str, asyncio.TimerHandle] = {}
         self._context_bars: dict[str, str] = {}
         self._closed = False
@@ -130,6 +130,7 @@ class Adapter(RuntimePart):
     async def start(self) -> None:
         """Measure from now on, take the first profile, and hear clients."""
         self._loop = asyncio.get_running_loop()
+        await self._preconditions.start()
         now = self._loop.time()
         resource, node = self._runtime.resource, self._runtime.node
         for name, output in resource.outputs.items():
@@ -160,6 +161,7 @@ class Adapter(RuntimePart):
         self._closed = True
         for timer in self._timers.values():
             timer.cancel()
+        await self._preconditions.close()
         await self._applier.close()
 
     # --- measuring ----------------------------------------------------------------------------------------------
@@ -218,6 +220,7 @@ class Adapter(RuntimePart):
         self._measured = measured
         for text, gone in self._missing.look(self.troubles()[0]):
             self._miss(text, gone=gone)
+        self._preconditions.look()
         self._bar()
         self._act(self.loop.window(measured, now))
         self._publish_quality()
@@ -382,20 +385,10 @@ class Adapter(RuntimePart):
     # --- acting -------------------------------------------------------------------------------------------------
 
     def _bar(self) -> None:
-        """Look at the profiles' preconditions."""
-        barred = dict(self._context_bars)
-        for name, declared in self._runtime.resource.profiles.items():
-            if declared.needs is None or name in barred:
-                continue
-            try:
-                needs = declared.needs()
-            except Exception as error:  # noqa: BLE001 - the user's code
-                needs = f"its precondition failed: {type(error).__name__}: {error}"
-            if needs is False:
-                barred[name] = "its precondition does not hold"
-            elif isinstance(needs, str) and needs:
-                barred[name] = needs
-        self._act(self.loop.bar(barred, self._loop.time()))
+        """Leave out the profiles whose preconditions do not hold, and those that the context does not allow."""
+        if not self._closed:
+            barred = self._preconditions.barred() | self._context_bars
+            self._act(self.loop.bar(barred, self._loop.time()))
 
     def _act(self, actions: list[Action]) -> None:
         for action in actions:
@@ -506,10 +499,13 @@ class Adapter(RuntimePart):
 
     def _publish_quality(self) -> None:
         level, message = self._health()
+        outputs = self._runtime.resource.outputs
+        # The first one's qualities are also named without it; they are shown once.
+        primary = f"{self._labels[next(iter(outputs))]}." if outputs else ""
         values = {
             name: self._attributes[name].show(value)
             for name, value in self._measured.items()
-            if name in self._attributes and not (self._primary and name.startswith(f"{self._primary}."))
+            if name in self._attributes and not (primary and name.startswith(primary))
         }
         values["profile"] = self.loop.profile
         if self.reaction is not None:
