@@ -1,9 +1,8 @@
 // The velocity node of the paper's robot (roscpp): each command that comes in leaves as a velocity, its head kept.
 // Options: --cmd --vel --nodelay --queue; --mode event: at once; --mode polled: at --rate Hz, the newest command if there
-// is a new one, on an absolute schedule with a phase drawn from --seed.
+// is a new one, at whole multiples of its period on CLOCK_MONOTONIC, so that a source can be given a phase to it.
 // Events: up; connected with the number of subscribers of the velocity.
 #include <mutex>
-#include <random>
 #include <thread>
 
 #include "node.hpp"
@@ -33,10 +32,8 @@ int main(int argc, char** argv) {
     loop = std::thread([&] {
       node::sleep_sharply();
       const double period = 1e9 / options.number("rate", 10.0);
-      std::mt19937_64 chance(uint64_t(options.number("seed", 1)));
-      const uint64_t start = node::now_ns() + uint64_t(std::uniform_real_distribution<double>(0.0, period)(chance));
-      for (uint64_t turn = 0; ros::ok(); ++turn) {
-        node::sleep_until(start + uint64_t(period * double(turn)));
+      for (uint64_t turn = uint64_t(double(node::now_ns()) / period) + 1; ros::ok(); ++turn) {
+        node::sleep_until(uint64_t(period * double(turn)));
         std_msgs::UInt8MultiArray::ConstPtr message;
         {
           std::lock_guard<std::mutex> lock(mutex);
