@@ -184,7 +184,7 @@ class Output:
     outlet: Outlet | None = field(default=None, repr=False)
 
     def publish(self, message: object | None = None, /, **values: Any) -> None:
-        """Send a message: whole, or its fields.
+        """Send a message: whole, or its fields; it is dropped while the resource is not active.
 
         Raises:
             MessageError: It does not fit the output's type.

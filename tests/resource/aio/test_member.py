@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.core.errors import ConfigError, PeerRefused
+from rmpa.resource.adaptation import AdaptationSettings
 from rmpa.resource.aio.member import Member, run_all
 from rmpa.resource.declare import Resource
+from rmpa.resource.lifecycle import Transition
 from rmpa.ros.aio.core import RosCore
 from rmpa.ros.aio.node import Node
 
@@ -129,3 +131,64 @@ async def test_several_run_until_they_are_told_to_stop(core: RosCore) -> None:
         stop.set()
         await running
     assert not {"/echo", "/other"} & core.state().nodes.keys()
+
+
+class Loud:
+    """A resource whose own thread publishes whatever its state, and whose hooks and profile do too."""
+
+    def __init__(self) -> None:
+        self.resource = Resource("loud", role="acting")
+        self.words = self.resource.output("words", "std_msgs/String")
+        self.mode = self.resource.output("mode", "std_msgs/String", latch=True)
+        self.resource.profile(offers={}, name="plain")(lambda: self.mode.publish(data="plain"))
+        self.resource.profile(offers={}, name="other", cost=1)(lambda: self.mode.publish(data="other"))
+        for event in ("configure", "activate", "deactivate"):
+            self.resource.on(event)(lambda event=event: self.words.publish(data=event))
+
+    async def thread(self) -> None:
+        """What a thread of the user's own does, and it is through with that."""
+        await asyncio.to_thread(self.words.publish, data="thread")
+        await asyncio.sleep(0)
+
+
+async def test_nothing_leaves_unless_the_resource_is_active(core: RosCore, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "rmpa")
+    loud = Loud()
+    words: list[str] = []
+    modes: list[str] = []
+    member = Member(loud.resource, core.uri, settings=AdaptationSettings(dwell=0.0))
+    async with Node("ear", master_uri=core.uri) as node, asyncio.timeout(40):
+        for name, heard in (("words", words), ("mode", modes)):
+            await node.subscribe(
+                f"/loud/{name}", "std_msgs/String", lambda m, heard=heard: heard.append(m.message.data)
+            )
+        await member.runtime.start()
+        while not (member.runtime._publishers["words"].subscribers and member.adapter.loop.profile == "plain"):
+            await asyncio.sleep(0.01)
+        while not member.runtime._publishers["mode"].subscribers:
+            await asyncio.sleep(0.01)
+        for _ in range(3):
+            await loud.thread()
+        await member._turn(Transition.CONFIGURE)
+        member.adapter.pin("other")
+        await member.adapter.settled()
+        await member._turn(Transition.ACTIVATE)
+        await loud.thread()
+        while len(words) < 2 or not modes:
+            await asyncio.sleep(0.01)
+        # What the profile said is how the resource is; of two profiles only the last one's is true.
+        assert (words, modes) == (["activate", "thread"], ["other"])
+        await member.deactivate()
+        await loud.thread()
+        await member.activate()
+        while len(words) < 4:
+            await asyncio.sleep(0.01)
+        assert words[2:] == ["deactivate", "activate"]
+        await member.close()
+    refused = [record.message for record in caplog.records if "refused" in record.message]
+    assert refused == [
+        "! /loud: what is published on words is refused while the resource is not active; this is said once",
+        "= /loud: words flows again; 4 messages were refused",
+        "! /loud: what is published on words is refused while the resource is not active; this is said once",
+        "= /loud: words flows again; 1 messages were refused",
+    ]

@@ -64,6 +64,7 @@ class Member:
         """Set when the resource is finalized, by whomever."""
         node = Node(resource.name, master_uri=master_uri, on_shutdown=lambda _reason: self.ended.set())
         self.runtime = Runtime(resource, node)
+        self.runtime.close_outputs()
         self.tasks = Tasks(self.runtime, on_problem=self._problem, on_deactivate=self._deactivate_soon)
         self.adapter = Adapter(
             self.runtime,
@@ -152,6 +153,8 @@ class Member:
         self.life.begin(transition)
         if transition is Transition.DEACTIVATE:
             await self.tasks.deactivate()
+        elif transition is Transition.ACTIVATE:
+            self.runtime.open_outputs()
         why = ""
         hook = self.resource.hooks.get(transition.value)
         try:
@@ -165,6 +168,8 @@ class Member:
             why = f"{type(error).__name__}: {error}"
             _log.warning("! %s: %s: %s", self.runtime.node.name, transition, why)
         state = self.life.failed(why) if why else self.life.succeeded()
+        if state is not State.ACTIVE:
+            self.runtime.close_outputs()
         if transition is Transition.ACTIVATE and not why:
             self.tasks.activate()
         await self.runtime.say("state", state.value)

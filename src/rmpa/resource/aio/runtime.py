@@ -11,8 +11,8 @@ import itertools
 import logging
 import threading
 import time
-from collections import deque
-from typing import TYPE_CHECKING, Any
+from collections import Counter, deque
+from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from rmpa.ros.aio.topics import Publisher, Received, Subscriber
 
 _log = logging.getLogger(__name__)
+_CLOSED: Final = "life cycle"
 
 
 class RuntimePart:
@@ -73,6 +74,9 @@ class Runtime:
         self._held: deque[tuple[Output, bytes, Fence | None]] = deque()
         self._held_bytes = 0
         self._holders: set[str] = set()
+        self._open = True
+        self._refused: Counter[str] = Counter()
+        """By output: messages that were refused since the outputs were closed."""
         self.flowing: frozenset[str] | None = None
         """The only outputs whose messages leave in the present context; ``None``: all."""
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -152,6 +156,8 @@ class Runtime:
         Args:
             who: What changes; messages leave when the last change is over.
         """
+        if not self._open:
+            self._keep_of({"profile", "context"} - {who})  # what the one before said is no longer true
         self._holders.add(who)
 
     def release(self, who: str = "profile", *, drop: bool = False) -> None:
@@ -161,6 +167,23 @@ class Runtime:
             held, self._held, self._held_bytes = self._held, deque(), 0
             for output, raw, _ in held if not drop else ():
                 self._send(output, raw)
+
+    def open_outputs(self) -> None:
+        """Let outputs flow; what profiles and contexts had to say meanwhile leaves first."""
+        self._open = True
+        for name, count in self._refused.items():
+            _log.info("= %s: %s flows again; %d messages were refused", self.node.name, name, count)
+        self._refused.clear()
+        self.release(_CLOSED)
+
+    def close_outputs(self) -> None:
+        """Refuse what is published from now on, by whomever; said once for each output.
+
+        Only what the functions of profiles and contexts publish is kept, the last one's of each kind: it is how the
+        resource is, and true when outputs flow again.
+        """
+        self._open = False
+        self.hold(_CLOSED)
 
     def drop(self) -> None:
         """Drop what was kept: it belongs to a profile that was given up. What comes is kept as before."""
@@ -196,6 +219,9 @@ class Runtime:
         if fence is not None and fence.closed:
             fence.stopped(f"publish on {output.name}")  # it was on its way from another thread
             return
+        if not self._open and fence is None:
+            self._refuse(output)
+            return
         if self._holders:
             self._held.append((output, raw, fence))
             self._held_bytes += len(raw)
@@ -212,6 +238,17 @@ class Runtime:
         now_ns = time.time_ns()
         for part in self.parts:
             part.published(output, raw, now_ns)
+
+    def _keep_of(self, kinds: set[str]) -> None:
+        """Of what is kept, keep only what such functions published."""
+        self._held = deque(kept for kept in self._held if kept[2] is not None and kept[2].who in kinds)
+        self._held_bytes = sum(len(raw) for _, raw, _ in self._held)
+
+    def _refuse(self, output: Output) -> None:
+        self._refused[output.name] += 1
+        if self._refused[output.name] == 1:
+            text = "is refused while the resource is not active; this is said once"
+            _log.warning("! %s: what is published on %s %s", self.node.name, output.name, text)
 
     def observe(self, attribute: str, value: Value) -> None:
         """Hand an observation to the parts."""
