@@ -22,6 +22,7 @@ from bench import results
 from bench.bed import NODES, Bed
 from bench.tables import Target, show_targets
 from rmpa.core.errors import RmpaError
+from rmpa.experiments.bed.agents import last_link
 from rmpa.experiments.usage import Meter
 from rmpa.monitor.aio.control_client import ControlClient
 
@@ -187,14 +188,6 @@ def meshed(agents: Sequence[Agent]) -> float:
             time.sleep(_LOOK)
         came[agent.name] = up
     return max(came.values())
-
-
-def last_link(snapshot: Snapshot | None, names: set[str], now: float) -> float | None:
-    """When the last of an agent's links came up, or ``None`` if one is missing. ``now`` is when it said so."""
-    if snapshot is None:
-        return None
-    ups = {info.name: info.link.up_ago for info in snapshot.peers if info.link is not None and info.name in names}
-    return now - min(ups.values()) if ups.keys() == names else None
 
 
 def _wait_without(agents: Sequence[Agent], name: str) -> None:

@@ -12,7 +12,7 @@ from xmlrpc.server import SimpleXMLRPCServer
 import pytest
 
 from bench.bed import NODES
-from bench.joining import last_link
+from rmpa.experiments.bed.agents import last_link
 from rmpa.monitor.snapshot import AgentInfo, LinkInfo, PeerInfo, Snapshot
 
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rmpa.experiments.bed.namespaces import Host
+    from rmpa.monitor.snapshot import Snapshot
 
 RMPA: Final = Path(sys.executable).with_name("rmpa")
 _numbers = itertools.count(1)
@@ -218,6 +219,14 @@ class Agent:
 def is_linked(row: dict[str, object]) -> bool:
     """Whether a row of ``rmpa peer list --json`` is of a peer with a live link."""
     return row.get("state") == "linked"
+
+
+def last_link(snapshot: Snapshot | None, names: set[str], now: float) -> float | None:
+    """When the last of an agent's links came up, or ``None`` if one is missing. ``now`` is when it said so."""
+    if snapshot is None:
+        return None
+    ups = {info.name: info.link.up_ago for info in snapshot.peers if info.link is not None and info.name in names}
+    return now - min(ups.values()) if ups.keys() == names else None
 
 
 def _short_dir(home: Path, host: Host) -> Path:

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Final, Protocol, Self
 import psutil
 
 from rmpa.core.errors import UnreachableError
-from rmpa.experiments.bed.agents import RMPA, Agent
-from rmpa.experiments.bed.processes import Deadline
+from rmpa.experiments.bed.agents import RMPA, Agent, last_link
+from rmpa.experiments.bed.processes import BedError, Deadline
 from rmpa.experiments.bed.ros import NODES, PYTHON, Ros, compiled, words
 from rmpa.monitor.aio.control_client import ControlClient, choose_agent
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from rmpa.experiments.bed.processes import Process
     from rmpa.experiments.bed.system import Kind
     from rmpa.experiments.model import Client
+    from rmpa.monitor.snapshot import Snapshot
 
 _UP: Final = 30.0
 """Seconds until a node must have said ``up``."""
@@ -133,8 +134,8 @@ class Robot(abc.ABC):
     def pids(self) -> Mapping[str, int]:
         """What of the system itself runs, by ``what@host``."""
 
-    def node(self, host: str, program: str, client: Client, **options: object) -> Process:
-        """Start one of our nodes; returns when it said ``up``.
+    def node(self, host: str, program: str, client: Client, *, wait: bool = True, **options: object) -> Process:
+        """Start one of our nodes; returns when it said ``up``, or at once.
 
         Its name in the graph is its program's and host's with a number, and the same again after a restart of the
         host, as on a real robot.
@@ -154,7 +155,8 @@ class Robot(abc.ABC):
             argv = [compiled(program)]
         given = words({"name": name, **options})
         process = shell.start(*argv, *given, name=f"{client} {program}", commands=True)
-        process.wait_event("up", _UP)
+        if wait:
+            process.wait_event("up", _UP)
         return process
 
     def kill(self, host: str) -> None:
@@ -168,14 +170,21 @@ class Robot(abc.ABC):
             process.wait()
         self._shells[host].close()
 
-    def start(self, host: str) -> None:
-        """Switch a killed host on again; returns when its master or agent is ready."""
+    def start(self, host: str) -> float:
+        """Switch a killed host on again; returns when its master or agent is ready, with when that was executed."""
         self._place.on(host)
         self._off.discard(host)
         self._shells[host] = self._shell(host)
         for key in [key for key in self._numbers if key[0] == host]:
             del self._numbers[key]
+        began = time.monotonic()
         self._boot(host)
+        own = self._own(host)
+        return own[0].started if own else began
+
+    @abc.abstractmethod
+    def linked(self) -> float:
+        """Wait until all that run are joined; when the last one was."""
 
     def cut(self, host: str) -> None:
         """Pull its cable out; nothing happens where there are none."""
@@ -228,6 +237,10 @@ class Classic(Robot):
     def boot(self, *, linked: bool = True) -> None:  # noqa: ARG002 - a master has no links
         """Start the master."""
         self._boot(self._at)
+
+    def linked(self) -> float:
+        """Classic ROS is joined when its master answers, which ``boot`` and ``start`` wait for."""
+        return time.monotonic()
 
     def pids(self) -> Mapping[str, int]:
         """The master, and where it is the real one also ``rosout`` and ``roscore``, which started both."""
@@ -303,6 +316,16 @@ class Rmpa(Robot):
         if linked:
             self.wait_linked()
 
+    def linked(self) -> float:
+        """Wait until every agent that runs is linked with every other; when the last link came up."""
+        self.wait_linked()
+        alive = {name for name in self._hosts if name not in self._off}
+        snapshots = {name: self._snapshot(name) for name in alive}
+        ups = [last_link(found, alive - {name}, time.monotonic()) for name, found in snapshots.items()]
+        if None in ups:
+            raise BedError("a link fell again while all agents were asked for theirs")
+        return max((up for up in ups if up is not None), default=time.monotonic())
+
     def wait_linked(self, timeout: float = _LINKED) -> None:
         """Wait until every agent that runs is linked with every other.
 
@@ -319,12 +342,17 @@ class Rmpa(Robot):
 
     def linked_with(self, host: str) -> set[str]:
         """The names of the agents that a host's agent has a live link to; none if it does not answer."""
+        found = self._snapshot(host)
+        return {peer.name for peer in found.peers if peer.state == "linked"} if found else set()
+
+    def _snapshot(self, host: str) -> Snapshot | None:
+        """What its agent says of itself; ``None`` if it does not answer."""
         agent = self._agents[host]
         try:
             with ControlClient(choose_agent(agent.env, agent.name).path) as client:
-                return {peer.name for peer in client.snapshot().peers if peer.state == "linked"}
+                return client.snapshot()
         except UnreachableError:
-            return set()
+            return None
 
     def pids(self) -> Mapping[str, int]:
         """The agents that run."""
