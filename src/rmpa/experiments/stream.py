@@ -1,0 +1,68 @@
+"""One stream from the joystick to the pc, measured in steps: of rates, of sizes."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Final, cast
+
+from rmpa.experiments import flow
+from rmpa.experiments.arrivals import ARRIVALS, SENT, counting_from
+from rmpa.experiments.contenders import nodelay_of, system_of
+from rmpa.experiments.model import Measured, Table
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rmpa.experiments.bed.processes import Process
+    from rmpa.experiments.bed.system import Stage
+    from rmpa.experiments.model import Cell, Client, Value
+
+HOSTS: Final = ("joystick", "pc")
+TOPIC: Final = "/cmd"
+LEAD: Final = 0.1
+"""Seconds at the beginning of each step whose messages are not counted: caches and the processor's clock come up."""
+SETTLE: Final = 0.2
+"""Seconds without an arrival after which a step is over: beyond the delayed acknowledgement's 40 ms, on any link."""
+QUEUE: Final = 1000
+
+
+class Stream:
+    """A source and a sink that are connected, and what came of their steps.
+
+    Args:
+        stage: Where files go.
+        source: Sends.
+        sink: Receives.
+        step: What differs from step to step; the first column of both tables.
+    """
+
+    def __init__(self, stage: Stage, source: Process, sink: Process, step: str) -> None:
+        self._stage, self._source, self._sink, self._step = stage, source, sink, step
+        self._came: list[tuple[Value, ...]] = []
+        self._sent: list[tuple[Value, ...]] = []
+
+    def run(self, step: Value, *, size: int, rate: float, count: int) -> None:
+        """Send one step; keep its last ``count`` messages."""
+        lead = max(2, round(rate * LEAD))
+        begun = flow.begin(self._source, self._stage.scratch, size=size, rate=rate, count=lead + count)
+        sent = counting_from(flow.sent(begun), lead)
+        came = counting_from(flow.noted(self._sink, [TOPIC], self._stage.scratch, begun.number, settle=SETTLE), lead)
+        self._sent += [(step, *row) for row in sent.rows]
+        self._came += [(step, *row[1:]) for row in came.rows]
+
+    def measured(self) -> Measured:
+        """All steps: tables ``arrivals`` and ``sent``."""
+        came, sent = Table((self._step, *ARRIVALS), self._came), Table((self._step, *SENT), self._sent)
+        return Measured({"arrivals": came, "sent": sent}, {"sent": len(self._sent), "came": len(self._came)})
+
+
+@contextmanager
+def stream(cell: Cell, stage: Stage, step: str, *, link: str | None = None) -> Iterator[Stream]:
+    """Set up a cell's system with a source and a sink; messages flow when it is given out."""
+    client = cast("Client", cell.settings["client"])
+    with stage.system(system_of(cell), HOSTS, link=link) as system:
+        sink = system.node("pc", "sink", client, topics=TOPIC, queue=QUEUE, nodelay=nodelay_of(cell))
+        source = system.node("joystick", "source", client, topic=TOPIC, queue=QUEUE)
+        flow.wait_connected(source)
+        flow.wait_flowing(source, sink, [TOPIC], stage.scratch)
+        yield Stream(stage, source, sink, step)
