@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.resource.tasks import Schedule, TaskFigures, TaskReport, restart_delay, stuck_after
+from rmpa.resource.tasks import Schedule, TaskFigures, TaskReport, restart_delay, stuck_after, too_slow
 
 
 def test_times_are_absolute_whatever_the_work_takes() -> None:
@@ -58,6 +58,25 @@ def test_what_is_measured_of_a_task() -> None:
         }
     )
     assert figures.window(2.0) == TaskReport()
+
+
+@pytest.mark.parametrize(
+    ("report", "period", "text"),
+    [
+        (TaskReport(runs=10, overruns=1), 0.1, ""),  # once is the machine's business
+        (
+            TaskReport(runs=10, overruns=2, missed=3),
+            0.1,
+            "2 of 10 runs took longer than its period of 0.1 s, 3 times left out",
+        ),
+        (TaskReport(runs=1, overruns=1), 2.0, "1 of 1 runs took longer than its period of 2 s"),
+        (TaskReport(runs=5, missed=5), 0.1, ""),  # it was held, it did not overrun
+        (TaskReport(runs=4, dropped=7), None, "7 messages of its input gave way to newer ones, 4 were taken"),
+        (TaskReport(runs=4), None, ""),
+    ],
+)
+def test_a_task_is_too_slow_if_it_overruns_often(report: TaskReport, period: float | None, text: str) -> None:
+    assert too_slow(report, period) == text
 
 
 def test_a_pause_of_its_own_is_no_period() -> None:

@@ -71,6 +71,24 @@ class TaskReport:
     busy: float = 0.0
 
 
+def too_slow(report: TaskReport, period: float | None) -> str:
+    """How a task was too slow over one window, for people; empty if it was not.
+
+    More than a tenth of its runs took longer than its period, or messages of its input gave way. A single late run
+    is the machine's business.
+
+    Args:
+        report: Of the window.
+        period: Seconds, of a periodic one, else ``None``.
+    """
+    if report.dropped:
+        return f"{report.dropped} messages of its input gave way to newer ones, {report.runs} were taken"
+    if period is None or report.overruns * 10 <= report.runs:
+        return ""
+    left_out = f", {report.missed} times left out" if report.missed else ""
+    return f"{report.overruns} of {report.runs} runs took longer than its period of {period:.3g} s{left_out}"
+
+
 class TaskFigures:
     """Measures one task; told by the thread that runs it, asked by the loop. Sums only.
 

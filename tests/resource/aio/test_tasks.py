@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import threading
 import time
 from types import SimpleNamespace
@@ -172,8 +173,79 @@ async def test_a_task_that_is_stuck_is_reported_and_replaced(bench: Bench, kind:
     bench.resource.task(rate=100, stuck_after=0.3)(plain if kind == "thread" else coroutine)
     bench.tasks.activate()
     assert "a run has not ended for" in (await bench.problem("stuck")).text
+    assert list(bench.tasks.running.values()) == ["stuck"], "until a run has come back"
+    (trouble,) = bench.tasks.troubles
+    assert "stuck: a run has not ended for" in trouble
     await count.wait()
     free.set()
+    async with asyncio.timeout(30):
+        while bench.tasks.troubles:
+            await asyncio.sleep(0.01)
+
+
+async def test_a_task_that_is_stuck_again_and_again_is_begun_ever_less_often(bench: Bench) -> None:
+    count, free = Counter(5), threading.Event()
+
+    def plain() -> None:
+        count()
+        free.wait(60)
+
+    bench.resource.task(rate=100, stuck_after=0.05)(plain)
+    bench.tasks.activate()
+    await count.wait()
+    free.set()
+    pauses = [after - before for before, after in itertools.pairwise(count.times)]
+    # Behind the time until it counts as stuck: 0.1, 0.2, 0.4 and 0.8 s, for each thread that hangs stays.
+    assert pauses[3] > 0.85
+
+
+@pytest.mark.parametrize("kind", ["thread", "coroutine"])
+async def test_a_task_that_overruns_its_period_is_reported_once_and_goes_on(bench: Bench, kind: str) -> None:
+    slow = threading.Event()
+    slow.set()
+    count = Counter(4)
+
+    def plain() -> None:
+        if slow.is_set():
+            time.sleep(0.03)
+        count()
+
+    async def coroutine() -> None:
+        if slow.is_set():
+            await asyncio.sleep(0.03)
+        count()
+
+    bench.resource.task(rate=100, name="t")(plain if kind == "thread" else coroutine)
+    bench.tasks.activate()
+    await count.wait()
+    bench.tasks.judge()
+    count = Counter(4)
+    await count.wait()
+    bench.tasks.judge()
+    assert [problem.kind for problem in bench.problems] == ["too slow"]
+    (trouble,) = bench.tasks.troubles
+    assert "task t too slow:" in trouble
+    assert "runs took longer than its period of 0.01 s" in trouble
+    slow.clear()
+    async with asyncio.timeout(60):
+        while bench.tasks.troubles:
+            await asyncio.sleep(0.1)
+            bench.tasks.judge()
+
+
+async def test_the_same_failure_has_one_traceback(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    count = Counter(5)
+
+    def plain() -> None:
+        count()
+        raise ValueError("no echo" if len(count.times) < 4 else "no battery")
+
+    bench.resource.task(rate=200)(plain)
+    bench.tasks.activate()
+    await count.wait()
+    await bench.tasks.deactivate()
+    traced = [record.exc_info[1] for record in caplog.records if record.exc_info]
+    assert [str(error) for error in traced] == ["no echo", "no battery"]
 
 
 @pytest.mark.parametrize("kind", ["thread", "coroutine"])

@@ -77,10 +77,10 @@ class Member:
         self.configuration = Reconfigure(self.runtime, self.tasks, self.adapter, self.contexts)
         self.demands = Demands(self.runtime)
         self.adapter.on_window.append(self.demands.window)
+        self.adapter.on_window.append(lambda _level, _message, _measured: self.tasks.judge())
         parts = [self.configuration.before, self.tasks, self.adapter, self.contexts, self.configuration, self.demands]
         self.memory = Memory(self.runtime, self.adapter, self.contexts, store) if store is not None else None
         self.runtime.parts += [*parts, self.memory] if self.memory is not None else parts
-        self._last_problem: dict[str, str] = {}
         self._deactivating: asyncio.Task[None] | None = None
 
     def add(self, part: RuntimePart) -> None:
@@ -178,7 +178,6 @@ class Member:
 
     def _problem(self, problem: TaskProblem) -> None:
         _log.warning("! %s: %s", self.runtime.node.name, problem)
-        self._last_problem[problem.task.name] = str(problem)
 
     def _deactivate_soon(self, why: str) -> None:
         over = self._deactivating is None or self._deactivating.done()
@@ -193,10 +192,7 @@ class Member:
             for name, item in self.resource.inputs.items()
             if item.required and not self.runtime.publishers_of(item)
         ]
-        tasks = []
-        for name, state in self.tasks.running.items():
-            if state != "running":
-                tasks.append(f"task {name} {state}: {self._last_problem.get(name, '')}".rstrip(": "))
+        tasks = self.tasks.troubles
         absent, short = self.demands.troubles()
         missing += absent
         tasks += short

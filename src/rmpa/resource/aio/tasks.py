@@ -20,7 +20,7 @@ from rmpa.core import limits
 from rmpa.core.aio.timerfd import TimerFd
 from rmpa.resource.aio.runtime import RuntimePart
 from rmpa.resource.declare import OnFailure
-from rmpa.resource.tasks import Schedule, TaskFigures, restart_delay, stuck_after
+from rmpa.resource.tasks import Schedule, TaskFigures, restart_delay, stuck_after, too_slow
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -105,7 +105,7 @@ class TaskProblem:
     def __init__(self, task: Task, kind: str, text: str) -> None:
         self.task = task
         self.kind = kind
-        """``failed``, ``stuck`` or ``stopped``."""
+        """``failed``, ``stuck``, ``stopped`` or ``too slow``."""
         self.text = text
 
     def __str__(self) -> str:
@@ -133,13 +133,44 @@ class Tasks(RuntimePart):
         self._on_problem = on_problem
         self._on_deactivate = on_deactivate
         self._runners: dict[str, _Runner] = {}
+        self._slow: dict[str, TaskProblem] = {}
+        """Tasks that were too slow in the last window in which they ran."""
         self._looker: asyncio.TimerHandle | None = None
         self._gate = Gate()
 
     @property
     def running(self) -> Mapping[str, str]:
-        """By task: ``running``, ``waiting`` (it failed and pauses) or ``stopped`` and why."""
+        """By task: ``running``, ``waiting`` (it failed), ``stuck`` (it did not come back) or ``stopped`` and why.
+
+        The middle two last until a run ends well.
+        """
         return {name: runner.state for name, runner in self._runners.items()}
+
+    @property
+    def troubles(self) -> list[str]:
+        """What does not work, for people."""
+        found = []
+        for name, runner in self._runners.items():
+            if runner.over:
+                found.append(f"task {name} {runner.state}")
+            elif runner.problem is not None:
+                found.append(str(runner.problem))
+            elif name in self._slow:
+                found.append(str(self._slow[name]))
+        return found
+
+    def judge(self) -> None:
+        """A window of quality ends: see which tasks were too slow in it."""
+        for name, report in self.reports(time.monotonic()).items():
+            if not report.runs and not report.dropped:
+                continue  # nothing that could be judged
+            runner, known = self._runners[name], self._slow.pop(name, None)
+            if text := too_slow(report, runner.period):
+                self._slow[name] = TaskProblem(runner.task, "too slow", text)
+                if known is None:
+                    self._on_problem(self._slow[name])
+            elif known is not None:
+                _log.info("= /%s: task %s keeps up again", self._runtime.resource.name, name)
 
     def activate(self) -> None:
         """Begin all tasks."""
@@ -153,6 +184,7 @@ class Tasks(RuntimePart):
             self._looker.cancel()
             self._looker = None
         runners, self._runners = list(self._runners.values()), {}
+        self._slow.clear()
         for runner in runners:
             runner.stop()
         await asyncio.gather(*(runner.ended() for runner in runners))
@@ -192,9 +224,11 @@ class Tasks(RuntimePart):
 
     # --- inside -------------------------------------------------------------------------------------------------
 
-    def _begin(self, task: Task) -> None:
+    def _begin(self, task: Task, *, lost: int = 0, problem: TaskProblem | None = None) -> None:
+        """Begin a task; after ``lost`` runs in a row that did not come back, behind a pause."""
         kind = _AsyncRunner if asyncio.iscoroutinefunction(task.function) else _ThreadRunner
         runner = kind(task, self._gate, lambda text: self._failed(task, text))
+        runner.lost, runner.problem = lost, problem
         self._runners[task.name] = runner
         runner.start()
 
@@ -203,7 +237,10 @@ class Tasks(RuntimePart):
         runner = self._runners.get(task.name)
         if runner is None:
             return
-        self._on_problem(TaskProblem(task, "failed", text))
+        problem = TaskProblem(task, "failed", text)
+        if runner.waiting:
+            runner.problem = problem
+        self._on_problem(problem)
         if task.on_failure is not OnFailure.RESTART:
             self._end(runner, text)
 
@@ -223,10 +260,11 @@ class Tasks(RuntimePart):
             if since is None or runner.stopped or now - since < runner.patience:
                 continue
             text = f"a run has not ended for {now - since:.3g} s"
-            self._on_problem(TaskProblem(runner.task, "stuck", text))
+            problem = TaskProblem(runner.task, "stuck", text)
+            self._on_problem(problem)
             runner.stop(stuck=True)
             if runner.task.on_failure is OnFailure.RESTART:
-                self._begin(runner.task)
+                self._begin(runner.task, lost=runner.lost + 1, problem=problem)
             else:
                 self._end(runner, text)
 
@@ -239,13 +277,18 @@ class _Runner:
         period = 1 / rate if rate else None
         self.task = task
         self.waiting = False
-        """Whether it pauses after a failure."""
+        """Whether its last run failed."""
+        self.lost = 0
+        """Runs in a row that did not come back."""
+        self.problem: TaskProblem | None = None
+        """What was wrong with its last run; ``None`` once one ended well."""
         self.over = ""
         """Why it ended by itself, or empty."""
         self.stopped = False
         self.patience = stuck_after(period, task.stuck_after)
         self.figures = TaskFigures(period, time.monotonic())
-        self._period = period
+        self.period = period
+        """Seconds, of a periodic one, else ``None``."""
         self._gate = gate
         self._on_failed = on_failed
         self._messages: deque[Received] = deque()
@@ -255,7 +298,14 @@ class _Runner:
         """For people."""
         if self.over:
             return f"stopped: {self.over}"
-        return "waiting" if self.waiting else "running"
+        if self.waiting:
+            return "waiting"
+        return "stuck" if self.lost else "running"
+
+    def _well(self) -> None:
+        """A run has ended well."""
+        self.figures.ended(time.monotonic())
+        self.waiting, self.lost, self.problem = False, 0, None
 
     def start(self) -> None:
         raise NotImplementedError
@@ -271,9 +321,9 @@ class _Runner:
 
     def retime(self, rate: float) -> None:
         """Go on with another rate, Hz: the next run is due one new period behind the last one."""
-        self._period = 1 / rate
-        self.patience = stuck_after(self._period, self.task.stuck_after)
-        self.figures.retimed(self._period)
+        self.period = 1 / rate
+        self.patience = stuck_after(self.period, self.task.stuck_after)
+        self.figures.retimed(self.period)
         self.wake()
 
     def give(self, message: Received) -> None:
@@ -289,7 +339,9 @@ class _Runner:
 
     def _error(self, error: BaseException) -> str:
         text = f"{type(error).__name__}: {error}"
-        _log.warning("! task %s failed: %s", self.task.name, text, exc_info=error)
+        known = self.problem is not None and self.problem.text == text
+        if not known:  # the same again needs no other traceback
+            _log.warning("! task %s failed:", self.task.name, exc_info=error)
         return text
 
 
@@ -317,28 +369,30 @@ class _AsyncRunner(_Runner):
         self._wake.set()
 
     async def _run(self) -> None:
-        if self._period is None:
+        if self.lost:
+            await asyncio.sleep(restart_delay(self.lost))
+        if self.period is None:
             await self._on_messages()
             return
         with TimerFd(blocking=False) as timer:
             loop = asyncio.get_running_loop()
             loop.add_reader(timer.fileno(), self._wake.set)
             try:
-                await self._periodically(self._period, timer)
+                await self._periodically(self.period, timer)
             finally:
                 loop.remove_reader(timer.fileno())
 
     async def _periodically(self, period: float, timer: TimerFd) -> None:
         schedule, last = Schedule(period, time.monotonic()), -math.inf
         while True:
-            if schedule.period != self._period:
-                period = self._period or period
+            if schedule.period != self.period:
+                period = self.period or period
                 schedule = Schedule(period, max(last + period, time.monotonic()))
             missed = schedule.missed
             due = schedule.next_due(time.monotonic())
             self.figures.missed(schedule.missed - missed)
             timer.set(due)
-            while not (over := timer.wait()) and schedule.period == self._period:
+            while not (over := timer.wait()) and schedule.period == self.period:
                 self._wake.clear()
                 await self._wake.wait()
             if not over:
@@ -372,13 +426,12 @@ class _AsyncRunner(_Runner):
                 raise  # it is us that are to end, not something that the run waited for
             text = await asyncio.to_thread(self._error, error)  # the traceback reads source files
         else:
-            self.figures.ended(time.monotonic())
+            self._well()
             return True
         self.figures.ended(time.monotonic(), text)
-        self._on_failed(text)
         self.waiting = True
+        self._on_failed(text)
         await asyncio.sleep(restart_delay(self.figures.in_a_row))
-        self.waiting = False
         self.figures.interrupted()
         return False
 
@@ -419,11 +472,13 @@ class _ThreadRunner(_Runner):
 
     def _thread(self) -> None:
         try:
-            if self._period is None:
+            if self.lost:
+                self._end.wait(restart_delay(self.lost))
+            if self.period is None:
                 self._on_messages()
             else:
                 with TimerFd(blocking=True) as timer:
-                    self._periodically(self._period, timer)
+                    self._periodically(self.period, timer)
         finally:
             with contextlib.suppress(RuntimeError):  # the loop has ended before us
                 self._loop.call_soon_threadsafe(self._done.set)
@@ -431,16 +486,16 @@ class _ThreadRunner(_Runner):
     def _periodically(self, period: float, timer: TimerFd) -> None:
         schedule, last = Schedule(period, time.monotonic()), -math.inf
         while not self._end.is_set():
-            if schedule.period != self._period:
-                period = self._period or period
+            if schedule.period != self.period:
+                period = self.period or period
                 schedule = Schedule(period, max(last + period, time.monotonic()))
             missed = schedule.missed
             due = schedule.next_due(time.monotonic())
             self.figures.missed(schedule.missed - missed)
-            while due - time.monotonic() > _SLICE and schedule.period == self._period:
+            while due - time.monotonic() > _SLICE and schedule.period == self.period:
                 if self._end.wait(min(due - time.monotonic() - _SLICE / 2, _SLICE)):
                     return
-            if schedule.period != self._period:
+            if schedule.period != self.period:
                 continue
             last = due
             timer.set(due)
@@ -470,15 +525,14 @@ class _ThreadRunner(_Runner):
         except (Exception, SystemExit) as error:  # noqa: BLE001 - the top of the user's code
             text = self._error(error)
         else:
-            self.figures.ended(time.monotonic())
+            self._well()
             return True
         self.figures.ended(time.monotonic(), text)
         if self._end.is_set():
             return False
+        self.waiting = True
         with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(self._on_failed, text)
-        self.waiting = True
         self._end.wait(restart_delay(self.figures.in_a_row))
-        self.waiting = False
         self.figures.interrupted()
         return False
