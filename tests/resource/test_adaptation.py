@@ -13,6 +13,7 @@ from rmpa.resource.adaptation import (
     AlarmKind,
     Apply,
     Clear,
+    CoolDown,
     ProfileState,
     Raise,
     Reacted,
@@ -474,3 +475,38 @@ def test_a_hung_function_that_ended_before_the_next_one_began_changes_nothing() 
     one = hung(5.0)
     assert one.ended_late("fast", 5.1, touched=False) == []
     assert finish(one, 5.2) == [Reacted("middle", 5.2)]
+
+
+def test_what_was_left_out_before_a_restart_is_left_out_for_the_rest_of_it() -> None:
+    one = loop()
+    one.start(0.0)
+    finish(one, 0.0)
+    one.require(at_least(30), 1.0)
+    assert applies(one.failed("fast", "no bus", 3.0)) == ["middle"]
+    cooling = one.cooling(4.0)
+    assert {name: (cool.until, cool.cool_down) for name, cool in cooling.items()} == {"fast": (13.0, 10.0)}
+    again = loop()
+    again.remember([at_least(30)], "middle", cooling, 4.0)
+    assert applies(again.start(4.0)) == ["middle"]
+    finish(again, 4.0)
+    assert again.explain(5.0)[0].excluded == "no bus"
+    assert again.next_timer() == 13.0
+    assert not again.cooling(13.0)
+    assert applies(again.handle_timer(13.0)) == ["fast"]
+    again.failed("fast", "no bus", 13.5)
+    assert again.cooling(13.5)["fast"].cool_down == 20.0  # the next one is twice as long, as if nothing had been
+
+
+def test_a_cool_down_of_a_file_is_no_longer_than_any_may_be() -> None:
+    one = loop()
+    one.remember([at_least(30)], "", {"fast": CoolDown(1e9, 1e9, "odd")}, 1.0)
+    assert one.cooling(1.0)["fast"].until == 161.0
+
+
+def test_a_profile_chosen_before_a_restart_waits_for_its_cool_down_and_one_chosen_now_does_not() -> None:
+    cooling = {"fast": CoolDown(13.0, 10.0, "no bus")}
+    before, now = loop(), loop()
+    before.remember([], "", cooling, 4.0)
+    assert applies(before.pin("fast", 4.0, anew=False)) == ["slow"]
+    now.remember([], "", cooling, 4.0)
+    assert applies(now.pin("fast", 4.0)) == ["fast"]

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource.declare import Resource
-from rmpa.resource.remembered import CHOSEN, CONTEXT, LAST, Asked, recall
+from rmpa.resource.remembered import CHOSEN, CONTEXT, COOL_DOWN, LAST, Asked, Cooling, recall
 
 NOW = 1_800_000_000_000_000_000
 SECOND = 1_000_000_000
@@ -67,6 +67,8 @@ def test_what_has_expired_meanwhile_is_forgotten() -> None:
         (CONTEXT, '"away"', "context away"),
         (("requirement", "/a"), '{"client": "/a", "values": [["nois", ">= 1"]]}', "nois"),
         (("requirement", "/a"), '{"client": "/a", "values": [["noise", "soft"]]}', "soft"),
+        ((COOL_DOWN, "exact"), '{"until_ns": 1, "cool_down": 1}', "declared no longer"),
+        ((COOL_DOWN, "fine"), '{"until_ns": "soon", "cool_down": 1}', "cool_down fine"),
         (("requirement", "/a"), "[" * 100_000, "requirement /a"),
     ],
 )
@@ -89,3 +91,21 @@ def test_an_expiry_is_the_wall_clocks() -> None:
     forever = Asked(client="/a", values=(("noise", "<= 1 m"),)).requirement(sonar().attributes, "sonar", 5.0, NOW)
     assert forever is not None
     assert forever.expires is None
+
+
+@pytest.mark.parametrize(
+    ("ahead", "left"),
+    [(12, 12), (20, 20), (500, 20), (10**9, 20), (0, None), (-1, None), (-(10**9), None)],
+    ids=["running", "just begun", "set back", "set back by decades", "over", "long over", "set forward by decades"],
+)
+def test_a_cool_down_is_the_wall_clocks_and_never_longer_than_it_was(ahead: int, left: int | None) -> None:
+    row = Cooling(until_ns=NOW + ahead * SECOND, cool_down=20.0, why="no bus").serialize()
+    found = recall({(COOL_DOWN, "fine"): row}, sonar(), NOW)
+    one = found.cooling["fine"].left(100.0, NOW)
+    assert (one and (one.until, one.cool_down, one.why)) == (left and (100.0 + left, 20.0, "no bus"))
+
+
+def test_a_clock_that_was_set_back_makes_no_request_longer() -> None:
+    one = asked(expires_ns=NOW + 10**9 * SECOND).requirement(sonar().attributes, "sonar", 100.0, NOW)
+    assert one is not None
+    assert one.expires == 130.0

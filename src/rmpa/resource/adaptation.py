@@ -160,8 +160,14 @@ class ProfileState(Enum):
 
 
 @dataclass(slots=True)
-class _Trouble:
-    """A profile that failed or disappointed."""
+class CoolDown:
+    """A profile that failed or disappointed is left out.
+
+    Args:
+        until: When that is over, monotonic seconds.
+        cool_down: How long it was to last; the next one is longer.
+        why: What was wrong.
+    """
 
     until: float
     cool_down: float
@@ -176,7 +182,7 @@ class _Knowledge:
     merged: Merged = field(default_factory=Merged)
     barred: dict[str, str] = field(default_factory=dict)
     """Profiles whose preconditions do not hold, and why."""
-    troubles: dict[str, _Trouble] = field(default_factory=dict)
+    troubles: dict[str, CoolDown] = field(default_factory=dict)
     hanging: set[str] = field(default_factory=set)
     """Profiles that were given up while their functions ran, and still run."""
     windows: deque[tuple[float, tuple[Shortfall, ...]]] = field(default_factory=deque)
@@ -253,11 +259,31 @@ class Adaptation:
 
     # --- what is asked ------------------------------------------------------------------------------------------
 
-    def remember(self, requirements: Iterable[Requirement], profile: str) -> None:
-        """Begin with what was asked before a restart, and with the profile that ran if that is as good; at first."""
+    def remember(
+        self,
+        requirements: Iterable[Requirement],
+        profile: str,
+        cooling: Mapping[str, CoolDown] | None = None,
+        now: float = 0.0,
+    ) -> None:
+        """Begin with what there was before a restart; to be called at first.
+
+        Args:
+            requirements: What was asked.
+            profile: That ran; it is taken if it is about as good as the best.
+            cooling: The profiles that were left out, and until when.
+            now: The time.
+        """
+        for name, one in (cooling or {}).items():
+            cool_down = min(one.cool_down, self._settings.cool_down_max)
+            self._knows.troubles[name] = CoolDown(min(one.until, now + cool_down), cool_down, one.why)
         self._knows.requirements = {requirement.client: requirement for requirement in requirements}
         self._knows.merged = merge(self._knows.requirements.values())
         self._before = profile
+
+    def cooling(self, now: float) -> dict[str, CoolDown]:
+        """The profiles that failed or disappointed and are left out at present."""
+        return {name: replace(one) for name, one in self._knows.troubles.items() if now < one.until < math.inf}
 
     def start(self, now: float) -> list[Action]:
         """Take the first profile."""
@@ -285,15 +311,21 @@ class Adaptation:
         self._knows.barred = dict(barred)
         return self._plan(now, "the preconditions of profiles have changed")
 
-    def pin(self, profile: str, now: float) -> list[Action]:
+    def pin(self, profile: str, now: float, *, anew: bool = True) -> list[Action]:
         """Run this profile whatever is asked; an empty name lets the loop decide again.
+
+        Args:
+            profile: Which one.
+            now: The time.
+            anew: Whether somebody chose it just now; else it was chosen before a restart.
 
         Raises:
             ConfigError: There is no such profile.
         """
         if profile:
             self._decider.profile(profile)
-            self._knows.troubles.pop(profile, None)  # who chooses it may know that what was wrong is mended
+            if anew:
+                self._knows.troubles.pop(profile, None)  # who chooses it may know that what was wrong is mended
         self._pinned = profile
         why = f"{profile} was chosen by hand" if profile else "the choice by hand is over"
         return self._plan(now, why, at_once=True)
@@ -534,7 +566,7 @@ class Adaptation:
         return self._cooling(now) | self._knows.barred
 
     def _cooling(self, now: float) -> dict[str, str]:
-        cooling = {name: t.why for name, t in self._knows.troubles.items() if now < t.until < math.inf}
+        cooling = {name: one.why for name, one in self.cooling(now).items()}
         return cooling | dict.fromkeys(self._knows.hanging, f"{self._hangs}, and its function still runs")
 
     @property
@@ -546,7 +578,7 @@ class Adaptation:
         cool_down = self._settings.cool_down
         if before is not None:
             cool_down = min(before.cool_down * COOL_DOWN_GROWTH, self._settings.cool_down_max)
-        self._knows.troubles[profile] = _Trouble(now + cool_down, cool_down, why)
+        self._knows.troubles[profile] = CoolDown(now + cool_down, cool_down, why)
 
     def _raise(self, alarm: Alarm) -> list[Action]:
         before, self._alarm = self._alarm, alarm

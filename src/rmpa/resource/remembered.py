@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.requirement_text import EXPIRES, parse_requirement
+from rmpa.resource.adaptation import CoolDown
+from rmpa.resource.requirement_text import parse_requirement
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -30,6 +31,7 @@ CHOSEN: Final = (PROFILE, "chosen")
 """The profile that was chosen by hand, or empty."""
 LAST: Final = (PROFILE, "last")
 """The profile that ran last."""
+COOL_DOWN: Final = "cool_down"
 CONTEXT: Final = ("context", "chosen")
 """The context that was chosen by hand, or empty."""
 _SECOND: Final = 1_000_000_000
@@ -64,13 +66,40 @@ class Asked(msgspec.Struct, frozen=True, kw_only=True):
         Raises:
             ConfigError: It asks for what the resource has no longer.
         """
-        values = [(key, text) for key, text in self.values if key != EXPIRES]
-        found = parse_requirement(self.client, values, attributes, resource, now)
-        if self.expires_ns is None:
-            return found
+        found = parse_requirement(self.client, list(self.values), attributes, resource, now)
+        if self.expires_ns is None or found.expires is None:
+            return replace(found, expires=None)
         if self.expires_ns <= now_ns:
             return None
-        return replace(found, expires=now + (self.expires_ns - now_ns) / _SECOND)
+        # A clock that was set back meanwhile does not make it longer than was asked.
+        return replace(found, expires=min(found.expires, now + (self.expires_ns - now_ns) / _SECOND))
+
+
+class Cooling(msgspec.Struct, frozen=True, kw_only=True):
+    """A profile that is left out, for it failed or disappointed.
+
+    Attributes:
+        until_ns: By the wall clock, Unix nanoseconds.
+        cool_down: Seconds for which it was left out; the next time it is longer.
+        why: What was wrong.
+    """
+
+    until_ns: int
+    cool_down: float
+    why: str = ""
+
+    def serialize(self) -> str:
+        """As JSON."""
+        return msgspec.json.encode(self).decode()
+
+    def left(self, now: float, now_ns: int) -> CoolDown | None:
+        """The same by the monotonic clock; ``None`` if it is over.
+
+        Where the wall clock was set back meanwhile it lasts as long as the whole cool-down; where it was set forward
+        it is over early, and the profile is only tried sooner.
+        """
+        left = min((self.until_ns - now_ns) / _SECOND, self.cool_down)
+        return CoolDown(now + left, self.cool_down, self.why) if left > 0 else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +112,7 @@ class Remembered:
         last: The profile that ran last, or empty.
         context: The context chosen by hand, or empty.
         asked: By clients that may come back.
+        cooling: Profiles that are left out, by name.
         lost: What no longer fits, each ready to read.
     """
 
@@ -91,6 +121,7 @@ class Remembered:
     last: str = ""
     context: str = ""
     asked: Sequence[Asked] = ()
+    cooling: Mapping[str, Cooling] = field(default_factory=dict, hash=False)
     lost: Sequence[str] = ()
 
 
@@ -104,6 +135,7 @@ def recall(rows: Mapping[Key, str], resource: Resource, now_ns: int) -> Remember
     """
     parameters: dict[str, ParameterValue] = {}
     asked: list[Asked] = []
+    cooling: dict[str, Cooling] = {}
     lost: list[str] = []
     chosen = {LAST: "", CHOSEN: "", CONTEXT: ""}
     attributes = resource.attributes
@@ -115,11 +147,13 @@ def recall(rows: Mapping[Key, str], resource: Resource, now_ns: int) -> Remember
                 one = msgspec.json.decode(text, type=Asked)
                 if one.requirement(attributes, resource.name, 0.0, now_ns) is not None:
                     asked.append(one)
+            elif kind == COOL_DOWN:
+                cooling[name] = _cooling(resource, name, text)
             elif (kind, name) in chosen:
                 chosen[kind, name] = _chosen(kind, text, resource)
         except (ConfigError, msgspec.DecodeError, RecursionError) as error:
             lost.append(f"{kind} {name}: {error}")
-    return Remembered(parameters, chosen[CHOSEN], chosen[LAST], chosen[CONTEXT], tuple(asked), tuple(lost))
+    return Remembered(parameters, chosen[CHOSEN], chosen[LAST], chosen[CONTEXT], tuple(asked), cooling, tuple(lost))
 
 
 def _parameter(resource: Resource, name: str, text: str) -> ParameterValue:
@@ -128,6 +162,12 @@ def _parameter(resource: Resource, name: str, text: str) -> ParameterValue:
     value = msgspec.json.decode(text, type=bool | int | float | str)
     # JSON has one kind of number: 1.0 may come back as 1, which ``check`` takes for a number with a point.
     return resource.parameters[name].check(value)
+
+
+def _cooling(resource: Resource, name: str, text: str) -> Cooling:
+    if name not in resource.profiles:
+        raise ConfigError(f"profile {name}", "it is declared no longer")
+    return msgspec.json.decode(text, type=Cooling)
 
 
 def _chosen(kind: str, text: str, resource: Resource) -> str:

@@ -158,10 +158,8 @@ async def test_nothing_leaves_unless_the_resource_is_active(core: RosCore, caplo
     modes: list[str] = []
     member = Member(loud.resource, core.uri, settings=AdaptationSettings(dwell=0.0))
     async with Node("ear", master_uri=core.uri) as node, asyncio.timeout(40):
-        for name, heard in (("words", words), ("mode", modes)):
-            await node.subscribe(
-                f"/loud/{name}", "std_msgs/String", lambda m, heard=heard: heard.append(m.message.data)
-            )
+        await node.subscribe("/loud/words", "std_msgs/String", lambda m: words.append(m.message.data))
+        await node.subscribe("/loud/mode", "std_msgs/String", lambda m: modes.append(m.message.data))
         await member.runtime.start()
         while not (member.runtime._publishers["words"].subscribers and member.adapter.loop.profile == "plain"):
             await asyncio.sleep(0.01)

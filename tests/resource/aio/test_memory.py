@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -116,6 +117,38 @@ async def test_a_latched_request_that_has_expired_does_not_come_again(core: RosC
         await asyncio.sleep(0.5)
         assert not any(seen)
     await member.close()
+
+
+async def test_a_profile_that_failed_is_not_tried_at_once_because_of_a_restart(core: RosCore, tmp_path: Path) -> None:
+    def broken() -> Resource:
+        one = Resource("sonar", role="sensing")
+        one.attribute("noise", better="min", unit="m")
+        one.profile(offers={"noise": 0.01}, name="fine")(fine)
+        one.profile(offers={"noise": 0.1}, cost=1, name="coarse")(lambda: None)
+        one.adaptation(window="100 ms", cool_down="60 s")
+        return one
+
+    def fine() -> None:
+        tried.append("fine")
+        raise OSError("no bus")
+
+    tried: list[str] = []
+    path = tmp_path / "sonar.sqlite"
+    first = await started(core, path, broken())
+    await until(lambda: first.adapter.loop.profile == "coarse")
+    (before,) = first.adapter.cooling(time.time_ns()).values()
+    await first.close()
+    again = await started(core, path, broken())
+    await until(lambda: again.adapter.loop.profile == "coarse")
+    (after,) = again.adapter.cooling(time.time_ns()).values()
+    assert after.until_ns == pytest.approx(before.until_ns, abs=2e9)
+    assert (after.cool_down, after.why) == (60.0, "OSError: no bus")
+    assert tried == ["fine"]
+    # Somebody who has mended it need not wait.
+    again.adapter.pin("fine")
+    await until(lambda: len(tried) == 2)
+    await until(lambda: again.adapter.loop.profile == "coarse")
+    await again.close()
 
 
 async def test_a_store_that_cannot_be_is_said_and_the_resource_runs(core: RosCore, tmp_path: Path) -> None:

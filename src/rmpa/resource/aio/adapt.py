@@ -33,7 +33,7 @@ from rmpa.resource.aio.runtime import RuntimePart
 from rmpa.resource.decision import Decider, wanted
 from rmpa.resource.observed import Missing, Observed
 from rmpa.resource.quality import ObservedQuality, TopicQuality
-from rmpa.resource.remembered import Asked, Remembered
+from rmpa.resource.remembered import Asked, Cooling, Remembered
 from rmpa.resource.requirement_text import parse_requirement
 from rmpa.resource.requirements import Requirement
 from rmpa.ros.diagnostic_array import ARRAY_TYPE, Level, Status, frame_array
@@ -151,7 +151,7 @@ class Adapter(RuntimePart):
         self._asking = await node.subscribe(f"{node.name}/requirements", ARRAY_TYPE, self._asked)
         await node.subscribe(f"{node.name}/observed", ARRAY_TYPE, self._told_of)
         self._bar()
-        self._act(self.loop.pin(self.chosen, now) if self.chosen else self.loop.start(now))
+        self._act(self.loop.pin(self.chosen, now, anew=False) if self.chosen else self.loop.start(now))
         self._respond()
         self._next_window(now)
         self._later("clients", _LOOK, self._look_at_clients)
@@ -315,7 +315,16 @@ class Adapter(RuntimePart):
             self._stamps[asked.client] = asked.stamp
             if asked.stamp and requirement.expires is not None:
                 self._expiries[asked.client, asked.stamp] = requirement.expires
-        self.loop.remember(found, self.recalled.last)
+        left = {name: one.left(now, now_ns) for name, one in self.recalled.cooling.items()}
+        self.loop.remember(found, self.recalled.last, {name: one for name, one in left.items() if one}, now)
+
+    def cooling(self, now_ns: int) -> dict[str, Cooling]:
+        """The profiles that are left out for a while, at a time of the wall clock."""
+        now = self._loop.time()
+        return {
+            name: Cooling(until_ns=now_ns + round((one.until - now) * 1e9), cool_down=one.cool_down, why=one.why)
+            for name, one in self.loop.cooling(now).items()
+        }
 
     def shift(self, context: str, bounds: Mapping[str, Bound], bars: Mapping[str, str]) -> None:
         """A context begins: what it requires counts above the clients', and some profiles may not run in it."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import msgspec
 
 from rmpa.resource.adaptation import Action, AlarmKind, Apply, Clear, Raise, Reacted
 from rmpa.resource.aio.runtime import RuntimePart
-from rmpa.resource.remembered import CHOSEN, CONTEXT, LAST, PARAMETER, REQUIREMENT, Asked, recall
+from rmpa.resource.remembered import CHOSEN, CONTEXT, COOL_DOWN, LAST, PARAMETER, REQUIREMENT, Asked, Cooling, recall
 from rmpa.ros.diagnostic_array import Level
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _SECOND = 1_000_000_000
+_Row = TypeVar("_Row", Asked, Cooling)
 
 
 class Memory(RuntimePart):
@@ -112,7 +113,8 @@ class Memory(RuntimePart):
 
     def _asked(self) -> None:
         """Something that was asked, or chosen by hand, may be another."""
-        asked = {one.client: one for one in self._adapter.asked(time.time_ns())}
+        now_ns = time.time_ns()
+        asked = {one.client: one for one in self._adapter.asked(now_ns)}
         for client, one in asked.items():
             key = (REQUIREMENT, client)
             before = self._said.get(key)
@@ -120,11 +122,23 @@ class Memory(RuntimePart):
                 self._put(key, one.serialize())
         for kind, name in [key for key in self._said if key[0] == REQUIREMENT and key[1] not in asked]:
             self._put((kind, name), None)
+        self._cooling(now_ns)
         loop = self._adapter.loop
         self._put(CHOSEN, _json(loop.pinned))
         self._put(CONTEXT, _json(self._contexts.chosen))
         if loop.profile:
             self._put(LAST, _json(loop.profile))
+
+    def _cooling(self, now_ns: int) -> None:
+        """Profiles may be left out, or no longer."""
+        cooling = self._adapter.cooling(now_ns)
+        for name, one in cooling.items():
+            key = (COOL_DOWN, name)
+            known = _decoded(self._said.get(key), Cooling)
+            if known is None or not _alike(known, one):
+                self._put(key, one.serialize())
+        for key in [key for key in self._said if key[0] == COOL_DOWN and key[1] not in cooling]:
+            self._put(key, None)
 
     def _window(self, level: Level, message: str, measured: Mapping[str, Value]) -> None:
         text = _json({key: round(v, 9) if isinstance(v, float) else v for key, v in measured.items()})
@@ -154,17 +168,31 @@ def _json(value: object) -> str:
     return msgspec.json.encode(value).decode()
 
 
+def _decoded(text: str | None, kind: type[_Row]) -> _Row | None:
+    """What a row says, if there is one and it can be read."""
+    try:
+        return msgspec.json.decode(text, type=kind) if text is not None else None
+    except msgspec.DecodeError:
+        return None
+
+
 def _same(before: str, one: Asked) -> bool:
     """Whether a row says the same; its expiry by the wall clock is never the same to the nanosecond."""
-    try:
-        known = msgspec.json.decode(before, type=Asked)
-    except msgspec.DecodeError:
+    known = _decoded(before, Asked)
+    if known is None:
         return False
     if (known.values, known.mark, known.stamp) != (one.values, one.mark, one.stamp):
         return False
     if known.expires_ns is None or one.expires_ns is None:
         return known.expires_ns == one.expires_ns
     return abs(known.expires_ns - one.expires_ns) < _SECOND
+
+
+def _alike(known: Cooling, one: Cooling) -> bool:
+    """Whether a row says the same of a profile that is left out; it does not when the wall clock was set."""
+    if (known.cool_down, known.why) != (one.cool_down, one.why):
+        return False
+    return abs(known.until_ns - one.until_ns) < _SECOND
 
 
 def _details(alarm: Alarm) -> dict[str, object]:
