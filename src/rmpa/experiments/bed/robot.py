@@ -93,6 +93,7 @@ class Robot(abc.ABC):
         self._hosts = tuple(hosts)
         self._home = home
         self._shells = {name: self._shell(name) for name in hosts}
+        self._nodes: list[Process] = []
         self._off: set[str] = set()
         self._numbers: collections.Counter[tuple[str, str]] = collections.Counter()
 
@@ -155,6 +156,7 @@ class Robot(abc.ABC):
             argv = [compiled(program)]
         given = words({"name": name, **options})
         process = shell.start(*argv, *given, name=f"{client} {program}", commands=True)
+        self._nodes.append(process)
         if wait:
             process.wait_event("up", _UP)
         return process
@@ -199,7 +201,9 @@ class Robot(abc.ABC):
         return self._place.traffic(host)
 
     def close(self) -> None:
-        """End all that was started."""
+        """End all that was started; nodes are not asked, for some take their time."""
+        for process in self._nodes:
+            process.send(signal.SIGKILL)
         for shell in self._shells.values():
             shell.close()
 

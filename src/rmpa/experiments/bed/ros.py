@@ -210,7 +210,7 @@ def compiled(program: str, nodes: Path = NODES, headers: Path = NODES) -> Path:
 
 
 def words(options: Mapping[str, object]) -> list[str]:
-    """Options as nodes take them: ``--word value``, a bare ``--word`` for ``True``, nothing for ``False``, ``None``."""
+    """Options as nodes take them: ``--word value``, a bare ``--word`` for true, nothing for false and ``None``."""
     made: list[str] = []
     for key, value in options.items():
         if value is not False and value is not None:
