@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.experiments.bed import namespaces, ros
 from rmpa.experiments.bed.hosts import NetworkPlace
+from rmpa.experiments.bed.loopback import Loopback
 from rmpa.experiments.bed.namespaces import Lab
 from rmpa.experiments.bed.robot import Classic, Rmpa
 
@@ -94,4 +95,6 @@ class PlannedStage:
             yield robot
 
     def _place(self, stack: ExitStack, hosts: Sequence[str], link: str, *, bands: bool) -> Place:
+        if self._plan.bed == "loopback":
+            return Loopback(hosts)
         return NetworkPlace(stack.enter_context(Lab()), hosts, link=link, bands=bands)

@@ -14,12 +14,13 @@ import sys
 import threading
 import time
 from array import array
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
+T = TypeVar("T")
 HEAD: Final = struct.Struct("=IIQ")
 """The first bytes of a measured message: round, sequence from 0, and the ns at which it was due at its source."""
 LEAD: Final = 20_000_000
@@ -156,19 +157,19 @@ def serve_polls(rate: float, seed: int, poll: Callable[[], None], alive: Callabl
         turn += 1
 
 
-class Newest:
+class Newest(Generic[T]):
     """The newest command, until it is taken."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._value: object = None
+        self._value: T | None = None
 
-    def put(self, value: object) -> None:
+    def put(self, value: T) -> None:
         """Replace it."""
         with self._lock:
             self._value = value
 
-    def take(self) -> object:
+    def take(self) -> T | None:
         """Take it away; ``None`` if there is no new one."""
         with self._lock:
             value, self._value = self._value, None
