@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -11,6 +12,7 @@ from rmpa.resource.aio.member import Member, run_all
 from rmpa.resource.declare import Resource
 from rmpa.resource.lifecycle import Transition
 from rmpa.ros.aio.core import RosCore
+from rmpa.ros.aio.http_client import call_api
 from rmpa.ros.aio.node import Node
 
 if TYPE_CHECKING:
@@ -100,16 +102,47 @@ async def test_a_second_one_of_its_name_is_refused_and_the_first_lives_on(core: 
     await member.close()
 
 
-async def test_a_hook_that_raises_is_why_it_does_not_start(core: RosCore) -> None:
-    one = echo()
+async def test_it_is_configured_with_its_parameters_before_a_profile_is_applied(core: RosCore) -> None:
+    events: list[str] = []
+    one = Resource("arm", role="acting")
+    speed = one.parameter("speed", 1.0)
+
+    @one.on("configure")
+    def open_device() -> None:
+        time.sleep(0.05)  # a profile would have overtaken it
+        events.append(f"configure {speed.value}")
 
     @one.on("activate")
-    def activate() -> None:
+    async def activate() -> None:
+        events.append("activate")
+
+    @one.profile(offers={})
+    def only() -> None:
+        time.sleep(0.05)  # and the hook this one
+        events.append("profile")
+
+    async with Node("launch", master_uri=core.uri) as node:
+        await call_api(core.uri, "setParam", node.name, "/arm/speed", 2.5)
+    member = Member(one, core.uri)
+    await member.start()
+    await member.close()
+    assert events == ["configure 2.5", "profile", "activate"]
+
+
+@pytest.mark.parametrize("event", ["configure", "activate"])
+async def test_a_hook_that_raises_is_why_it_does_not_start(core: RosCore, event: str) -> None:
+    events: list[str] = []
+    one = echo()
+    one.on("finalize")(lambda: events.append("finalize"))
+
+    @one.on(event)
+    def hook() -> None:
         raise OSError("no such device")
 
-    with pytest.raises(PeerRefused, match="activate: OSError: no such device"):
+    with pytest.raises(PeerRefused, match=f"{event}: OSError: no such device"):
         await Member(one, core.uri).start()
     assert "/echo" not in core.state().nodes
+    assert events == ["finalize"]
 
 
 def test_a_resource_without_a_profile_is_refused() -> None:
@@ -167,7 +200,6 @@ async def test_nothing_leaves_unless_the_resource_is_active(core: RosCore, caplo
             await asyncio.sleep(0.01)
         for _ in range(3):
             await loud.thread()
-        await member._turn(Transition.CONFIGURE)
         member.adapter.pin("other")
         await member.adapter.settled()
         await member._turn(Transition.ACTIVATE)

@@ -22,7 +22,7 @@ from rmpa.ros.aio.http_client import call_api
 from rmpa.ros.aio.node import Node
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Awaitable, Callable
     from pathlib import Path
 
     from rmpa.resource.adaptation import AdaptationSettings
@@ -78,7 +78,8 @@ class Member:
         self.demands = Demands(self.runtime)
         self.adapter.on_window.append(self.demands.window)
         self.adapter.on_window.append(lambda _level, _message, _measured: self.tasks.judge())
-        parts = [self.configuration.before, self.tasks, self.adapter, self.contexts, self.configuration, self.demands]
+        first = [self.configuration.before, _Configuring(self._configure), self.tasks]
+        parts = [*first, self.adapter, self.contexts, self.configuration, self.demands]
         self.memory = Memory(self.runtime, self.adapter, self.contexts, store) if store is not None else None
         self.runtime.parts += [*parts, self.memory] if self.memory is not None else parts
         self._deactivating: asyncio.Task[None] | None = None
@@ -103,8 +104,8 @@ class Member:
             if self.memory is not None:
                 await self.memory.close()
             raise
+        await self.adapter.settled()  # the first profile's function and the hooks run one behind the other
         try:
-            await self._turn(Transition.CONFIGURE)
             await self._turn(Transition.ACTIVATE)
         except RmpaError:
             await self.close()
@@ -135,6 +136,13 @@ class Member:
         self.ended.set()
 
     # --- inside -------------------------------------------------------------------------------------------------
+
+    async def _configure(self) -> None:
+        try:
+            await self._turn(Transition.CONFIGURE)
+        except RmpaError:
+            await self._turn(Transition.FINALIZE)
+            raise
 
     async def _refuse_twin(self) -> None:
         """A second node of one name would end the first one."""
@@ -202,6 +210,20 @@ class Member:
         if self.life.state is not State.ACTIVE:
             tasks.append(f"it is {self.life.state}")
         return missing, tasks
+
+
+class _Configuring(RuntimePart):
+    """Configures the resource when its parameters have been taken up, before any profile is applied.
+
+    What opens the device is done before what sets it.
+    """
+
+    def __init__(self, configure: Callable[[], Awaitable[None]]) -> None:
+        self._configure = configure
+
+    async def start(self) -> None:
+        """Configure; what it raises ends the start."""
+        await self._configure()
 
 
 async def run_all(
