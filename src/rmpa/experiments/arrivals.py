@@ -32,10 +32,10 @@ def latencies(table: Table, **where: Value) -> list[float]:
     return [(came - due) / 1e6 for due, came in _pairs(table, "due_ns", "came_ns", where)]
 
 
-def source_periods(table: Table, rate: float, **where: Value) -> list[float]:
+def source_periods(table: Table, hz: float, **where: Value) -> list[float]:
     """Seconds between what the source sent: the part of the jitter that no way can take away."""
     late = sorted(_pairs(table, "sequence", "late_ns", where))
-    return [1 / rate + (b - a) / 1e9 for (_, a), (_, b) in itertools.pairwise(late)]
+    return [1 / hz + (b - a) / 1e9 for (_, a), (_, b) in itertools.pairwise(late)]
 
 
 def counting_from(table: Table, first: int) -> Table:
@@ -52,8 +52,11 @@ def lost(arrivals: Table, sent: Table, **where: Value) -> int:
 
 
 def counted(value: float | None, digits: int = 3, factor: float = 1.0) -> str:
-    """A figure for a table: so many significant digits; a dash for what is not known."""
-    return "-" if value is None else f"{value * factor:.{digits}g}"
+    """A figure for a table: so many significant digits, but all before the point; a dash for what is not known."""
+    if value is None:
+        return "-"
+    shown = value * factor
+    return f"{shown:,.0f}" if abs(shown) >= 10**digits else f"{shown:.{digits}g}"
 
 
 def _pairs(table: Table, first: str, second: str, where: dict[str, Value]) -> Iterator[tuple[int, int]]:

@@ -247,21 +247,26 @@ def _grids(found: Found) -> Iterator[Grid]:
 def _figures(found: Found) -> Iterator[Figure]:
     for kind, ladders in found.items():
         shown = [contender for contender in (RMPA, CLASSIC) if contender in ladders]
-        points = [_points(ladders[one], f"{one.label}, {kind.client}", one.system) for one in shown]
-        lines = [series for one in shown for series in _drawn(ladders[one], one)]
+        labels = {one: f"{one.label}, {kind.client}" for one in shown}
+        points = [_points(ladders[one], labels[one], one.system) for one in shown]
+        lines = [series for one in shown for series in _drawn(ladders[one], labels[one], one.system)]
         medians = [
-            Series(f"{one.label}, median", *_columns(ladders[one].medians), style="line", system=one.system)
-            for one in shown
+            Series(labels[one], *_columns(ladders[one].medians), style="line", system=one.system) for one in shown
         ]
         yield Figure(
             f"fig-11-{kind.client}-{kind.link}-{kind.batch}",
             f"Fig. 11. Latency by payload: {kind.client}, {_link(kind.link)}, batches of {kind.batch}",
             "Every message, with the line through the medians; then the medians, on axes that show small payloads.",
             (
-                Panel("every message", "payload, KB", "latency, ms", (*points, *lines)),
+                Panel(_straightness(ladders, shown), "payload, KB", "latency, ms", (*points, *lines)),
                 Panel("medians", "payload, KB", "latency, ms", tuple(medians), logx=True, logy=True),
             ),
         )
+
+
+def _straightness(ladders: Mapping[Contender, Ladder], shown: Sequence[Contender]) -> str:
+    lines = [(one.label, line) for one in shown if (line := ladders[one].line()) is not None]
+    return "every message" + "".join(f"; R² {label} {line.r2:.4f}" for label, line in lines)
 
 
 def _link(link: str) -> str:
@@ -273,12 +278,11 @@ def _points(ladder: Ladder, label: str, system: str) -> Series:
     return Series(label, [x for x, _ in pairs], [y for _, y in pairs], system=system)
 
 
-def _drawn(ladder: Ladder, contender: Contender) -> Iterator[Series]:
+def _drawn(ladder: Ladder, label: str, system: str) -> Iterator[Series]:
     line = ladder.line()
     if line is not None:
         ends = [min(ladder.medians) / _KB, max(ladder.medians) / _KB]
-        label = f"{contender.label}: R² = {line.r2:.4f}"
-        yield Series(label, ends, [line.at(x) for x in ends], style="line", system=contender.system)
+        yield Series(label, ends, [line.at(x) for x in ends], style="line", system=system)
 
 
 def _columns(medians: Mapping[int, float]) -> tuple[Sequence[float], Sequence[float]]:
