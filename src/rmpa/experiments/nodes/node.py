@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import ctypes
 import json
-import random
+import math
 import struct
 import sys
 import threading
@@ -30,6 +30,7 @@ _PAUSE: Final = 500_000_000
 _PATIENCE: Final = 10.0
 """Seconds of waiting for silence at the most."""
 _LOOK: Final = 0.02
+_PHASE: Final = "ms from a whole multiple of the period on CLOCK_MONOTONIC to each due moment; default: any"
 _PR_SET_TIMERSLACK: Final = 29
 _TIMER_ABSTIME: Final = 1
 
@@ -73,6 +74,7 @@ def source_options(description: str | None) -> argparse.ArgumentParser:
     made = parser(description)
     made.add_argument("--topic", default="/cmd")
     made.add_argument("--queue", type=int, default=100)
+    made.add_argument("--phase", type=float, default=None, help=_PHASE)
     return made
 
 
@@ -84,7 +86,6 @@ def velocity_options(description: str | None) -> argparse.ArgumentParser:
     made.add_argument("--queue", type=int, default=100)
     made.add_argument("--mode", choices=["event", "polled"], default="event")
     made.add_argument("--rate", type=float, default=10.0, help="of the polled mode, Hz")
-    made.add_argument("--seed", type=int, default=1, help="decides the polled mode's phase")
     return made
 
 
@@ -117,7 +118,22 @@ class Subscribers:
             say("connected", subscribers=count)
 
 
-def serve_rounds(publish: Callable[[bytearray], None], alive: Callable[[], bool]) -> None:
+def first_due(now: int, period: float, phase: float | None) -> int:
+    """When the first message of a round is due, in ns: after its lead, and at its phase.
+
+    Args:
+        now: The moment of the command, ns.
+        period: Between messages, ns.
+        phase: Milliseconds from a whole multiple of the period; ``None`` for any.
+    """
+    start = now + LEAD
+    if phase is None:
+        return start
+    behind = start - phase * 1e6
+    return start + int(math.ceil(behind / period) * period - behind)
+
+
+def serve_rounds(publish: Callable[[bytearray], None], phase: float | None, alive: Callable[[], bool]) -> None:
     """Send the rounds that are asked for, in this thread: ``ROUND SIZE RATE COUNT FILE``.
 
     COUNT messages of SIZE bytes at RATE Hz on an absolute schedule: one that leaves late does not move those behind
@@ -125,6 +141,7 @@ def serve_rounds(publish: Callable[[bytearray], None], alive: Callable[[], bool]
 
     Args:
         publish: Gets the data of each message, in a buffer that is used again.
+        phase: As of ``first_due``.
         alive: Whether to go on.
     """
     sleep_sharply()
@@ -132,7 +149,7 @@ def serve_rounds(publish: Callable[[bytearray], None], alive: Callable[[], bool]
         number, size, rate, count, file = int(words[0]), int(words[1]), float(words[2]), int(words[3]), words[4]
         data = bytearray(b"\x07" * max(size, HEAD.size))
         late = array("Q", bytes(8 * count))
-        start = time.monotonic_ns() + LEAD
+        start = first_due(time.monotonic_ns(), 1e9 / rate, phase)
         sent = 0
         while sent < count and alive():
             due = start + int(1e9 / rate * sent)
@@ -145,14 +162,16 @@ def serve_rounds(publish: Callable[[bytearray], None], alive: Callable[[], bool]
         say("sent", round=number, count=sent, start_ns=start)
 
 
-def serve_polls(rate: float, seed: int, poll: Callable[[], None], alive: Callable[[], bool]) -> None:
-    """Call ``poll`` at ``rate`` Hz on an absolute schedule whose phase ``seed`` decides, in this thread."""
+def serve_polls(rate: float, poll: Callable[[], None], alive: Callable[[], bool]) -> None:
+    """Call ``poll`` at whole multiples of its period on CLOCK_MONOTONIC, in this thread.
+
+    A source can so be given a phase to it.
+    """
     sleep_sharply()
     period = 1e9 / rate
-    start = time.monotonic_ns() + int(random.Random(seed).uniform(0.0, period))  # noqa: S311 - a phase, no secret
-    turn = 0
+    turn = int(time.monotonic_ns() / period) + 1
     while alive():
-        sleep_until(start + int(period * turn))
+        sleep_until(int(period * turn))
         poll()
         turn += 1
 

@@ -30,7 +30,9 @@ def main() -> None:
             loop.call_soon_threadsafe(publisher.publish_raw, framed(data))
 
         # Timers of the loop are late by a millisecond; a thread's sleep is not.
-        threading.Thread(target=serve_rounds, args=(publish, lambda: not ended.is_set()), daemon=True).start()
+        threading.Thread(
+            target=serve_rounds, args=(publish, args.phase, lambda: not ended.is_set()), daemon=True
+        ).start()
         watching = asyncio.create_task(watch(publisher))
         say("up")
         await ended.wait()

@@ -40,7 +40,7 @@ def main() -> None:
 
         await node.subscribe(args.cmd, KIND, take, nodelay=args.nodelay)
         if args.mode == "polled":
-            polling = (args.rate, args.seed, poll, lambda: not ended.is_set())
+            polling = (args.rate, poll, lambda: not ended.is_set())
             threading.Thread(target=serve_polls, args=polling, daemon=True).start()
         watching = asyncio.create_task(watch(publisher))
         say("up")

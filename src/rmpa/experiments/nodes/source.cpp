@@ -1,7 +1,8 @@
 // Publish on an absolute schedule (roscpp): a message that leaves late does not move those behind it.
 // Options: --topic --queue; --phase: ms from a whole multiple of the period on CLOCK_MONOTONIC to each moment at which
-// a message is due (default: wherever that falls). Reads "ROUND SIZE RATE COUNT FILE" lines: COUNT messages of SIZE bytes (16 at the least) at
-// RATE Hz; each begins with the round (4 bytes), its sequence from 0 (4) and the ns at which it was due (8).
+// a message is due (default: wherever that falls).
+// Reads "ROUND SIZE RATE COUNT FILE" lines: COUNT messages of SIZE bytes (16 at the least) at RATE Hz; each begins with
+// the round (4 bytes), its sequence from 0 (4) and the ns at which it was due (8).
 // FILE gets for each message how many ns after that it was given to roscpp (8 bytes).
 // Events: up; connected with the number of subscribers; sent with the round, the count and when the first was due.
 #include <cmath>

@@ -26,7 +26,9 @@ def main() -> None:
 
     say("up")
     # Not in the main thread: that one hears of the end, the other waits for commands.
-    threading.Thread(target=serve_rounds, args=(publish, lambda: not rospy.is_shutdown()), daemon=True).start()
+    threading.Thread(
+        target=serve_rounds, args=(publish, args.phase, lambda: not rospy.is_shutdown()), daemon=True
+    ).start()
     rospy.spin()
 
 

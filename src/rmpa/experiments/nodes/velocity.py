@@ -27,7 +27,7 @@ def main() -> None:
 
     say("up")
     if args.mode == "polled":
-        serve_polls(args.rate, args.seed, poll, lambda: not rospy.is_shutdown())
+        serve_polls(args.rate, poll, lambda: not rospy.is_shutdown())
     else:
         rospy.spin()
 
