@@ -34,6 +34,7 @@ COMMANDS = {
     "why": ("rmpa.cli.why", "Say why a topic of a peer does not arrive, and what to do."),
     "doctor": ("rmpa.cli.doctor", "Check this machine: network, clock, rights, ROS environment."),
     "multicast": ("rmpa.cli.multicast", "Send and receive multicast packets by hand."),
+    "experiment": ("rmpa.cli.experiment", "Measure RMPA and classic ROS side by side: the paper's evaluation."),
     "reload": ("rmpa.cli.reload", "Let the agent read its settings again."),
     "completion": ("rmpa.cli.completion", "Print the script that completes rmpa's commands in a shell."),
 }
