@@ -52,6 +52,9 @@ def sonar() -> Resource:
     one.output("ranges", "sensor_msgs/Range", deadline="100 ms")
     one.parameter("gain", 1.0, low=0.5, unit="dB", description="of the amplifier")
     one.parameter("beam", "wide", choices=("wide", "narrow"))
+    pace = one.parameter("pace", 2.0, low=0.5, high=9)
+    one.task(rate=pace, name="measure")(lambda: None)
+    one.task(rate="0.1 Hz", name="clean")(lambda: None)
     one.attribute("accuracy", better="min", unit="m")
     one.profile(offers={"rate": 10, "accuracy": "5 cm"}, cost=1, name="slow", description="cheap")(lambda: None)
     one.profile(offers={"rate": 40, "accuracy": "1 cm"}, cost=3, name="fast")(lambda: None)
@@ -138,6 +141,7 @@ def test_resources_here_and_at_peers(rmpa: Rmpa, running: Member, remote: object
         ["base:/sonar", "active", "sensing"],
     ]
     assert "\x1b" not in rmpa("resource", "list")[1]
+    assert "2 modules have a resource /sonar: what is asked" in rmpa("resource", "list")[2]
     listed = as_json(rmpa, "resource", "list")
     assert [(one["name"], one["peer"], one["profile"], one["context"]) for one in listed] == [
         ("/sonar", None, "slow", ""), ("/lidar", "base", "fast", "away"), ("/sonar", "base", "fast", "away"),
@@ -160,23 +164,27 @@ def test_all_of_a_resource(rmpa: Rmpa, running: Member) -> None:
         "State: active",
         "Profile: slow",
         "Health: OK: profile slow",
-        "/sonar/ranges sensor_msgs/Range deadline 0.1",
+        "/sonar/ranges sensor_msgs/Range deadline 0.1 s",
         "gain 1 dB 0.5 .. of the amplifier",
         "beam wide wide | narrow",
         "accuracy not measured min performance",
         "slow 1 rate 10 Hz, accuracy 0.05 m cheap",
         "docked /battery.charging and ~gain > 3",
         "away by hand",
+        "measure 2 Hz (parameter pace)",
+        "clean 0.1 Hz",
     ):
         assert line in lines, out
     about = as_json(rmpa, "resource", "info", "sonar")
-    assert about["parameters"] == {"gain": 1.0, "beam": "wide", "profile": "", "context": ""}
+    assert about["parameters"] == {"gain": 1.0, "beam": "wide", "pace": 2.0, "profile": "", "context": ""}
     assert about["health"]["values"]["profile"] == "slow"
     assert about["descriptor"]["profiles"][1]["name"] == "fast"
 
 
 def test_a_profile_by_hand(rmpa: Rmpa, running: Member, remote: list[dict[str, Any]]) -> None:
+    assert as_json(rmpa, "profile", "set", "sonar", "fast") == {"resource": "/sonar", "peer": None, "chosen": "fast"}
     assert rmpa("profile", "set", "sonar", "fast") == (0, "", "")
+    assert ["fast", "runs,", "by"] in rows(rmpa, "profile", "explain", "sonar")
     assert running.adapter.loop.profile == "fast"
     assert rows(rmpa, "profile", "list", "sonar")[2] == ["fast", "runs,", "by"]
     code, out, err = rmpa("profile", "set", "sonar", "broken")
@@ -236,6 +244,7 @@ def test_a_decision_is_explained(rmpa: Rmpa, core: RosCore, background: Backgrou
 
 def test_a_context_by_hand(rmpa: Rmpa, running: Member) -> None:
     assert rmpa("context", "get") == (0, "\n", "")
+    assert as_json(rmpa, "context", "set", "sonar", "away")["chosen"] == "away"
     assert rmpa("context", "set", "sonar", "away") == (0, "", "")
     assert running.adapter.loop.profile == "fast"
     assert rmpa("context", "get", "sonar") == (0, "away\n", "")

@@ -15,7 +15,7 @@ from rmpa.bridge.proxy_names import proxied_node
 from rmpa.cli.master import TopicName, choose_master, read_graph
 from rmpa.cli.options import agent_option, json_option, master_option
 from rmpa.cli.output import Column, coloured, print_json, print_line, print_table, printable
-from rmpa.cli.resources_seen import look_around
+from rmpa.cli.resources_seen import look_around, run_around
 from rmpa.cli.stream import run_stream, with_node
 from rmpa.core.errors import RmpaError
 from rmpa.resource.descriptor import TOPIC
@@ -54,7 +54,7 @@ def list_(everything: bool, as_json: bool, agent: str | None, master: str | None
         colours = [_COLOURS.get(health["level"], "") for _, health in found]
         print_table((Column("RESOURCE"), Column("LEVEL"), Column("MESSAGE")), rows, colours=colours)
 
-    asyncio.run(look_around(choose_master(master, agent, os.environ), body))
+    run_around(master, agent, body)
 
 
 def _health(message: Any) -> dict[str, Any]:

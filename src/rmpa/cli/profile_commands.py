@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
-import os
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from rmpa.cli.master import choose_master
+from rmpa.cli.choice_commands import Choice, whose
 from rmpa.cli.options import agent_option, json_option, master_option
 from rmpa.cli.output import Column, print_json, print_table, printable
-from rmpa.cli.resources_seen import decision_of, known_name, look_around
-from rmpa.core.errors import ConfigError, RmpaError
+from rmpa.cli.resources_seen import decision_of, run_around
+from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
     from rmpa.cli.resources_seen import Room, Seen
@@ -55,8 +53,7 @@ def list_(resource: str | None, as_json: bool, agent: str | None, master: str | 
         if as_json:
             print_json(
                 {
-                    "resource": one.path,
-                    "peer": one.peer,
+                    **whose(one),
                     "profile": runs,
                     "chosen": chosen,
                     "profiles": one.descriptor.profiles,
@@ -81,53 +78,24 @@ def list_(resource: str | None, as_json: bool, agent: str | None, master: str | 
         columns = (Column("PROFILE"), Column("STATE"), Column("OFFERS"), Column("COST", right=True), Column("NOTES"))
         print_table(columns, rows, colours=colours)
 
-    asyncio.run(look_around(choose_master(master, agent, os.environ), body))
+    run_around(master, agent, body)
 
 
-@click.command(epilog="\b\nExamples:\n  rmpa profile get /sonar\n")
-@click.argument("resource", required=False)
-@json_option
-@agent_option
-@master_option
-def get(resource: str | None, as_json: bool, agent: str | None, master: str | None) -> None:
-    """Print the profile of a RESOURCE that runs."""
-
-    async def body(room: Room) -> None:
-        one = room.pick(resource)
-        decision = await _decision(room, one)
-        if as_json:
-            said = {key: decision.get(key, "") for key in ("profile", "applying", "chosen")}
-            print_json({"resource": one.path, "peer": one.peer, **said})
-        else:
-            click.echo(printable(str(decision.get("profile", ""))))
-
-    asyncio.run(look_around(choose_master(master, agent, os.environ), body))
+async def _present(room: Room, one: Seen) -> dict[str, Any]:
+    decision = await _decision(room, one)
+    return {key: decision.get(key, "") for key in ("profile", "applying", "chosen")}
 
 
-@click.command(
-    "set",
-    epilog="\b\nExamples:\n  rmpa profile set /sonar fine\n  rmpa profile set base:/sonar --auto\n",
-)
-@click.argument("resource")
-@click.argument("profile", required=False)
-@click.option("--auto", is_flag=True, help="Let the resource decide again.")
-@agent_option
-@master_option
-def set_(resource: str, profile: str | None, auto: bool, agent: str | None, master: str | None) -> None:
+_CHOICE = Choice("profile", lambda descriptor: (each.name for each in descriptor.profiles), _present)
+get = _CHOICE.get_command("Print the profile of a RESOURCE that runs.")
+set_ = _CHOICE.set_command(
     """Choose the PROFILE of a RESOURCE by hand; returns when it runs.
 
     It runs whatever clients ask, until --auto. If it cannot be applied, what was chosen before stays.
-    """
-    if (profile is None) != auto:
-        raise ConfigError("PROFILE", "say which one, or --auto", "one of both")
-
-    async def body(room: Room) -> None:
-        one = room.pick(resource)
-        if profile is not None:
-            known_name("profile", profile, (each.name for each in one.descriptor.profiles))
-        await room.configure(one, {"profile": profile or ""})
-
-    asyncio.run(look_around(choose_master(master, agent, os.environ), body))
+    """,
+    "Let the resource decide again.",
+    "fine",
+)
 
 
 @click.command(
@@ -154,11 +122,11 @@ def explain(resource: str | None, as_json: bool, agent: str | None, master: str 
         one = room.pick(resource)
         decision = await _decision(room, one)
         if as_json:
-            print_json({"resource": one.path, "peer": one.peer, **decision})
+            print_json({**whose(one), **decision})
         else:
             _print_explained(one, decision)
 
-    asyncio.run(look_around(choose_master(master, agent, os.environ), body))
+    run_around(master, agent, body)
 
 
 def _print_explained(one: Seen, decision: dict[str, Any]) -> None:
@@ -169,7 +137,7 @@ def _print_explained(one: Seen, decision: dict[str, Any]) -> None:
     for conflict in decision.get("conflicts", ()):
         click.echo(printable(f"conflict: {conflict}"))
     if decision.get("alarm"):
-        click.echo(printable(f"alarm: {decision['alarm']}"))
+        click.echo(printable(f"alarm: {str(decision['alarm']).replace('_', '-')}"))
     if decision.get("reaction") is not None:
         click.echo(f"last reconfiguration took {decision['reaction']:.3g} s")
     click.echo()
@@ -177,7 +145,7 @@ def _print_explained(one: Seen, decision: dict[str, Any]) -> None:
     rows, colours = [], []
     for score in decision.get("scores", ()):
         name = str(score.get("profile"))
-        head = (name, _verdict(score, runs), f"{score.get('distance', 0.0):.4g}")
+        head = (name, _verdict(score, runs, chosen), f"{score.get('distance', 0.0):.4g}")
         terms: list[dict[str, Any]] = score.get("terms") or [{}]
         for term in terms:
             attribute = str(term.get("attribute", "-"))
@@ -206,7 +174,9 @@ def _print_explained(one: Seen, decision: dict[str, Any]) -> None:
     print_table(columns, rows, colours=colours)
 
 
-def _verdict(score: dict[str, Any], runs: str) -> str:
+def _verdict(score: dict[str, Any], runs: str, chosen: str) -> str:
+    if score.get("profile") == runs == chosen:
+        return f"runs, by hand, though {score['excluded']}" if score.get("excluded") else "runs, by hand"
     if score.get("excluded"):
         return f"left out: {score['excluded']}"
     if score.get("profile") == runs:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import os
+from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from rmpa.cli.master import choose_master
 from rmpa.cli.options import agent_option, json_option, master_option
 from rmpa.cli.output import Column, print_json, print_table, printable, warn
 from rmpa.cli.profile_commands import offers, shown
-from rmpa.cli.resources_seen import look_around
+from rmpa.cli.resources_seen import run_around
 from rmpa.resource.attributes import MEASURED
 from rmpa.ros.diagnostic_array import ARRAY_TYPE, Level
 
@@ -20,8 +19,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from rmpa.cli.resources_seen import Room, Seen
-    from rmpa.resource.descriptor import Descriptor, ParameterDescriptor, TopicDescriptor
+    from rmpa.resource.descriptor import Descriptor, ParameterDescriptor, TaskDescriptor, TopicDescriptor
 
+_TIMES: Final = frozenset({"deadline", "lifespan", "liveliness_lease"})
 _COLOURS: Final = {"active": "green", "inactive": "yellow", "unconfigured": "yellow", "finalized": "red"}
 
 
@@ -33,6 +33,10 @@ def list_(as_json: bool, agent: str | None, master: str | None) -> None:
     """List the resources of this module, and those of peers with the peers' names."""
 
     async def body(room: Room) -> None:
+        for path, count in Counter(one.path for one in room.seen).items():
+            if count > 1:
+                text = "what is asked of that name is heard by all of them; docs/names.md tells them apart"
+                warn(f"{count} modules have a resource {printable(path)}: {text}")
         states, profiles, contexts = await room.texts(room.seen, "state", "profile", "context")
         if as_json:
             print_json(
@@ -70,7 +74,7 @@ def list_(as_json: bool, agent: str | None, master: str | None) -> None:
         colours = [_COLOURS.get(states.get(one, ""), "") for one in room.seen]
         print_table(tuple(map(Column, titles)), rows, colours=colours)
 
-    asyncio.run(look_around(choose_master(master, agent, os.environ), body))
+    run_around(master, agent, body)
 
 
 @click.command(epilog="\b\nExamples:\n  rmpa resource info /sonar\n  rmpa resource info base:/arm --json\n")
@@ -107,7 +111,7 @@ def info(resource: str | None, as_json: bool, agent: str | None, master: str | N
         else:
             _print_info(one, about)
 
-    asyncio.run(look_around(choose_master(master, agent, os.environ), body))
+    run_around(master, agent, body)
 
 
 def _statuses(message: Any) -> list[dict[str, Any]]:
@@ -152,7 +156,7 @@ def _print_info(one: Seen, about: dict[str, Any]) -> None:
         ((p.name, f"{p.cost:g}", offers(said, p.offers) or "-", p.description) for p in said.profiles),
     )
     _table(("CONTEXT", "WHEN"), ((c.name, c.when or "by hand") for c in said.contexts))
-    _table(("TASK", "RUNS"), ((t.name, f"{t.rate:g} Hz" if t.rate else f"on {t.on}") for t in said.tasks))
+    _table(("TASK", "RUNS"), ((t.name, _runs(t, about["parameters"])) for t in said.tasks))
     _table(
         ("CLIENT", "IS TOLD", "ASKS"),
         (
@@ -160,6 +164,13 @@ def _print_info(one: Seen, about: dict[str, Any]) -> None:
             for c in about["clients"]
         ),
     )
+
+
+def _runs(task: TaskDescriptor, values: dict[str, Any]) -> str:
+    """When a task runs."""
+    if task.follows in values:
+        return f"{values[task.follows]:g} Hz (parameter {task.follows})"
+    return f"{task.rate:g} Hz" if task.rate else f"on {task.on}"
 
 
 def _parameter(one: ParameterDescriptor, values: dict[str, Any]) -> Sequence[str]:
@@ -182,8 +193,13 @@ def _qualities(said: Descriptor, values: dict[str, str]) -> list[Sequence[str]]:
 def _topics(title: str, topics: Sequence[TopicDescriptor]) -> None:
     _table(
         (title, "TYPE", "CONTRACT"),
-        ((t.topic, t.type, ", ".join(f"{key} {value}" for key, value in t.contract.items()) or "-") for t in topics),
+        ((t.topic, t.type, ", ".join(_term(key, value) for key, value in t.contract.items()) or "-") for t in topics),
     )
+
+
+def _term(key: str, value: object) -> str:
+    """A term of a contract; its times are seconds."""
+    return f"{key} {value:g} s" if isinstance(value, float) and key in _TIMES else f"{key} {value}"
 
 
 def _line(title: str, text: str) -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
 from rmpa.bridge.proxy_names import proxied_node
-from rmpa.cli.master import TopicName, read_graph, read_topic
+from rmpa.cli.master import TopicName, choose_master, read_graph, read_topic
 from rmpa.cli.output import printable
 from rmpa.cli.service_ends import require_service
 from rmpa.cli.stream import with_node
@@ -148,6 +149,11 @@ def _only(found: Sequence[Seen], remedy: str) -> Seen:
     if not found:
         raise RmpaError("there is no resource; `rmpa run` runs one, `rmpa resource list` shows all")
     raise RmpaError(f"there are {', '.join(printable(str(each)) for each in found)}; {remedy}")
+
+
+def run_around(master: str | None, agent: str | None, body: Callable[[Room], Awaitable[None]]) -> None:
+    """Find all resources of the graph that is meant, as ``choose_master`` has it, and let ``body`` deal with them."""
+    asyncio.run(look_around(choose_master(master, agent, os.environ), body))
 
 
 async def look_around(master: Master, body: Callable[[Room], Awaitable[None]]) -> None:

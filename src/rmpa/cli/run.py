@@ -131,7 +131,8 @@ def load(path: Path) -> list[Resource]:
     try:
         names = runpy.run_path(str(path), run_name="__rmpa__")
     except RmpaError as error:
-        raise ConfigError(str(path), str(error), "", path, _line_in(path, error)) from error
+        told = error if isinstance(error, ConfigError) else ConfigError("the file", str(error))
+        raise ConfigError(told.source, told.problem, told.remedy, path, _line_in(path, error)) from error
     except (Exception, SystemExit) as error:
         what = f"{type(error).__name__}: {error}"
         raise ConfigError("the file", f"it cannot be run: {what}", "", path, _line_in(path, error)) from error

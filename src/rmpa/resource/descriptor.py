@@ -86,11 +86,12 @@ class ContextDescriptor(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TaskDescriptor(msgspec.Struct, frozen=True, kw_only=True):
-    """A task: periodic at a rate in Hz, or on an input."""
+    """A task: periodic at a rate in Hz, which may follow a parameter, or on an input."""
 
     name: str
     rate: float | None = None
     on: str = ""
+    follows: str = ""
 
 
 class Descriptor(msgspec.Struct, frozen=True, kw_only=True):
@@ -193,7 +194,12 @@ def describe(resource: Resource, node: str) -> Descriptor:
             for c in resource.contexts.values()
         ),
         tasks=tuple(
-            TaskDescriptor(name=t.name, rate=t.rate, on=t.on.name if t.on is not None else "")
+            TaskDescriptor(
+                name=t.name,
+                rate=t.rate,
+                on=t.on.name if t.on is not None else "",
+                follows=t.follows.name if t.follows is not None else "",
+            )
             for t in resource.tasks.values()
         ),
     )

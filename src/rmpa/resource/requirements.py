@@ -81,16 +81,16 @@ def bound(
         return _words(attribute, exactly, where, weight=weight, hard=hard)
     if exactly is not None:
         at_least = at_most = exactly
-    if attribute.direction is Direction.MAX:
-        _check_side(at_least, at_most, exactly, where, "more is better", "at_least")
-        at_most = None
-    elif attribute.direction is Direction.MIN:
-        _check_side(at_most, at_least, exactly, where, "less is better", "at_most")
-        at_least = None
     low = -math.inf if at_least is None else _place(attribute, at_least, where)
     high = math.inf if at_most is None else _place(attribute, at_most, where)
     if low > high:
         raise ConfigError(where, f"at least {at_least} and at most {at_most}", "the bounds are the wrong way round")
+    if attribute.direction is Direction.MAX:
+        _check_side(at_least, at_most, exactly, where, "more is better", "at_least (>=)")
+        high = math.inf
+    elif attribute.direction is Direction.MIN:
+        _check_side(at_most, at_least, exactly, where, "less is better", "at_most (<=)")
+        low = -math.inf
     return Bound(low, high, weight=weight, hard=hard)
 
 
