@@ -125,10 +125,21 @@ GREETING_FORGET: Final = 20.0
 """An address of which nobody spoke for this long (four heartbeats) is greeted no more."""
 SPREAD_INTERVAL: Final = 0.5
 """News of found peers are gathered this long for those that hear no multicast; the first goes out at once."""
+GREETINGS_PER_SECOND: Final = 25.0
+"""Over all such addresses, beyond one for each: who is passed on may be invented."""
+WHISPERS_PER_SECOND: Final = 10.0
+"""Heartbeats by unicast to peers without a link, over all of them: each takes 0.2 ms, and of a roster full of
+invented peers each still gets one a minute."""
+ROSTER_EVICTIONS_PER_SECOND: Final = 10.0
+"""In a full roster, peers without a link that missed a heartbeat and give way to new ones."""
 BEACONS_PER_WAKE: Final = 64
 """Packets handled, 100 microseconds each with data between them, before the loop gets its turn again."""
 BEACONS_PER_SOURCE: Final = 200
 """Packets a second from one address; a host with twenty agents that all start at once stays below."""
+BEACONS_UNLINKED_PER_SECOND: Final = 200.0
+"""Beacons a second of peers that we have no link with, over all addresses, which can be forged: 5 % of a core."""
+BEACONS_UNLINKED_BURST: Final = 1000
+"""The same at once: a hundred peers that start together send 400 and answer each other."""
 BEACON_SOURCES_MAX: Final = 1024
 """Source addresses counted for that; the oldest is forgotten first."""
 BEACON_REPEATS: Final = 128
@@ -162,9 +173,9 @@ BACKOFF_FIRST: Final = 0.1
 """Before the second attempt to dial."""
 BACKOFF_MAX: Final = 2.0
 """Between attempts at the most: a peer that comes back is linked within this time."""
-DIAL_STRANGERS_RATE: Final = 20.0
+DIAL_STRANGERS_RATE: Final = 10.0
 """Dials a second to peers that were never linked, over all of them: beacons can be forged, and a dial that fails
-takes half a millisecond. Their back-off's cap grows with their number; up to 40 of them notice nothing."""
+takes half a millisecond. Their back-off's cap grows with their number; up to 20 of them notice nothing."""
 DIAL_STRANGERS_BURST: Final = 64
 """Such dials at once. One that ends in a link is not counted, so a network that starts up is not held up."""
 FRAME_HEADER_BYTES: Final = 24
@@ -601,6 +612,14 @@ STORE_EVENTS_MAX: Final = 2000
 """Alarms and changes of the profile in it."""
 STORE_DESCRIPTORS_MAX: Final = 20
 """Different descriptors of one resource in it: one more for each change of its file."""
+KNOWN_MAX: Final = 256
+"""Other resources whose descriptors a module keeps; the one that was not seen for longest gives way."""
+KNOWN_TEXT_MAX: Final = 16 * MIB
+"""Characters of all of them."""
+KNOWN_LOOK: Final = 10.0
+"""Seconds between looks which resources there are."""
+KNOWN_WRITE: Final = 60.0
+"""Seconds between writes of when a resource that is here was seen last, to spare flash memory."""
 STORE_BYTES_MAX: Final = 64 * MIB
 """Of the whole file, whatever happens."""
 STORE_INTERVAL: Final = 10.0

@@ -15,12 +15,12 @@ from rmpa.ros.diagnostic_array import Level
 from rmpa.ros.tcpros import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from rmpa.resource.aio.runtime import Runtime
     from rmpa.resource.attributes import Value
     from rmpa.resource.declare import Demand
-    from rmpa.ros.aio.topics import Received
+    from rmpa.ros.aio.topics import Received, Subscriber
 
 _log = logging.getLogger(__name__)
 
@@ -38,6 +38,10 @@ class Demands(RuntimePart):
         self._first: dict[str, str] = {}
         """By resource that something is heard from: its first output."""
         self._undo = contextlib.AsyncExitStack()
+        self.listening: dict[str, Subscriber] = {}
+        """By topic: the descriptors that are listened to here."""
+        self.on_descriptor: list[Callable[[str, Received], None]] = []
+        """Called with what such a resource says: its name, and the message."""
 
     async def start(self) -> None:
         """Ask."""
@@ -107,6 +111,8 @@ class Demands(RuntimePart):
         """Learn which of its outputs is the first: ``rate`` alone is that one's."""
 
         def heard(received: Received) -> None:
+            for hear in self.on_descriptor:
+                hear(name, received)
             try:
                 outputs = Descriptor.parse(str(received.message.data)).outputs
             except RmpaError as error:
@@ -115,7 +121,8 @@ class Demands(RuntimePart):
                 self._first[name] = outputs[0].name if outputs else ""
 
         await client.observe()
-        await self._runtime.node.subscribe(f"{name}/{TOPIC}", "std_msgs/String", heard)
+        topic = f"{name}/{TOPIC}"
+        self.listening[topic] = await self._runtime.node.subscribe(topic, "std_msgs/String", heard)
 
     async def _follow(self, demand: Demand, client: ResourceClient) -> None:
         said: tuple[Level, str] | None = None

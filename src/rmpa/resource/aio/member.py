@@ -12,6 +12,7 @@ from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource.aio.adapt import Adapter
 from rmpa.resource.aio.contexts import Contexts
 from rmpa.resource.aio.demands import Demands
+from rmpa.resource.aio.known import FILE, Known
 from rmpa.resource.aio.memory import Memory
 from rmpa.resource.aio.reconfigure import Reconfigure
 from rmpa.resource.aio.runtime import Runtime, RuntimePart
@@ -82,11 +83,18 @@ class Member:
         parts = [*first, self.adapter, self.contexts, self.configuration, self.demands]
         self.memory = Memory(self.runtime, self.adapter, self.contexts, store) if store is not None else None
         self.runtime.parts += [*parts, self.memory] if self.memory is not None else parts
+        self.known: Known | None = None
+        """Where other resources are written down, if that is here."""
         self._deactivating: asyncio.Task[None] | None = None
 
     def add(self, part: RuntimePart) -> None:
         """Let a further part hear of everything; before ``start()``."""
         self.runtime.parts.append(part)
+
+    def keep_others(self, store: Store) -> None:
+        """Write down which other resources there are; before ``start()``, for one resource of a process."""
+        self.known = Known(self.runtime, self.demands, store)
+        self.add(self.known)
 
     async def start(self) -> None:
         """Configure and activate it.
@@ -207,6 +215,8 @@ class Member:
         tasks += [f"rule over {problem}" for problem in self.contexts.problems]
         if self.memory is not None and self.memory.problem:
             tasks.append(self.memory.problem)
+        if self.known is not None and self.known.problem:
+            tasks.append(self.known.problem)
         if self.life.state is not State.ACTIVE:
             tasks.append(f"it is {self.life.state}")
         return missing, tasks
@@ -250,6 +260,8 @@ async def run_all(
         for resource in resources:
             store = Store(stores / f"{resource.name}.sqlite") if stores is not None else None
             member = Member(resource, master_uri, store=store)
+            if stores is not None and not members:
+                member.keep_others(Store(stores / FILE))
             await member.start()
             members.append(member)
         ready()

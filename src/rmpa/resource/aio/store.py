@@ -84,6 +84,22 @@ def module_dir(directory: Path, module: str) -> Path:
     return directory / (re.sub(r"[^\w.-]", "_", module).lstrip(".") or "_")
 
 
+def read_state(path: Path) -> dict[Key, str]:
+    """What a store's ``state`` holds; nobody need run, and who does is not disturbed.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    try:
+        with contextlib.closing(
+            sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=1.0)
+        ) as found:
+            rows = found.execute("SELECT kind, name, value FROM state ORDER BY kind, name")
+            return {(str(kind), str(name)): str(value) for kind, name, value in rows}
+    except sqlite3.Error as error:
+        raise OSError(f"{path}: {error}") from error
+
+
 class DamagedStore(Exception):  # noqa: N818 - reads as what happened; never leaves this file
     """The file is no store of ours."""
 
