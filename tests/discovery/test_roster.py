@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from dataclasses import replace
 from ipaddress import IPv4Address
 
@@ -623,3 +624,128 @@ def test_peers_are_read_in_guid_order(one: Harness) -> None:
     for number in (5, 3, 9, 2):
         one.hear(Speaker(who(number))())
     assert one.present() == ["peer2", "peer3", "peer5", "peer9"]
+
+
+# --- rosters full of peers that somebody invents -----------------------------------------------------------------
+
+
+def forged(number: int) -> Identity:
+    guid = Guid.of(IPv4Address(0x0A010000 + number), 4000)
+    return replace(who(2), guid=guid, instance=number.to_bytes(16, "big"), name=f"n{number}")
+
+
+def flood(one: Harness, count: int, *, first: int = 0) -> None:
+    """So many peers say once that they are there, for two minutes."""
+    for number in range(first, first + count):
+        one.hear(Speaker(forged(number))(BeaconKind.ANNOUNCE, lease=120.0))
+        one.roster.outputs()
+        one.roster.events()
+
+
+def test_peers_without_a_link_that_do_not_hear_us_share_a_few_heartbeats(one: Harness) -> None:
+    flood(one, limits.ROSTER_PEERS_MAX - 2)
+    one.hear(Speaker(who(2))(BeaconKind.ANNOUNCE), multicast=False)
+    one.roster.link_up(who(2), one.now)
+    one.run(limits.MULTICAST_SILENCE + limits.HEARTBEAT_INTERVAL)
+    sent = unicasts(one.run(60.0), BeaconKind.HEARTBEAT)
+    linked = who(2).guid.endpoint
+    assert sent.count(linked) >= 11, "who is linked gets each heartbeat"
+    others = [address for address in sent if address != linked]
+    assert len(others) <= (60 + limits.HEARTBEAT_INTERVAL) * limits.WHISPERS_PER_SECOND
+    assert len(set(others)) == limits.ROSTER_PEERS_MAX - 2, "each in turn"
+    assert one.roster.counters["beacon.whisper_limited"]
+
+
+def test_who_spoke_once_and_has_no_link_is_not_passed_on_for_long(one: Harness) -> None:
+    flood(one, 300)
+    one.roster.link_up(who(3), one.now)
+    one.run(limits.MULTICAST_SILENCE)
+    for output in one.run(60.0):
+        assert set(output.beacon.gossip) <= {who(3).guid}
+    one.hear(Speaker(who(2))(BeaconKind.ANNOUNCE), multicast=False)
+    (answer,) = one.roster.outputs()
+    assert answer.beacon.gossip == (who(3).guid,)
+
+
+def test_greetings_of_many_invented_addresses_are_few(one: Harness) -> None:
+    speaker, sent = Speaker(who(2)), 0
+    for second in range(60):
+        for part in range(8):
+            guids = [Guid.of(IPv4Address(0x0A020000 + 64 * part + j), 1) for j in range(limits.BEACON_GOSSIP_MAX)]
+            one.hear(speaker(BeaconKind.HEARTBEAT, *guids))
+        sent += len(unicasts(one.roster.outputs() + one.run(1.0), BeaconKind.ANNOUNCE))
+        assert sent <= limits.GREETINGS_MAX + (second + 1) * limits.GREETINGS_PER_SECOND
+    assert sent >= 40 * limits.GREETINGS_PER_SECOND
+
+
+def test_in_a_full_roster_who_missed_a_heartbeat_gives_way_but_not_to_many(one: Harness) -> None:
+    flood(one, limits.ROSTER_PEERS_MAX - 1)
+    one.hear(Speaker(who(3))())
+    assert "peer3" not in one.present(), "all spoke a moment ago"
+    one.run(limits.HEARTBEAT_LATE)
+    one.hear(Speaker(who(4))())
+    assert "peer4" in one.present()
+    flood(one, 1000, first=1000)
+    assert len(one.present()) == limits.ROSTER_PEERS_MAX - 1
+    new = [name for name in one.present() if name.startswith("n1") and len(name) > 4]
+    assert len(new) <= limits.ROSTER_EVICTIONS_PER_SECOND
+    assert one.roster.counters["roster.full"] >= 1000 - limits.ROSTER_EVICTIONS_PER_SECOND
+
+
+def test_a_linked_peer_gives_way_to_nobody(one: Harness) -> None:
+    one.roster.link_up(who(3), one.now)
+    flood(one, limits.ROSTER_PEERS_MAX - 2)
+    for second in range(60):
+        one.run(1.0)
+        flood(one, 100, first=1000 + 100 * second)
+    assert "peer3" in one.present()
+    assert len(one.roster.peers()) == limits.ROSTER_PEERS_MAX - 1
+
+
+def test_a_beacon_that_was_forged_while_its_place_was_linked_takes_no_seat_when_the_link_falls(one: Harness) -> None:
+    one.hear(Speaker(who(2))())
+    one.roster.link_up(who(2), one.now)
+    one.run(1)
+    one.hear(Speaker(replace(who(2, 2), name="eve"))(BeaconKind.ANNOUNCE, lease=120.0))
+    one.run(limits.HEARTBEAT_LATE + 1)
+    one.roster.events()
+    one.roster.link_down(who(2).guid, one.now)
+    assert one.roster.events() == []
+    assert one.present() == ["peer2"]
+
+
+def test_whose_link_is_known(one: Harness) -> None:
+    assert one.roster.is_linked(who(1).guid, who(1).instance), "our own echo"
+    one.hear(Speaker(who(2))())
+    assert not one.roster.is_linked(who(2).guid, who(2).instance)
+    one.roster.link_up(who(2), one.now)
+    assert one.roster.is_linked(who(2).guid, who(2).instance)
+    assert not one.roster.is_linked(who(2).guid, who(2, 2).instance)
+    one.roster.link_down(who(2).guid, one.now)
+    assert not one.roster.is_linked(who(2).guid, who(2).instance)
+
+
+def test_timers_and_names_are_those_of_the_seats_whatever_happens() -> None:
+    """The remembered answers against a look at every seat, over a thousand random events."""
+    rng = random.Random(3)
+    one = Harness()
+    speakers = [Speaker(replace(who(2 + n // 2, 1 + n % 2), name=f"name{n % 5}")) for n in range(24)]
+    for _ in range(1500):
+        speaker = rng.choice(speakers)
+        what = rng.randrange(8)
+        if what < 5:
+            kind = rng.choice([*BeaconKind])
+            one.hear(speaker(kind, lease=rng.choice([2.0, 16.0])), multicast=rng.random() < 0.5)
+        elif what == 5:
+            one.roster.link_up(speaker.identity, one.now)
+        elif what == 6:
+            one.roster.link_down(speaker.identity.guid, one.now)
+        one.run(rng.choice([0.0, 0.1, 3.0]))
+        one.roster.events()
+        seats = one.roster._seats
+        timers = [at for seat in seats if (at := seat.next_timer()) is not None]
+        assert seats.next_timer() == min(timers, default=None)
+        assert seats.present() == [s.current for s in seats if s.present and s.current is not None]
+        for name in {f"name{n}" for n in range(5)}:
+            having = [s for s in seats if s.current is not None and s.current.identity.name == name]
+            assert seats.named(name) == having

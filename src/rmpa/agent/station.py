@@ -21,6 +21,7 @@ from rmpa.discovery.aio.service import Discovery
 from rmpa.discovery.events import Conflict, PeerChanged, PeerFound, PeerLost, PeerRestarted
 from rmpa.mesh.aio.link import Takers
 from rmpa.mesh.aio.mesh import Mesh
+from rmpa.mesh.peering import REPLACED
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -118,9 +119,10 @@ class Station:
         self.discovery.link_up(link.identity, (link.remote_endpoint[0], link.identity.guid.port))
         self._bridge.link_up(link)
 
-    def _link_down(self, link: MeshLink, _reason: str) -> None:
+    def _link_down(self, link: MeshLink, reason: str) -> None:
         self._bridge.link_down(link)
-        self.discovery.link_down(link.identity.guid, link.identity.instance)
+        if reason != REPLACED:  # the peer is linked all the while: nobody else may take its seat
+            self.discovery.link_down(link.identity.guid, link.identity.instance)
 
     def _interfaces(self, everything: tuple[Interface, ...]) -> bool:
         """Whether we stay where we are."""

@@ -39,6 +39,7 @@ class PeersView:
         statuses = {status.identity.guid: status for status in station.mesh.peers()}
         infos = []
         for guid in {*roster, *statuses, *links}:
+            breathe()
             attached = links.get(guid)
             info = self._peer(roster.get(guid), statuses.get(guid), attached, now)
             if attached is not None:

@@ -53,11 +53,18 @@ class Timetable(Generic[_K]):
             heappop(heap)
         return heap[0][0] if heap else None
 
+    def pop(self, now: float) -> _K | None:
+        """The first of those that are due at ``now``, taken out; ``None`` if none is."""
+        at = self.next()
+        if at is None or at > now:
+            return None
+        _, key = heappop(self._heap)
+        del self._at[key]
+        return key
+
     def take(self, now: float) -> list[_K]:
         """Those that are due at ``now``, earliest first; taken out."""
         due = []
-        while (at := self.next()) is not None and at <= now:
-            _, key = heappop(self._heap)
-            del self._at[key]
+        while (key := self.pop(now)) is not None:
             due.append(key)
         return due

@@ -138,9 +138,7 @@ class Beacon:
             BeaconOtherVersion: The sender is of this domain and speaks another version.
             BeaconMalformed: Anything else is wrong.
         """
-        _check_prefix(data, domain)
-        if len(data) < _FIXED.size:
-            raise BeaconMalformed(f"only {len(data)} bytes")
+        sender_of(data, domain)
         _, _, kind, _, guid, instance, lease, sequence, name_length = _FIXED.unpack_from(data)
         name, offset = _take(data, _FIXED.size, name_length, "name")
         count, offset = _take(data, offset, 1, "number of addresses")
@@ -204,6 +202,23 @@ class Beacon:
         """``announce 3 of base (10.0.0.1:40001#7), 2 gossiped``; names are ROS names, so no byte can hurt a log."""
         gossip = f", {len(self.gossip)} gossiped" if self.gossip else ""
         return f"{self.kind.name.lower()} {self.sequence} of {self.identity}{gossip}"
+
+
+def sender_of(data: bytes, domain: int) -> tuple[Guid, bytes]:
+    """The GUID and the instance id that a packet begins with, without a look at the rest of it.
+
+    Args:
+        data: The whole packet.
+        domain: The reader's domain id.
+
+    Raises:
+        RemoteProtocolError: As for ``Beacon.parse``, as far as the beginning shows it.
+    """
+    _check_prefix(data, domain)
+    if len(data) < _FIXED.size:
+        raise BeaconMalformed(f"only {len(data)} bytes")
+    _, _, _, _, guid, instance, *_ = _FIXED.unpack_from(data)
+    return Guid(guid), instance
 
 
 def _check_prefix(data: bytes, domain: int) -> None:

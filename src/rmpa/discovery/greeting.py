@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from rmpa.core import limits
 from rmpa.core.backoff import Backoff
-from rmpa.core.clock import earliest
+from rmpa.core.bucket import Bucket
+from rmpa.core.timetable import Timetable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -44,7 +45,6 @@ class AnswerLimit:
 @dataclass(slots=True)
 class _Greeting:
     backoff: Backoff
-    at: float
     told_at: float
 
 
@@ -60,6 +60,9 @@ class Greetings:
     def __init__(self, rng: Callable[[], float]) -> None:
         self._rng = rng
         self._all: dict[Address, _Greeting] = {}
+        self._due: Timetable[Address] = Timetable()
+        self._allowed = Bucket(limits.GREETINGS_PER_SECOND, limits.GREETINGS_MAX)
+        self._resume = float("-inf")
 
     def __contains__(self, address: Address) -> bool:
         return address in self._all
@@ -75,25 +78,31 @@ class Greetings:
             return True
         if len(self._all) >= limits.GREETINGS_MAX:
             return False
-        self._all[address] = _Greeting(Backoff(limits.GREETING_FIRST, limits.GREETING_MAX, self._rng), now, now)
+        self._all[address] = _Greeting(Backoff(limits.GREETING_FIRST, limits.GREETING_MAX, self._rng), now)
+        self._due.set(address, now)
         return True
 
     def heard(self, address: Address) -> bool:
         """Whoever is there spoke: no more greetings. Return whether it had been greeted."""
+        self._due.set(address, None)
         return self._all.pop(address, None) is not None
 
     def due(self, now: float) -> list[Address]:
-        """The addresses to greet now, in order."""
-        greeted = []
-        for address in sorted(a for a, g in self._all.items() if g.at <= now):
+        """The addresses to greet now, the ones that waited longest first; beyond the limit they go on waiting."""
+        greeted: list[Address] = []
+        while now >= self._resume and (address := self._due.pop(now)) is not None:
             greeting = self._all[address]
             if now - greeting.told_at >= limits.GREETING_FORGET:
                 del self._all[address]
-                continue
-            greeted.append(address)
-            greeting.at = now + greeting.backoff.delay()
+            elif self._allowed.take(now):
+                greeted.append(address)
+                self._due.set(address, now + greeting.backoff.delay())
+            else:
+                self._due.set(address, now)
+                self._resume = self._allowed.next(now)
         return greeted
 
     def next_timer(self) -> float | None:
         """When ``due`` has something to say or to forget."""
-        return earliest(*(greeting.at for greeting in self._all.values()))
+        due = self._due.next()
+        return None if due is None else max(due, self._resume)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
+from rmpa.core.bucket import Bucket
 from rmpa.core.clock import earliest
 from rmpa.core.counters import Counters
 from rmpa.core.identity import Identity
@@ -30,8 +31,10 @@ from rmpa.discovery.events import (
     SendMulticast,
     SendUnicast,
 )
+from rmpa.discovery.gossip import GossipTurn, Whispers
 from rmpa.discovery.greeting import AnswerLimit, Greetings
 from rmpa.discovery.seat import Seat, Verdict, Voice
+from rmpa.discovery.seats import Seats
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -67,7 +70,9 @@ class Roster:
         self._rng = rng
         self._multicast = multicast
         self._lease_ms = round(lease * 1000)
-        self._seats: dict[int, Seat] = {}
+        self._seats = Seats()
+        self._room = Bucket(limits.ROSTER_EVICTIONS_PER_SECOND, limits.ROSTER_EVICTIONS_PER_SECOND)
+        self._no_room_until = _NEVER
         self._named: set[frozenset[bytes]] = set()
         self._answers = AnswerLimit()
         self._greetings = Greetings(rng)
@@ -77,7 +82,8 @@ class Roster:
         self._spread_at: float | None = None
         self._spread_last = _NEVER
         self._sequence = 0
-        self._gossip_turn = 0
+        self._gossip_turn = GossipTurn()
+        self._whispers = Whispers()
         self._closed = False
         self._outputs: list[Output] = []
         self._events: list[Event] = []
@@ -87,7 +93,7 @@ class Roster:
     def start(self, now: float) -> None:
         """Announce ourselves: a burst, then silence but for the heartbeat."""
         own = Voice(self._own, now, now, limits.ROSTER_LEASE, Heard.LINK, Heard.LINK, linked=True)
-        self._seats[self._own.guid.place] = Seat(own, own=True)
+        self._seats.add(self._own.guid.place, Seat(own, own=True))
         self._burst = self._burst_times(now, limits.BURST_OFFSETS)
         self._heartbeat_at = self._next_heartbeat(now)
         self.handle_timer(now)
@@ -108,12 +114,16 @@ class Roster:
         key = identity.guid.place
         seat = self._seats.get(key)
         if seat is None:
-            if len(self._seats) >= limits.ROSTER_PEERS_MAX:
+            if len(self._seats) >= limits.ROSTER_PEERS_MAX and not self._evict_silent(now):
                 self.counters.add("roster.full")
                 return
-            seat = self._seats[key] = Seat()
+            seat = self._seats.add(key, Seat())
         previous = seat.current.identity if seat.current is not None else None
         verdict = seat.hear(beacon, now, source, multicast=multicast)
+        if verdict in {Verdict.KNOWN, Verdict.STALE}:
+            self._seats.heard(key)
+        else:
+            self._seats.changed(key)
         greeted = [self._greetings.heard(address) for address in {identity.guid.endpoint, source}]
         self._judge(seat, verdict, now, previous=previous, source=source)
         if verdict in {Verdict.NEW, Verdict.RESTARTED} and not multicast and seat.current is not None:
@@ -139,12 +149,13 @@ class Roster:
             if len(self._seats) >= limits.ROSTER_PEERS_MAX and not self._evict():
                 self.counters.add("roster.full")
                 return
-            seat = self._seats[key] = Seat()
+            seat = self._seats.add(key, Seat())
         if seat.own:
             self.counters.add("roster.own_link")
             return
         previous = seat.current.identity if seat.current is not None else None
         verdict = seat.link_up(identity, now)
+        self._seats.changed(key)
         if source is not None and seat.current is not None:
             seat.current.source = source
         self._greetings.heard(identity.guid.endpoint)
@@ -168,6 +179,7 @@ class Roster:
         if instance is not None and previous.instance != instance:
             return
         verdict = seat.link_down(now)
+        self._seats.changed(key)
         if verdict is Verdict.CONFLICT:
             self._lost(seat, LossReason.CONFLICT)
             return
@@ -202,7 +214,7 @@ class Roster:
             return
         if self._multicast:
             self._outputs.append(SendMulticast(self._beacon(BeaconKind.GOODBYE)))
-        for voice in self._unheard_by_multicast(now):
+        for voice in self._whispered_to(now):
             for address in _addresses(voice):
                 self._send(BeaconKind.GOODBYE, address)
         self._closed = True
@@ -216,7 +228,7 @@ class Roster:
             self._spread_at,
             self._burst[0] if self._burst else None,
             self._greetings.next_timer(),
-            *(seat.next_timer() for seat in self._seats.values()),
+            self._seats.next_timer(),
         )
 
     def handle_timer(self, now: float) -> None:
@@ -233,7 +245,7 @@ class Roster:
             self._heartbeat_at = self._next_heartbeat(now)
             self._shout(BeaconKind.HEARTBEAT, now)
             self._whisper(now)
-            met = {address for voice in self._present() for address in _addresses(voice)}
+            met = {address for voice in self._seats.present() for address in _addresses(voice)} if self._seeds else ()
             for address in self._seeds:
                 if address not in met:
                     self._send(BeaconKind.ANNOUNCE, address)
@@ -258,15 +270,21 @@ class Roster:
         """All peers in GUID order, those that a conflict keeps out included."""
         return tuple(
             self._view(seat, voice)
-            for seat in self._ordered()
+            for seat in self._seats
             for voice in [seat.current, *(seat.rivals() if seat.conflict else [])]
             if voice is not None and not (seat.own and voice is seat.current)
         )
 
     def silent_seeds(self) -> list[Address]:
         """Seeds at whose address nobody in the roster is."""
-        met = {host for voice in self._present() for host, _ in _addresses(voice)}
+        met = {host for voice in self._seats.present() for host, _ in _addresses(voice)}
         return [seed for seed in self._seeds if seed[0] not in met]
+
+    def is_linked(self, guid: Guid, instance: bytes) -> bool:
+        """Whether we have a link with this run of a peer; with ourselves we do."""
+        seat = self._seats.get(guid.place)
+        voice = seat.current if seat is not None else None
+        return voice is not None and voice.linked and voice.identity.instance == instance
 
     @property
     def identity(self) -> Identity:
@@ -299,6 +317,7 @@ class Roster:
             self._lost(seat, LossReason.GOODBYE)
             seat.vacate()
             self._settle(seat, now)
+            self._seats.changed(current.identity.guid.place)
         elif verdict is Verdict.CONFLICT:
             kind = ConflictKind.OWN_GUID if seat.own else ConflictKind.GUID
             rival = max(seat.rivals(), key=lambda v: v.heard)
@@ -307,6 +326,7 @@ class Roster:
                 self._lost(seat, LossReason.CONFLICT)
         elif verdict is Verdict.WAITING:
             self._settle(seat, now)
+            self._seats.changed(current.identity.guid.place)
 
     def _found(self, seat: Seat, now: float) -> None:
         voice = seat.current
@@ -314,6 +334,7 @@ class Roster:
             return
         seat.present = True
         voice.since = now
+        self._seats.changed(voice.identity.guid.place)
         self._events.append(PeerFound(voice.identity, voice.source, voice.found_by))
         self._retire_ghosts(seat, voice)
         self._check_name(seat)
@@ -322,6 +343,7 @@ class Roster:
     def _lost(self, seat: Seat, reason: LossReason) -> None:
         if seat.present and seat.current is not None:
             seat.present = False
+            self._seats.changed(seat.current.identity.guid.place)
             self._events.append(PeerLost(seat.current.identity, reason))
             self._named = {pair for pair in self._named if seat.current.identity.instance not in pair}
 
@@ -330,7 +352,7 @@ class Roster:
 
         If the old one lives all the same, its next beacon brings it back.
         """
-        for other in self._ordered():
+        for other in self._seats.named(voice.identity.name):
             ghost = other.current
             if (
                 ghost is not None
@@ -338,12 +360,12 @@ class Roster:
                 and not other.own
                 and not ghost.linked
                 and ghost.heard < voice.since
-                and ghost.identity.name == voice.identity.name
                 and ghost.identity.guid.address == voice.identity.guid.address
             ):
                 key = ghost.identity.guid.place
                 self._lost(other, LossReason.MOVED)
                 other.vacate()
+                self._seats.changed(key)
                 self._drop_if_empty(key)
 
     def _check_name(self, seat: Seat) -> None:
@@ -361,13 +383,13 @@ class Roster:
         if mine is None:
             return []
         pairs = []
-        for other in self._ordered():
+        for other in self._seats.named(mine.identity.name):
             voice = other.current
             if voice is None or other is seat or not (other.present or other.own):
                 continue
             newer, older = (mine, voice) if (mine.since, other.own) >= (voice.since, seat.own) else (voice, mine)
             alive = older.linked or older.heard >= newer.since or other.own or seat.own
-            if voice.identity.name == mine.identity.name and alive:
+            if alive:
                 pairs.append((newer, older))
         return pairs
 
@@ -384,10 +406,9 @@ class Roster:
                     self._send_answer(seat.current, now)
 
     def _leases(self, now: float) -> None:
-        for key in sorted(self._seats):
+        for key in self._seats.due(now):
             seat = self._seats.get(key)  # one that came back may have retired another
-            timer = seat.next_timer() if seat is not None else None
-            if seat is None or timer is None or timer > now:
+            if seat is None:
                 continue
             voice = seat.current
             if voice is not None and not voice.linked and voice.deadline <= now:
@@ -397,25 +418,44 @@ class Roster:
                     # No multicast will bring it back by itself once the network heals.
                     self._greetings.learn(voice.identity.guid.endpoint, now)
             self._settle(seat, now)
+            self._seats.changed(key)
             self._drop_if_empty(key)
 
     def _drop_if_empty(self, key: int) -> None:
-        seat = self._seats[key]
-        if seat.current is None and not seat.others:
-            del self._seats[key]
+        seat = self._seats.get(key)
+        if seat is not None and seat.current is None and not seat.others:
+            self._seats.drop(key)
 
     def _evict(self) -> bool:
         """Make room for a linked peer: the one that is silent for longest has no link to prove that it exists."""
-        unlinked = [
-            (seat.current.heard if seat.current is not None else _NEVER, key)
-            for key, seat in self._seats.items()
-            if seat.current is None or not seat.current.linked
-        ]
-        if not unlinked:
+        oldest = min(self._seats.unlinked(), default=None)
+        if oldest is None:
             return False
-        _, key = min(unlinked)
-        self._lost(self._seats.pop(key), LossReason.SILENCE)
+        self._remove(oldest[1])
         return True
+
+    def _evict_silent(self, now: float) -> bool:
+        """Make room for one that speaks: another has no link and has missed a heartbeat, and may be invented.
+
+        Not often, for so may be the one that speaks.
+        """
+        if now < self._no_room_until:
+            return False
+        heard, key = min(self._seats.unlinked(), default=(now, 0))
+        self._no_room_until = heard + limits.HEARTBEAT_LATE
+        if now < self._no_room_until:
+            return False
+        if not self._room.take(now):
+            self._no_room_until = self._room.next(now)
+            return False
+        self._remove(key)
+        return True
+
+    def _remove(self, key: int) -> None:
+        seat = self._seats.get(key)
+        if seat is not None:
+            self._lost(seat, LossReason.SILENCE)
+            self._seats.drop(key)
 
     # --- sending ----------------------------------------------------------------------------------------------
 
@@ -427,8 +467,8 @@ class Roster:
         """Where we hear those that are not at their GUID's address: whoever hears of them may only reach that."""
         found = []
         for guid in gossip:
-            voice = self._seats[guid.place].current
-            source = voice.source if voice is not None else None
+            seat = self._seats.get(guid.place)
+            source = seat.current.source if seat is not None and seat.current is not None else None
             if source is not None and source != guid.endpoint and not source[0].startswith("127."):
                 found.append(source)
         return tuple(found)
@@ -440,15 +480,21 @@ class Roster:
     def _shout(self, kind: BeaconKind, now: float) -> None:
         """Multicast, with those that multicast does not bring to the others."""
         if self._multicast:
-            gossip = self._gossip(self._unheard_by_multicast(now), None)
+            gossip = self._gossip(self._unheard_by_multicast(now), None, now)
             self._outputs.append(SendMulticast(self._beacon(kind, gossip)))
 
     def _whisper(self, now: float) -> None:
         """The heartbeat, and all we know, to each peer that multicast does not join with us."""
-        for voice in self._unheard_by_multicast(now):
-            gossip = self._gossip(self._present(), voice)
+        for voice in self._whispered_to(now):
+            gossip = self._gossip(self._seats.present(), voice, now)
             for address in _addresses(voice):
                 self._send(BeaconKind.HEARTBEAT, address, gossip)
+
+    def _whispered_to(self, now: float) -> list[Voice]:
+        chosen, everybody = self._whispers.choose(self._unheard_by_multicast(now), now)
+        if not everybody:
+            self.counters.add("beacon.whisper_limited")
+        return chosen
 
     def _spread(self, now: float) -> None:
         self._spread_at = None
@@ -459,7 +505,7 @@ class Roster:
 
     def _news(self, now: float) -> None:
         """Somebody was found: let those know who cannot hear it themselves."""
-        if self._spread_at is None and self._heartbeat_at is not None and len(self._present()) > 1:
+        if self._spread_at is None and self._heartbeat_at is not None and len(self._seats.present()) > 1:
             self._spread_at = max(now, self._spread_last + limits.SPREAD_INTERVAL)
 
     def _answer(self, seat: Seat, verdict: Verdict, beacon: Beacon, now: float, *, multicast: bool) -> None:
@@ -475,9 +521,10 @@ class Roster:
             self._send_answer(voice, now)
 
     def _send_answer(self, voice: Voice, now: float) -> None:
-        gossip = self._gossip(self._present(), voice)
+        gossip: tuple[Guid, ...] | None = None
         for address in _addresses(voice):
             if self._answers.allows(address, now):
+                gossip = self._gossip(self._seats.present(), voice, now) if gossip is None else gossip
                 self._send(BeaconKind.ANSWER, address, gossip)
             else:
                 self.counters.add("beacon.answer_limited")
@@ -507,33 +554,21 @@ class Roster:
         if not addresses:
             return []
         met = {*self._own.endpoints}
-        for voice in self._present():
+        for voice in self._seats.present():
             met.update(voice.identity.endpoints, _addresses(voice))
         near = self._own.guid.address.is_loopback
         return [a for a in addresses if a not in met and (near or not a[0].startswith("127."))]
 
-    def _gossip(self, voices: list[Voice], to: Voice | None) -> tuple[Guid, ...]:
-        """GUIDs to pass on, in order; where they are too many for one beacon, in turn."""
-        near = to.identity.guid.address.is_loopback if to is not None else self._own.guid.address.is_loopback
-        guids = [v.identity.guid for v in voices if v is not to and (near or not v.identity.guid.address.is_loopback)]
-        most = limits.BEACON_GOSSIP_MAX
-        if len(guids) <= most:
-            return tuple(guids)
-        self._gossip_turn = (self._gossip_turn + most) % len(guids)
-        return tuple((guids[self._gossip_turn :] + guids)[:most])
+    def _gossip(self, voices: list[Voice], to: Voice | None, now: float) -> tuple[Guid, ...]:
+        identity = to.identity if to is not None else self._own
+        return self._gossip_turn.choose(voices, to, now, near=identity.guid.address.is_loopback)
 
     # --- small reads ------------------------------------------------------------------------------------------
-
-    def _ordered(self) -> list[Seat]:
-        return [self._seats[key] for key in sorted(self._seats)]
-
-    def _present(self) -> list[Voice]:
-        return [s.current for s in self._ordered() if s.present and s.current is not None]
 
     def _unheard_by_multicast(self, now: float) -> list[Voice]:
         """Peers that get their heartbeats by unicast."""
         silence = limits.MULTICAST_SILENCE
-        return [v for v in self._present() if not self._multicast or now - v.multicast_at > silence]
+        return [v for v in self._seats.present() if not self._multicast or now - v.multicast_at > silence]
 
     def _burst_times(self, now: float, offsets: tuple[float, ...]) -> list[float]:
         return [now + offset + (limits.BURST_JITTER * self._rng() if offset else 0.0) for offset in offsets]

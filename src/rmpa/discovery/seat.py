@@ -142,7 +142,8 @@ class Seat:
             return Verdict.LEAVING
         if self.conflict:
             return Verdict.CONFLICT
-        waiting = [v for v in self.rivals() if v.since > current.since]
+        # A run that lives sends heartbeats; one beacon, perhaps forged, long ago gets nobody a seat.
+        waiting = [v for v in self.rivals() if v.since > current.since and now - v.heard <= limits.HEARTBEAT_LATE]
         if not waiting:
             return Verdict.KNOWN
         return self._promote(max(waiting, key=lambda v: v.heard), now, Verdict.RESTARTED)

@@ -78,7 +78,7 @@ class Discovery:
         self._on_interfaces = on_interfaces
         self._clock: Clock = clock if clock is not None else SystemClock()
         self._roster = Roster(identity, rng=random.random, multicast=settings.multicast, counters=self.counters)
-        self._intake = Intake(settings.domain, self.counters)
+        self._intake = Intake(settings.domain, self.counters, is_linked=self._roster.is_linked)
         self._refusals = RefusalLog(_log, self.counters)
         self._group: Address = (settings.group, settings.discovery_port)
         self._sender = sockets.Sender(udp_socket, self._group, self.counters)
@@ -198,7 +198,7 @@ class Discovery:
             except OSError as error:  # an ICMP error that some earlier packet of ours caused
                 _log.debug("< %s", error)
                 continue
-            beacon = self._intake.take(data, source, now, multicast=multicast)
+            beacon = self._intake.take(data, source, now, multicast=multicast, interface=index)
             if beacon is not None:
                 _log.debug("< %s:%d (interface %d): %s", *source, index, beacon)
                 self._roster.receive(beacon, source, now, multicast=multicast)

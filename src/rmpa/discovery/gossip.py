@@ -1,0 +1,67 @@
+"""Whom a beacon passes on, and who gets one by unicast: so many of many, in turn."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rmpa.core import limits
+from rmpa.core.bucket import Bucket
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rmpa.core.guid import Guid
+    from rmpa.discovery.seat import Voice
+
+
+class GossipTurn:
+    """Chooses the peers that one beacon passes on."""
+
+    def __init__(self) -> None:
+        self._turn = 0
+
+    def choose(self, voices: Sequence[Voice], to: Voice | None, now: float, *, near: bool) -> tuple[Guid, ...]:
+        """GUIDs to pass on, in order; where they are too many for one beacon, in turn.
+
+        Who has no link and was not heard of late is left out: others would greet it for as long as we speak of it.
+
+        Args:
+            voices: Who is known.
+            to: Who is told, if it is one alone.
+            now: Monotonic seconds.
+            near: Whether those who are told can reach loopback addresses.
+        """
+        count = len(voices)
+        start = self._turn % count if count > limits.BEACON_GOSSIP_MAX else 0
+        guids: list[Guid] = []
+        for number in range(start, start + count):
+            voice = voices[number % count]
+            if voice is to or not (voice.linked or now - voice.heard <= limits.MULTICAST_SILENCE):
+                continue
+            guid = voice.identity.guid
+            if near or not guid.address.is_loopback:
+                guids.append(guid)
+                if len(guids) == limits.BEACON_GOSSIP_MAX:
+                    self._turn = number + 1
+                    break
+        return tuple(guids)
+
+
+class Whispers:
+    """Chooses who gets a heartbeat by unicast: all that are linked; of the others, who may be invented, a few."""
+
+    def __init__(self) -> None:
+        self._turn = 0
+        self._allowed = Bucket(limits.WHISPERS_PER_SECOND, limits.WHISPERS_PER_SECOND * limits.HEARTBEAT_INTERVAL)
+
+    def choose(self, voices: Sequence[Voice], now: float) -> tuple[list[Voice], bool]:
+        """Those of ``voices`` who get one now, the others in turn from call to call; whether that is all of them."""
+        chosen = [voice for voice in voices if voice.linked]
+        others = [voice for voice in voices if not voice.linked]
+        start = self._turn % len(others) if others else 0
+        for voice in others[start:] + others[:start]:
+            if not self._allowed.take(now):
+                return chosen, False
+            chosen.append(voice)
+            self._turn = (self._turn + 1) % len(others)
+        return chosen, True
