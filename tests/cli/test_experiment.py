@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import json
 import signal
@@ -21,6 +22,7 @@ from rmpa.experiments.bed.processes import BedError
 from rmpa.experiments.estimate import Estimate
 from rmpa.experiments.model import Cell
 from rmpa.experiments.registry import EXPERIMENTS
+from rmpa.experiments.report import figures
 from rmpa.experiments.store import Store
 from tests.experiments import fakes
 from tests.experiments.fakes import FakeExperiment
@@ -89,9 +91,11 @@ def test_a_run_measures_and_writes_its_report(
     assert "fake        reached     20 Hz  ≤ 20 Hz      -  highest rate" in lines
     assert f"report: {Path('mine/report/report.html')}" in lines
     assert "[4/4] fake system=rmpa rate=20 round=1:" in err
+    assert err.count(" left\n") == 3  # behind the last one nothing is left to wait for
     store = Store.load(tmp_path / "mine")
     assert (store.plan.size, store.plan.bed) == ("short", "loopback")
     assert [session.end for session in store.manifest.sessions] == ["finished"]
+    assert store.manifest.sessions[0].argv[0] == "rmpa"  # wherever it is installed
     assert (tmp_path / "mine" / "report" / "report.html").exists()
     assert (tmp_path / "mine" / "report" / "report.md").exists()
 
@@ -225,6 +229,7 @@ import sys, threading
 from rmpa.cli.main import main
 from rmpa.experiments.bed import stage
 from rmpa.experiments.registry import EXPERIMENTS
+from rmpa.experiments.report import figures
 from tests.experiments import fakes
 
 def wait(cell, attempt):
@@ -275,6 +280,25 @@ def test_who_may_write_nothing_is_told(
     code, _, err = rmpa(capsys, "run", "--out", "file/run")
     assert code == 1
     assert err.splitlines()[-1].startswith("rmpa: file/run: cannot be written to")
+
+
+def test_without_matplotlib_the_report_has_no_figures_and_says_what_installs_them(
+    fake: FakeExperiment, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    found = importlib.util.find_spec
+
+    def hidden(name: str, package: str | None = None) -> object:
+        return None if name == "matplotlib" else found(name, package)
+
+    monkeypatch.setattr(figures, "find_spec", hidden)
+    code, out, err = rmpa(capsys, "run", "--short", "--out", "mine")
+    assert code == 0
+    assert "highest rate" in out
+    assert (
+        err.splitlines()[-1] == "! left out: figures (matplotlib is not installed: pip install 'rmpa[experiments]')"
+    )
+    assert "pip install 'rmpa[experiments]'" in Path("mine/report/report.md").read_text()
 
 
 CELLS = [Cell("rates", {"system": "rmpa", "rate": rate}, seconds=10.0) for rate in (10, 20)]

@@ -174,7 +174,11 @@ def run(
     if store.plan.bed == "namespaces":
         namespaces.remove_stale()
     try:
-        with _terminated(), store.session(sys.argv), watching([cell for _, cell in waiting]) as watcher:
+        with (
+            _terminated(),
+            store.session(["rmpa", *sys.argv[1:]]),
+            watching([cell for _, cell in waiting]) as watcher,
+        ):
             outcome = runner.run(jobs, store, make_stage, watcher)
     except KeyboardInterrupt:
         words = [
@@ -226,6 +230,7 @@ def report(directory: Path, as_json: bool) -> None:
 def compare(a: Path, b: Path, as_json: bool) -> None:
     """Compare the runs in directories A and B: what was measured, and what differs in how."""
     from rmpa.experiments.report.compare import compare as comparison
+    from rmpa.experiments.report.words import number, quantity
 
     found = comparison(a, b)
     if as_json:
@@ -241,7 +246,7 @@ def compare(a: Path, b: Path, as_json: bool) -> None:
     print_table(
         (Column("EXPERIMENT"), Column("FIGURE"), *right),
         [
-            (one.experiment, one.text, _figure(one.a, one.unit), _figure(one.b, one.unit), _figure(one.ratio))
+            (one.experiment, one.text, quantity(one.a, one.unit), quantity(one.b, one.unit), number(one.ratio))
             for one in found.claims
         ],
     )
@@ -340,6 +345,8 @@ def _about(directory: Path, written: Report) -> dict[str, object]:
 
 
 def _print_report(written: Report) -> None:
+    from rmpa.experiments.report.words import measured, quantity, wanted
+
     claims = list(_claims(written.findings))
     if claims:
         right = [Column(title, right=True) for title in ("MEASURED", "WANTED", "PAPER")]
@@ -349,9 +356,9 @@ def _print_report(written: Report) -> None:
                 (
                     name,
                     _REACHED[claim.reached],
-                    _figure(claim.value, claim.unit),
-                    f"{'≥' if claim.at_least else '≤'} {_figure(claim.limit, claim.unit)}",
-                    _figure(claim.paper, claim.unit),
+                    measured(claim),
+                    wanted(claim),
+                    quantity(claim.paper, claim.unit),
                     claim.text,
                 )
                 for name, claim in claims
@@ -369,7 +376,3 @@ def _claims(findings: Mapping[str, Findings]) -> Iterator[tuple[str, Claim]]:
     for name, found in findings.items():
         for claim in found.claims:
             yield name, claim
-
-
-def _figure(value: float | None, unit: str = "") -> str:
-    return "-" if value is None else f"{value:.4g} {unit}".rstrip()

@@ -62,7 +62,7 @@ class Lines:
     def cell_ends(self, cell: Cell, seconds: float) -> None:
         """Say that it is done, and how long the rest takes."""
         self._estimate.end(self._now())
-        self._write(f"{self._count()} {_name(cell)}: {duration(seconds)}, {self._rest()}")
+        self._write(f"{self._count()} {_name(cell)}: {duration(seconds)}{self._rest()}")
 
     def cell_fails(self, cell: Cell, error: str, *, again: bool) -> None:
         """Say why."""
@@ -76,7 +76,8 @@ class Lines:
         return f"[{self._estimate.done:>{len(str(total))}}/{total}]"
 
     def _rest(self) -> str:
-        return f"about {duration(self._estimate.left(self._now()))} left"
+        left = self._estimate.left(self._now())
+        return f", about {duration(left)} left" if left else ""
 
 
 class Bars:
