@@ -54,8 +54,11 @@ def test_the_full_run_has_the_papers_batches_and_ten_thousand_beyond() -> None:
 
 
 def test_systems_take_turns_and_another_one_begins_each_round() -> None:
-    cells = [cell for cell in EXPERIMENT.cells(FULL) if cell.settings.get("nodelay") is not False]
-    assert [cell.settings["system"] for cell in cells] == ["rmpa", "classic", "classic", "rmpa"]
+    cells = [cell.settings for cell in EXPERIMENT.cells(FULL)]
+    assert [cell["system"] for cell in cells if cell["round"] == 1][:2] == ["rmpa", "classic"]
+    assert [cell["system"] for cell in cells if cell["round"] == 2] == ["classic", "rmpa"]
+    beside = [cell for cell in cells if cell.get("relays") or cell.get("nodelay") is False]
+    assert [cell["round"] for cell in beside] == [1, 1]
 
 
 @pytest.mark.parametrize(("step", "value", "reached"), [(1, 1.0, True), (2, 2.0, False)])
@@ -65,15 +68,28 @@ def test_widening_is_that_of_rmpa_at_1_khz_against_the_papers_rates(step: int, v
             return made(LADDER, ramp(3))
         return made(LADDER, lambda rate, number: ramp(step if rate == 1000 else 1)(rate, number))
 
-    (claim,) = EXPERIMENT.findings(run(FULL, measure)).claims
+    claim = EXPERIMENT.findings(run(FULL, measure)).claims[0]
     assert claim.value == pytest.approx(value)
     assert claim.reached is reached
 
 
 def test_too_few_messages_say_nothing_of_the_width() -> None:
     few = dict.fromkeys((*PAPER, 1000), 50)  # in two rounds 100, and p95 needs 200
-    (claim,) = EXPERIMENT.findings(run(FULL, lambda _: made(few, ramp(1)))).claims
+    claim = EXPERIMENT.findings(run(FULL, lambda _: made(few, ramp(1)))).claims[0]
     assert claim.reached is None
+
+
+def test_relays_are_no_classic_ros_and_are_what_rmpa_must_not_be_slower_than() -> None:
+    def measure(cell: Cell) -> Measured:
+        if cell.settings.get("relays"):
+            return made(LADDER, lambda _rate, _number: 400)
+        return made(LADDER, lambda _rate, _number: 300 if cell.settings["system"] == "rmpa" else 100)
+
+    found = EXPERIMENT.findings(run(FULL, measure))
+    assert found.claims[1].value == pytest.approx(0.75)
+    rows = rows_of(found.grids[0])
+    assert rows["10 Hz", "classic"]["p50"] == "100"
+    assert rows["10 Hz", "classic, two relays"]["p50"] == "400"
 
 
 def rows_of(grid: Grid) -> dict[tuple[str, str], dict[str, str]]:

@@ -102,11 +102,9 @@ class Control:
         given = phases(plan.seed, _ROUNDS[plan.size])
         made: list[Cell] = []
         for number, phase in enumerate(given, 1):
-            order = [CLASSIC, RMPA]
-            if number <= _DEFAULTS_ROUNDS and not plan.short:
-                order.append(DEFAULTS)
+            beside = [DEFAULTS] if number <= _DEFAULTS_ROUNDS and not plan.short else []
             for (client, mode), shift in zip(itertools.product(clients, MODES), itertools.count(number)):
-                for contender in turn(order, shift):
+                for contender in (*turn([CLASSIC, RMPA], shift), *beside):
                     settings: dict[str, Value] = {**contender.settings, "client": client, "mode": mode}
                     if mode == "polled":
                         settings["phase_ms"] = phase
@@ -213,7 +211,7 @@ def evaluate(measured: Measured) -> Round:
 
 def rounds(results: Results, contender: Contender, client: str, mode: str) -> dict[int, Round]:
     """What was measured of one contender, by the round's number."""
-    found = results.select(**contender.settings, client=client, mode=mode)
+    found = contender.select(results, client=client, mode=mode)
     return {
         number: evaluate(measured) for cell, measured in found if isinstance(number := cell.settings["round"], int)
     }

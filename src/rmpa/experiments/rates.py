@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.experiments import samples, statistics
 from rmpa.experiments.arrivals import counted, latencies, lost
-from rmpa.experiments.contenders import CLASSIC, DEFAULTS, RMPA, turn
+from rmpa.experiments.contenders import CLASSIC, DEFAULTS, RELAYS, RMPA, nodelay_of, relays_of, turn
 from rmpa.experiments.model import Cell, Claim, Figure, Findings, Grid, Panel, Series
 from rmpa.experiments.stream import SETTLE, stream
 
@@ -30,14 +30,16 @@ _COUNTS: Final = {
     "full": {**dict.fromkeys(PAPER, 100), 100: 600, 200: 1600, 500: 5000, 1000: 5000},
 }
 """Messages of each rate in each round."""
-_DEFAULTS_COUNT: Final = 50
-"""Of the paper's rates, in one round, without tcp_nodelay."""
+_BESIDE: Final = {**dict.fromkeys(PAPER, 50), 1000: 1000}
+"""Messages in one round of what only stands beside the others."""
 _SETUP: Final = 5.0
 """Seconds until a system of two hosts and its nodes are up, about."""
 _WIDENING_LIMIT: Final = 1.2
 """Of p95 less p50: that of 200 messages (at each of the paper's rates) has a standard error of 13 %, the median of
 five such rates one of 7 %, and 1.2 leaves room for three of those."""
 _MS_TO_US: Final = 1e3
+_RELAYS_LIMIT: Final = 1.0
+"""Python agents that are no slower than relays in C++."""
 
 _ABOUT: Final = """\
 One stream of 64 bytes from *joystick* to *pc*, one way: from the moment at which a message was **due** at its
@@ -47,8 +49,13 @@ network namespaces of one machine, with one clock.
 10 to 50 Hz in batches of 100, as in the paper, in each of two rounds; then in each round 600 messages at 100 Hz,
 1,600 at 200 Hz, 5,000 at 500 Hz and 5,000 at 1 kHz. So p99 is given from 100 Hz on, and p99.9 at 500 Hz and 1 kHz;
 percentiles with fewer than ten samples beyond them are left out. The first tenth of a second of each step is not
-counted. Systems take turns. Classic ROS runs with tcp_nodelay; one batch of 50 without it stands beside the paper's
-rates, since there Nagle's algorithm may hold a message back until the one before it was acknowledged.
+counted. Systems take turns.
+
+Classic ROS runs with tcp_nodelay. Beside it, in one round of 50 messages at each of the paper's rates and 1,000 at
+1 kHz: classic ROS *without tcp_nodelay*, where Nagle's algorithm may hold a message back until the one before it
+was acknowledged; and classic ROS through *two relays* in C++ (roscpp, tcp_nodelay), one on each host, which tells
+what two more processes that must wake cost by themselves: much more at 10 Hz, from an idle processor, than at 1
+kHz.
 
 *Width* is p95 less p50. No widening is said when the width at 1 kHz is at most 1.2 times the median of those at 10
 to 50 Hz: their own sampling error is 7 %.
@@ -67,20 +74,19 @@ class Rates:
         clients = plan.clients[:1] if plan.short else plan.clients
         made: list[Cell] = []
         for number in range(1, _ROUNDS[plan.size] + 1):
-            order = [CLASSIC, RMPA]
-            if number == 1 and not plan.short:
-                order.append(DEFAULTS)
+            beside = [DEFAULTS, RELAYS] if number == 1 and not plan.short else []
             for shift, client in enumerate(clients, number):
-                for contender in turn(order, shift):
+                for contender in (*turn([CLASSIC, RMPA], shift), *beside):
                     settings = {**contender.settings, "client": client, "round": number}
-                    made.append(Cell(self.name, settings, _seconds(_counts(plan, contender))))
+                    made.append(
+                        Cell(self.name, settings, _seconds(_counts(plan, beside=contender in (DEFAULTS, RELAYS))))
+                    )
         return made
 
     def measure(self, cell: Cell, stage: Stage) -> Measured:
         """Climb through the rates once."""
-        defaults = cell.settings.get("nodelay") is False
         with stream(cell, stage, "rate") as made:
-            for rate, count in _counts(stage.plan, DEFAULTS if defaults else CLASSIC).items():
+            for rate, count in _counts(stage.plan, beside=not nodelay_of(cell) or relays_of(cell) > 0).items():
                 made.run(rate, size=_SIZE, rate=rate, count=count)
             return made.measured()
 
@@ -90,13 +96,15 @@ class Rates:
         grids: list[Grid] = []
         claims: list[Claim] = []
         for client in results.plan.clients:
-            steps = {contender: _steps(results, contender, client) for contender in (RMPA, CLASSIC, DEFAULTS)}
+            steps = {contender: _steps(results, contender, client) for contender in (RMPA, CLASSIC, RELAYS, DEFAULTS)}
             if not any(steps.values()):
                 continue
             figures.append(_figure(steps, client))
             grids.append(_grid(steps, client))
             text = f"p95 less p50 of RMPA, {client}: at 1 kHz / at 10 to 50 Hz"
             claims.append(Claim(text, widening(steps[RMPA]), _WIDENING_LIMIT))
+            text = f"p50 at 10 to 50 Hz, {client}: RMPA / classic through two relays in C++"
+            claims.append(Claim(text, _slowly(steps[RMPA], steps[RELAYS]), _RELAYS_LIMIT))
         return Findings(tuple(figures), tuple(grids), tuple(claims))
 
 
@@ -147,9 +155,14 @@ def widening(steps: Mapping[int, Step]) -> float | None:
     return width / base if base and width is not None else None
 
 
-def _counts(plan: Plan, contender: Contender) -> dict[int, int]:
-    counts = _COUNTS[plan.size]
-    return dict.fromkeys(PAPER, _DEFAULTS_COUNT) if contender is DEFAULTS else counts
+def _slowly(steps: Steps, base: Steps) -> float | None:
+    """The median over the paper's rates of one p50 by the other's."""
+    medians = [(steps[rate].summary.p50, base[rate].summary.p50) for rate in PAPER if rate in steps and rate in base]
+    return statistics.median(a / b for a, b in medians if a is not None and b)
+
+
+def _counts(plan: Plan, *, beside: bool) -> dict[int, int]:
+    return _BESIDE if beside else _COUNTS[plan.size]
 
 
 def _seconds(counts: Mapping[int, int]) -> float:
@@ -158,7 +171,7 @@ def _seconds(counts: Mapping[int, int]) -> float:
 
 def _steps(results: Results, contender: Contender, client: str) -> Steps:
     steps: Steps = {}
-    for _, measured in results.select(**contender.settings, client=client):
+    for _, measured in contender.select(results, client=client):
         arrivals, sent = measured.tables["arrivals"], measured.tables["sent"]
         for rate in dict.fromkeys(sent.column("rate")):
             if isinstance(rate, int):

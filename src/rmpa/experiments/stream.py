@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, cast
 
 from rmpa.experiments import flow
 from rmpa.experiments.arrivals import ARRIVALS, SENT, counting_from
-from rmpa.experiments.contenders import nodelay_of, system_of
+from rmpa.experiments.contenders import nodelay_of, relays_of, system_of
 from rmpa.experiments.model import Measured, Table
 
 if TYPE_CHECKING:
@@ -33,11 +33,12 @@ class Stream:
         stage: Where files go.
         source: Sends.
         sink: Receives.
+        topic: What it subscribes to.
         step: What differs from step to step; the first column of both tables.
     """
 
-    def __init__(self, stage: Stage, source: Process, sink: Process, step: str) -> None:
-        self._stage, self._source, self._sink, self._step = stage, source, sink, step
+    def __init__(self, stage: Stage, source: Process, sink: Process, topic: str, step: str) -> None:
+        self._stage, self._source, self._sink, self._topic, self._step = stage, source, sink, topic, step
         self._came: list[tuple[Value, ...]] = []
         self._sent: list[tuple[Value, ...]] = []
 
@@ -46,7 +47,9 @@ class Stream:
         lead = max(2, round(rate * LEAD))
         begun = flow.begin(self._source, self._stage.scratch, size=size, rate=rate, count=lead + count)
         sent = counting_from(flow.sent(begun), lead)
-        came = counting_from(flow.noted(self._sink, [TOPIC], self._stage.scratch, begun.number, settle=SETTLE), lead)
+        came = counting_from(
+            flow.noted(self._sink, [self._topic], self._stage.scratch, begun.number, settle=SETTLE), lead
+        )
         self._sent += [(step, *row) for row in sent.rows]
         self._came += [(step, *row[1:]) for row in came.rows]
 
@@ -59,10 +62,15 @@ class Stream:
 @contextmanager
 def stream(cell: Cell, stage: Stage, step: str, *, link: str | None = None) -> Iterator[Stream]:
     """Set up a cell's system with a source and a sink; messages flow when it is given out."""
-    client = cast("Client", cell.settings["client"])
+    client, nodelay = cast("Client", cell.settings["client"]), nodelay_of(cell)
     with stage.system(system_of(cell), HOSTS, link=link) as system:
-        sink = system.node("pc", "sink", client, topics=TOPIC, queue=QUEUE, nodelay=nodelay_of(cell))
+        end = TOPIC
+        for host in HOSTS[: relays_of(cell)]:
+            begin, end = end, f"{end}_{host}"
+            library: Client = "own" if client == "own" else "roscpp"
+            system.node(host, "velocity", library, cmd=begin, vel=end, mode="event", queue=QUEUE, nodelay=nodelay)
+        sink = system.node("pc", "sink", client, topics=end, queue=QUEUE, nodelay=nodelay)
         source = system.node("joystick", "source", client, topic=TOPIC, queue=QUEUE)
         flow.wait_connected(source)
-        flow.wait_flowing(source, sink, [TOPIC], stage.scratch)
-        yield Stream(stage, source, sink, step)
+        flow.wait_flowing(source, sink, [end], stage.scratch)
+        yield Stream(stage, source, sink, end, step)
