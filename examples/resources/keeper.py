@@ -3,6 +3,7 @@
 rmpa run examples/resources/keeper.py
 """
 
+from collections import deque
 from typing import Any
 
 from rmpa.resource import Resource, at_least, at_most
@@ -12,8 +13,9 @@ ranges = keeper.input("/sonar/ranges", "sensor_msgs/Range")
 speed = keeper.output("/cmd_vel", "geometry_msgs/Twist")
 distance = keeper.parameter("distance", 1.0, low=0.3, high=3.0, unit="m")
 gain = keeper.parameter("gain", 0.8, low=0.0, high=2.0)
-closeness = keeper.attribute("closeness", better="min", unit="m")
+closeness = keeper.attribute("closeness", better="min", unit="m", category="spatial")
 sonar = keeper.asks("sonar", rate=at_least("15 Hz", hard=True))
+last: deque[float] = deque(maxlen=2)
 
 
 @keeper.profile(offers={"rate": "20 Hz", "closeness": "20 cm"}, cost=1, best_effort=True)
@@ -33,3 +35,5 @@ def control(seen: Any) -> None:
     """Drive towards the distance, half a metre a second at the most."""
     wanted = gain.value * (seen.range - distance.value)
     speed.publish(linear={"x": max(-0.5, min(0.5, wanted))})
+    last.append(seen.range)
+    closeness.observe(max(last) - min(last))  # by as much as what it sees jumps about it cannot keep a distance

@@ -9,10 +9,12 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Final
 
 import pytest
 
+from rmpa.cli.run import load
 from rmpa.experiments.bed.processes import Process, eventually
 from tests.interop.ros import free_port
 
@@ -32,6 +34,16 @@ def test_its_files_are_the_examples() -> None:
     assert [name for name, _ in shown] == ["sonar.py", "keeper.py", "ask.py"]
     for name, text in shown:
         assert (FILES / name).read_text(encoding="utf-8") == text, name
+
+
+def test_the_keeper_says_how_close_it_keeps() -> None:
+    (keeper,) = load(FILES / "keeper.py")
+    seen: list[tuple[str, object]] = []
+    keeper.declared_attributes["closeness"].observer = SimpleNamespace(observe=lambda *said: seen.append(said))
+    keeper.outputs["/cmd_vel"].outlet = SimpleNamespace(publish=lambda _values, _message: None)
+    for distance in (2.0, 2.05, 1.95):
+        keeper.tasks["control"].function(SimpleNamespace(range=distance))
+    assert seen == [("closeness", pytest.approx(jump)) for jump in (0.0, 0.05, 0.1)]
 
 
 class Terminals:
