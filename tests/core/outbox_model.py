@@ -336,6 +336,7 @@ class Model:
         assert sorted(box._turns) == ready == sorted(self.served)
         assert bool(box) == bool(committed or self.urgent or ready)
         assert box.pending_entries == len(box._committed) + len(self.urgent) + len(waiting)
+        assert box.waiting_entries == sum(not entry.pinned for entry in waiting)
 
 
 def make_box(entries: int, max_bytes: int) -> Outbox:

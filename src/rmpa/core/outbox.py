@@ -175,6 +175,11 @@ class Outbox:
         """Entries that wait, urgent ones and the parts that are about to leave included."""
         return len(self._committed) + len(self._urgent) + sum(len(f.parcels) for f in self._flows.values())
 
+    @property
+    def waiting_entries(self) -> int:
+        """Entries of all keys that wait, marks between them and what is about to leave not included."""
+        return sum(len(flow.parcels) - flow.marks for flow in self._flows.values())
+
     def waiting(self, key: int) -> int:
         """Entries of one key that wait."""
         flow = self._flows.get(key)

@@ -94,6 +94,30 @@ def test_reliable_topics_survive_every_outage_that_is_waited_for(block: int) -> 
         play(seed, outages, clocks=bool(seed % 2))
 
 
+async def a_best_effort_route(world: World) -> None:
+    """Its link ends; nobody can say what it misses until the next one, so that it did is what is counted."""
+    a, b = world.sides
+    speaker = world.speak(a, "/urgent", "/two")
+    world.speak(a, "/sure", "/one")
+    world.link()
+    await world.rest(0.5)
+    listener = world.listen(b, "/plain")
+    plain = world.speak(a, "/plain", "/three")
+    world.listen(b, "/sure")
+    await world.rest(1.0)
+    for said in (speaker, plain):
+        said.say(10)
+    await world.rest(0.1)
+    assert numbers(listener, plain) == [1]
+    assert b.bridge.counters["route.interrupted"] == 0
+    await world.outage(0.6)
+    assert (a.bridge.counters["route.interrupted"], b.bridge.counters["route.interrupted"]) == (0, 1)
+
+
+def test_that_a_best_effort_route_was_interrupted_is_counted() -> None:
+    play(0, a_best_effort_route, clocks=False)
+
+
 async def an_owed_acknowledgement(world: World) -> None:
     """The next link stands before an acknowledgement of the last one is due; its numbers mean other routes."""
     a, b = world.sides

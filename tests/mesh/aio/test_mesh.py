@@ -227,6 +227,19 @@ async def test_a_bye_says_why() -> None:
         assert one.downs[0][1] == "maintenance"
         assert other.downs[0][1] == "peer0 left: maintenance"
         assert not one.mesh.peers()
+        assert one.mesh.counters.as_dict() == {"link.down": 1}
+
+
+async def test_what_waits_for_a_link_that_ends_is_counted() -> None:
+    async with peers(2) as (one, other):
+        await until(lambda: one.linked(other) and other.linked(one), "a link")
+        lane = one.link(other).express
+        dropped = sum(lane.send(1, number, 0, bytes(limits.MIB // 8)) for number in range(200))
+        waiting = lane.outbox.waiting_entries
+        assert (waiting > 50, dropped) == (True, 0)
+        other.kill()
+        await until(lambda: bool(one.downs), "it is down")
+        assert waiting - 2 <= one.mesh.counters["link.discarded"] <= waiting, "but for what was on its way"
 
 
 async def test_a_peer_that_is_not_there_says_why_it_is_not_linked() -> None:

@@ -290,7 +290,10 @@ class Bridge:
         if attached.back is not None:
             attached.back.cancel()
             attached.back = None
-        attached.inbound.link_down()
+        interrupted = attached.inbound.link_down()
+        if interrupted:
+            # What is published until the next link stands is sent to nobody, and has no number that could be missed.
+            self.counters.add("route.interrupted", interrupted)
         for part in self._parts:
             part.link_down(attached)
         attached.takers.clear()

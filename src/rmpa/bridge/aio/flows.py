@@ -19,6 +19,7 @@ from rmpa.bridge.quality import Quality
 from rmpa.bridge.watch import Watch
 from rmpa.core import limits
 from rmpa.core.contract import Contract, Durability, Priority, Reliability
+from rmpa.core.counters import Counters
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.reliable import ReliableReceiver
@@ -202,7 +203,7 @@ class LinkTime:
 
     def __init__(self) -> None:
         self.resumed_at: Callable[[], float] = _never
-        """When the link was heard again after its last silence, monotonic seconds."""
+        """When the link's last silence was last seen, monotonic seconds; see ``core.aio.stream``."""
         self.ahead_ns = 0
         """The peer's wall clock less ours."""
         self.error_ns: int | None = None
@@ -224,6 +225,7 @@ class ImportFlow:
         on_ack: ``(sequence)``: tell the sender that everything up to this message has come.
         on_torn: Subscribers were closed in the middle of a message: let them come again.
         on_broken: A reliable route has lost messages all the same.
+        counters: Outlive the route: ``message.lost``, ``message.late``, ``message.stale``, ``message.expired``.
     """
 
     def __init__(
@@ -235,7 +237,9 @@ class ImportFlow:
         on_ack: Callable[[int], None] | None = None,
         on_torn: Callable[[], None] | None = None,
         on_broken: Callable[[Occurred], None] | None = None,
+        counters: Counters | None = None,
     ) -> None:
+        self._counters = counters if counters is not None else Counters()
         self._loop = asyncio.get_running_loop()
         now = self._loop.time()
         self._outlet = outlet
@@ -372,7 +376,7 @@ class ImportFlow:
         """The long way of a sequence: count what is missing; whether the message is not one from before."""
         gap = sequence - (self._next if self._expected == _NONE else self._expected) & _SEQUENCE_MASK
         if gap >= _HALF:
-            self.late += 1
+            self._was_late()
             return False
         # Half a message is here, and its lane is gone, though we have not heard of that yet.
         self._drop_parts()
@@ -391,6 +395,7 @@ class ImportFlow:
 
     def _missing(self, count: int) -> None:
         self.lost += count
+        self._counters.add("message.lost", count)
         occurred = self.watch.lost(count, self._loop.time())
         if self._on_broken is not None and self._receiver is not None:
             self._on_broken(occurred)
@@ -404,16 +409,17 @@ class ImportFlow:
         error = self._time.error_ns
         if error is None or age <= self._stale_ns + error:
             return False
-        if self.contract.lifespan is None and self._loop.time() - age / 1e9 >= self._time.resumed_at():
-            return False  # not an outage held it up, but a slow link, or we
+        if self.contract.lifespan is None:
+            held_up = self._time.resumed_at() - (self._loop.time() - age / 1e9)
+            if held_up * 1e9 <= self._stale_ns + error:
+                return False  # not an outage held it up for so long, but a slow link, or we
         if self.contract.lifespan is not None:
-            self.expired += 1
-            self.watch.expired(1, self._loop.time())
+            self._has_expired()
             return True
         if sequence <= self._kept:
             return False
         if self._stale is not None:
-            self.stale += 1
+            self._gave_way()
         self._stale = (sequence, stamp_ns, bytes(framed))
         if self._timer is None:
             self._timer = self._loop.call_later(limits.STALE_HOLD, self._nothing_newer)
@@ -421,10 +427,23 @@ class ImportFlow:
 
     def _supersede(self) -> None:
         self._stale = None
-        self.stale += 1
+        self._gave_way()
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
+
+    def _was_late(self) -> None:
+        self.late += 1
+        self._counters.add("message.late")
+
+    def _gave_way(self) -> None:
+        self.stale += 1
+        self._counters.add("message.stale")
+
+    def _has_expired(self) -> None:
+        self.expired += 1
+        self._counters.add("message.expired")
+        self.watch.expired(1, self._loop.time())
 
     def _nothing_newer(self) -> None:
         self._timer = None
@@ -449,14 +468,13 @@ class ImportFlow:
         if verdict.gap:
             self._missing(verdict.gap)
         if not verdict.deliver:
-            self.late += 1
+            self._was_late()
             return False
         error = self._time.error_ns
         if self.contract.lifespan is not None and error is not None:
             age = now_ns - stamp_ns + self._time.ahead_ns
             if age > self._stale_ns + error:
-                self.expired += 1
-                self.watch.expired(1, now)
+                self._has_expired()
                 return False
         return True
 
@@ -519,8 +537,7 @@ class ImportFlow:
             return False
         if time.time_ns() - stamp_ns + self._time.ahead_ns <= self._stale_ns + error:
             return False
-        self.expired += 1
-        self.watch.expired(1, self._loop.time())
+        self._has_expired()
         return True
 
     def _complete(self, sequence: int, stamp_ns: int) -> None:

@@ -74,7 +74,7 @@ class Inbound:
     Args:
         core: The local core, in which the proxies are registered.
         prefix: The namespace of this peer's proxies.
-        counters: Where refusals at the proxies' ports are counted.
+        counters: Where refusals at the proxies' ports, and messages that reach no subscriber, are counted.
         on_demand: Called with a source and whether somebody local listens to it.
         on_mismatch: Called with a source, the caller id of a refused subscriber and the text it was told.
         on_occurred: Called with a source and what became of its contract.
@@ -200,6 +200,7 @@ class Inbound:
                 on_ack=on_ack,
                 on_torn=lambda: self._call_back_soon(source, publication),
                 on_broken=lambda occurred: self._on_occurred(source, occurred),
+                counters=self._counters,
             )
             position = flow_before.position if flow_before is not None else None
             known = position is not None and position[0] == action.epoch
@@ -254,12 +255,17 @@ class Inbound:
         if proxy is not None and proxy.publications.get(source.topic) is publication:
             self._register(proxy, source.topic)
 
-    def link_down(self) -> None:
-        """The link is gone: what it brought in part is dropped, and nobody says any more that its sources live."""
+    def link_down(self) -> int:
+        """The link is gone: what it brought in part is dropped, and nobody says any more that its sources live.
+
+        Returns:
+            How many best-effort routes were open: what they miss from now on nobody can count.
+        """
         now = asyncio.get_running_loop().time()
         for flow in self.flows.values():
             flow.torn()
             flow.watch.link_down(now)
+        return sum(flow.contract.reliability is not Reliability.RELIABLE for flow in self.flows.values())
 
     def detach(self, action: Detach) -> None:
         """No data comes on a route any more, or not until its peer is back."""

@@ -89,7 +89,9 @@ class Stream:
         self.last_in = self._loop.time()
         """When bytes last came (``loop.time()``), whether or not ``on_bytes`` was called for them."""
         self.resumed_at = -math.inf
-        """When bytes came after a silence of more than ``limits.STALE_AGE`` (``loop.time()``)."""
+        """When this process last looked, and found nothing, before bytes ended a silence of more than
+        ``limits.STALE_AGE`` (``loop.time()``): what was on its way then was held up, what is younger may have been
+        kept waiting by ourselves."""
         self._fd = sock.fileno()
         # An agent's loop has a short way for the data path; elsewhere (tools, tests) the usual one does.
         add_reader = getattr(self._loop, "add_direct_reader", self._loop.add_reader)
@@ -433,7 +435,7 @@ class Stream:
             # Only a silence in which we looked counts: not that this process got no CPU.
             looked = getattr(self._loop, "looked_before", now)
             if looked - self.last_in > limits.STALE_AGE:
-                self.resumed_at = now
+                self.resumed_at = looked
         self.last_in = now
         self.bytes_in += count
         self._filled += count

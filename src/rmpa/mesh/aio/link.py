@@ -148,6 +148,8 @@ class MeshLink:
         self._malformed = False
         self.silent = False
         """Once it has ended: whether nobody said so; its peer may be there, and the cable is not."""
+        self.discarded = 0
+        """Once it has ended: messages that still waited for it."""
         self.used = False
         """Whether this is the link that is used with its peer."""
         self.express = LaneSender("express")
@@ -241,7 +243,7 @@ class MeshLink:
 
     @property
     def resumed_at(self) -> float:
-        """When the express lane was heard again after its last silence, monotonic seconds; see ``Stream``."""
+        """When the express lane's last silence was last seen, monotonic seconds; see ``Stream``."""
         return self._stream.resumed_at
 
     @property
@@ -475,6 +477,7 @@ class MeshLink:
 
     def _let_go(self) -> None:
         """Break what would make a cycle: the collector finds an old one late, and what waits here may be large."""
+        self.discarded = self.express.outbox.waiting_entries + self.bulk.outbox.waiting_entries
         self.express.clear()
         self.bulk.clear()
         self._machine.on_event = _ignore_event

@@ -270,6 +270,8 @@ class Mesh:
         if link.lane == Lane.BULK:
             self._bulk_ended(link, reason)
             return
+        if link.discarded:
+            self.counters.add("link.discarded", link.discarded)
         self._bulk_backoffs.pop(link.id, None)
         guid = self._dialled.pop(link.id, None)
         if guid is not None:
@@ -310,6 +312,7 @@ class Mesh:
             self._bulk_wanted(link)
         elif isinstance(output, LinkDown):
             _log.info("= %s: link down: %s", output.identity, output.reason)
+            self.counters.add("link.replaced" if output.reason == REPLACED else "link.down")
             down = self._links.get(output.link_id, ended)
             if down is not None:
                 down.silent = down.silent or output.reason == REPLACED
