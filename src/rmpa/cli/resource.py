@@ -14,7 +14,7 @@ _HERE: Final = "rmpa.cli.resource_commands"
 @click.group(
     cls=LazyGroup,
     commands_at={
-        "list": (_HERE, "List resources; those of peers with the peers' names."),
+        "list": ("rmpa.cli.resource_list", "List resources; those of peers with the peers' names."),
         "info": (_HERE, "Show all of a resource: topics, parameters, qualities, profiles, contexts, clients."),
     },
     epilog="""\

@@ -1,9 +1,8 @@
-"""``rmpa resource list|info``."""
+"""``rmpa resource info``."""
 
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
 import click
@@ -22,59 +21,6 @@ if TYPE_CHECKING:
     from rmpa.resource.descriptor import Descriptor, ParameterDescriptor, TaskDescriptor, TopicDescriptor
 
 _TIMES: Final = frozenset({"deadline", "lifespan", "liveliness_lease"})
-_COLOURS: Final = {"active": "green", "inactive": "yellow", "unconfigured": "yellow", "finalized": "red"}
-
-
-@click.command("list", epilog="\b\nExamples:\n  rmpa resource list\n  rmpa resource list --json | jq -r '.[].name'\n")
-@json_option
-@agent_option
-@master_option
-def list_(as_json: bool, agent: str | None, master: str | None) -> None:
-    """List the resources of this module, and those of peers with the peers' names."""
-
-    async def body(room: Room) -> None:
-        for path, count in Counter(one.path for one in room.seen).items():
-            if count > 1:
-                text = "what is asked of that name is heard by all of them; docs/names.md tells them apart"
-                warn(f"{count} modules have a resource {printable(path)}: {text}")
-        states, profiles, contexts = await room.texts(room.seen, "state", "profile", "context")
-        if as_json:
-            print_json(
-                [
-                    {
-                        "name": one.path,
-                        "peer": one.peer,
-                        "role": one.descriptor.role,
-                        "physical": one.descriptor.physical,
-                        "description": one.descriptor.description,
-                        "state": states.get(one),
-                        "profile": profiles.get(one),
-                        "context": contexts.get(one),
-                    }
-                    for one in room.seen
-                ]
-            )
-            return
-        rows = [
-            tuple(
-                printable(cell)
-                for cell in (
-                    str(one),
-                    states.get(one) or "does not answer",
-                    one.descriptor.role,
-                    "device" if one.descriptor.physical else "simulated",
-                    profiles.get(one) or "-",
-                    contexts.get(one) or "-",
-                    one.descriptor.description,
-                )
-            )
-            for one in room.seen
-        ]
-        titles = ("RESOURCE", "STATE", "ROLE", "KIND", "PROFILE", "CONTEXT", "DESCRIPTION")
-        colours = [_COLOURS.get(states.get(one, ""), "") for one in room.seen]
-        print_table(tuple(map(Column, titles)), rows, colours=colours)
-
-    run_around(master, agent, body)
 
 
 @click.command(epilog="\b\nExamples:\n  rmpa resource info /sonar\n  rmpa resource info base:/arm --json\n")

@@ -1,0 +1,92 @@
+"""Which resources a module of this machine has seen before, as its ``rmpa run`` wrote them down."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rmpa.bridge.proxy_names import proxied_node
+from rmpa.cli.output import duration, printable, warn
+from rmpa.cli.resources_seen import Seen
+from rmpa.resource.aio.known import FILE
+from rmpa.resource.aio.store import module_dir, read_state, state_dir
+from rmpa.resource.sightings import Sightings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from rmpa.cli.master import Master
+
+
+@dataclass(frozen=True, slots=True)
+class Remembered:
+    """One resource.
+
+    Args:
+        module: Who has seen it; the names are those of its graph.
+        seen: As it was then.
+        first: When it was seen first, Unix seconds.
+        last: And last.
+    """
+
+    module: str
+    seen: Seen
+    first: float
+    last: float
+
+    @property
+    def ago(self) -> float:
+        """Seconds since it was seen last; 0 where the clock was set back meanwhile."""
+        return max(0.0, time.time() - self.last)
+
+    def __str__(self) -> str:
+        """Where it is now, for a column of states."""
+        return f"last seen {duration(self.ago)} ago, not here now"
+
+
+def remembered(master: Master, state: str | None, here: Iterable[Seen]) -> list[Remembered]:
+    """The resources that were seen before and are not here now, the latest first.
+
+    Args:
+        master: If it is an agent's, those that its module has seen; else those of all modules of this machine.
+        state: Where they are written down; ``None``: where ``rmpa run`` does so by default.
+        here: Those that are here.
+    """
+    directory = state_dir(os.environ, state)
+    if directory is None:
+        return []
+    snapshot = master.snapshot()
+    paths = [module_dir(directory, snapshot.agent.name) / FILE] if snapshot is not None else []
+    present = {(each.path, each.peer) for each in here}
+    found = [
+        each
+        for path in paths or sorted(directory.glob(f"*/{FILE}"))
+        for each in _read(path)
+        if (each.seen.path, each.seen.peer) not in present
+    ]
+    return sorted(found, key=lambda each: -each.last)
+
+
+def _read(path: Path) -> list[Remembered]:
+    if not path.exists():
+        return []
+    try:
+        rows = read_state(path)
+    except OSError as error:
+        warn(printable(str(error)))
+        return []
+    latest: dict[tuple[str, str | None], Remembered] = {}
+    for each in Sightings(rows).all:  # the latest first
+        proxy = proxied_node(each.caller)
+        peer = proxy[0] if proxy is not None else None
+        one = Remembered(
+            path.parent.name,
+            Seen(each.path, peer, each.caller, each.descriptor),
+            each.first_ns / 1e9,
+            each.last_ns / 1e9,
+        )
+        latest.setdefault((each.path, peer), one)
+    return list(latest.values())
