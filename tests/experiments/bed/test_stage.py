@@ -171,9 +171,9 @@ def test_two_systems_on_loopback_do_not_meet() -> None:
         flow.wait_connected(source)
 
 
+@pytest.mark.ros
+@pytest.mark.netns
 class TestCables:
-    pytestmark = [pytest.mark.ros, pytest.mark.netns]
-
     @of_both_kinds
     def test_cut_cable_stops_what_runs_over_it(self, kind: Kind) -> None:
         with _system(NETWORK, kind) as (stage, robot):
