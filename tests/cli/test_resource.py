@@ -67,6 +67,7 @@ def sonar() -> Resource:
     def broken() -> None:
         raise OSError("no such device")
 
+    one.asks("eye", priority=3)
     one.context("docked", when="/battery.charging and ~gain > 3")
     one.context("away", requires={"rate": at_least("20 Hz")}, profiles=["fast"])
     return one
@@ -177,12 +178,20 @@ def test_all_of_a_resource(rmpa: Rmpa, running: Member) -> None:
         "away by hand",
         "measure 2 Hz (parameter pace)",
         "clean 0.1 Hz",
+        "/eye nothing at present 3",
     ):
         assert line in lines, out
     about = as_json(rmpa, "resource", "info", "sonar")
     assert about["parameters"] == {"gain": 1.0, "beam": "wide", "pace": 2.0, "profile": "", "context": ""}
     assert about["health"]["values"]["profile"] == "slow"
     assert about["descriptor"]["profiles"][1]["name"] == "fast"
+    running.resource.demands["/eye"].ask(blur=at_most("2 px", hard=True), sight__rate=at_least("5 Hz"))
+    wishes = {"blur": "<= 2 px hard", "sight.rate": ">= 5 Hz"}
+    deadline = time.monotonic() + 30
+    while as_json(rmpa, "resource", "info", "sonar")["descriptor"]["asks"][0]["wishes"] != wishes:
+        assert time.monotonic() < deadline
+    text = " ".join(rmpa("resource", "info")[1].split())
+    assert "ASKS OF FOR PRIORITY /eye blur <= 2 px hard; sight.rate >= 5 Hz 3" in text
 
 
 def test_a_profile_by_hand(rmpa: Rmpa, running: Member, remote: list[dict[str, Any]]) -> None:
@@ -313,7 +322,7 @@ def test_nobody_is_there(rmpa: Rmpa, core: RosCore) -> None:
 
 
 def write_down(path: Path, *each: tuple[str, str, float]) -> None:
-    """Write a module's file as ``rmpa run`` does: of each resource its path, its node, and how many s ago it was seen."""
+    """Write a module's file as ``rmpa run`` does: of each resource its path, its node, and seconds since then."""
 
     async def write() -> None:
         store, sightings = Store(path), Sightings()

@@ -35,6 +35,8 @@ def sonar() -> Resource:
     @one.task(on=joy, on_failure="stop", stuck_after="2 s")
     async def steer(message: object) -> None: ...
 
+    one.asks("eye", priority=2, rate=at_least("5 Hz"), sight__age=at_most("1 s", hard=True))
+    one.asks("/robot1/ear")
     one.context(
         "docked", when="/charging == true", requires={"rate": at_least("1 Hz", hard=True)}, profiles=["saving"]
     )
@@ -64,6 +66,8 @@ def test_a_descriptor_says_all_of_it_and_survives_the_way() -> None:
     assert [(i.topic, i.required) for i in described.inputs] == [("/joy", False)]
     assert described.contexts[0].requires == {"rate": ">= 1 Hz hard"}
     assert [(t.name, t.rate, t.on) for t in described.tasks] == [("measure", 40.0, ""), ("steer", None, "/joy")]
+    asked = [(a.resource, a.wishes, a.priority) for a in described.asks]
+    assert asked == [("/eye", {"rate": ">= 5 Hz", "sight.age": "<= 1 s hard"}, 2), ("/robot1/ear", {}, 0)]
 
 
 @pytest.mark.parametrize("text", [b"", b"{}", b"[]", b"\xff", b"[" * 9999, b'{"version":1,"name":3}'])

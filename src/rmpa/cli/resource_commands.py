@@ -29,7 +29,7 @@ _TIMES: Final = frozenset({"deadline", "lifespan", "liveliness_lease"})
 @agent_option
 @master_option
 def info(resource: str | None, as_json: bool, agent: str | None, master: str | None) -> None:
-    """Show all of a RESOURCE: its topics, parameters, qualities, profiles, contexts, tasks and clients."""
+    """Show all of a RESOURCE: topics, parameters, qualities, profiles, contexts, tasks, what it asks, and clients."""
 
     async def body(room: Room) -> None:
         one = room.pick(resource)
@@ -103,6 +103,13 @@ def _print_info(one: Seen, about: dict[str, Any]) -> None:
     )
     _table(("CONTEXT", "WHEN"), ((c.name, c.when or "by hand") for c in said.contexts))
     _table(("TASK", "RUNS"), ((t.name, _runs(t, about["parameters"])) for t in said.tasks))
+    _table(
+        ("ASKS OF", "FOR", "PRIORITY"),
+        (
+            (a.resource, "; ".join(f"{k} {v}" for k, v in a.wishes.items()) or "nothing at present", str(a.priority))
+            for a in said.asks
+        ),
+    )
     _table(
         ("CLIENT", "IS TOLD", "ASKS"),
         (

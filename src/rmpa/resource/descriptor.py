@@ -94,6 +94,20 @@ class TaskDescriptor(msgspec.Struct, frozen=True, kw_only=True):
     follows: str = ""
 
 
+class DemandDescriptor(msgspec.Struct, frozen=True, kw_only=True):
+    """What it asks of another resource at present.
+
+    Attributes:
+        resource: The other one's node, as this resource's module has it.
+        wishes: By the other one's attribute, as a requirement says it: ``>= 20 Hz hard``; empty: nothing.
+        priority: The higher one wins a conflict between clients.
+    """
+
+    resource: str
+    wishes: dict[str, str] = {}
+    priority: int = 0
+
+
 class Descriptor(msgspec.Struct, frozen=True, kw_only=True):
     """A whole resource.
 
@@ -120,6 +134,7 @@ class Descriptor(msgspec.Struct, frozen=True, kw_only=True):
     profiles: tuple[ProfileDescriptor, ...] = ()
     contexts: tuple[ContextDescriptor, ...] = ()
     tasks: tuple[TaskDescriptor, ...] = ()
+    asks: tuple[DemandDescriptor, ...] = ()
 
     def serialize(self) -> str:
         """As JSON."""
@@ -201,6 +216,14 @@ def describe(resource: Resource, node: str) -> Descriptor:
                 follows=t.follows.name if t.follows is not None else "",
             )
             for t in resource.tasks.values()
+        ),
+        asks=tuple(
+            DemandDescriptor(
+                resource=d.resource,
+                wishes={key.replace("__", "."): str(wish) for key, wish in d.wishes.items()},
+                priority=d.priority,
+            )
+            for d in resource.demands.values()
         ),
     )
 

@@ -8,7 +8,9 @@ import pytest
 from rmpa.core.errors import ConfigError
 from rmpa.resource.aio.member import Member
 from rmpa.resource.declare import Resource, at_least, at_most
+from rmpa.resource.descriptor import Descriptor
 from rmpa.ros.aio.core import RosCore
+from rmpa.ros.aio.node import Node
 from rmpa.ros.diagnostic_array import Level
 
 if TYPE_CHECKING:
@@ -69,6 +71,11 @@ async def test_a_controller_asks_as_much_as_its_profile_needs(core: RosCore) -> 
     assert member.demands.troubles() == ([], [])
     needs.ask(blur=at_most("2 px"))
     await until(lambda: other.adapter.loop.requirements, "something is asked again")
+    # Its descriptor says what it asks at present, to everybody.
+    said: list[str] = []
+    async with Node("reader", master_uri=core.uri) as node:
+        await node.subscribe("/hand/descriptor", "std_msgs/String", lambda m: said.append(m.message.data))
+        await until(lambda: said and Descriptor.parse(said[-1]).asks[0].wishes == {"blur": "<= 2 px"}, "it says so")
     await member.close()
     await until(lambda: not other.adapter.loop.requirements, "it is forgotten")
     await other.close()

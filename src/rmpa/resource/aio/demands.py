@@ -106,6 +106,7 @@ class Demands(RuntimePart):
             demand.answer = None
             wishes: dict[str, Any] = dict(demand.wishes)
             client.ask(priority=demand.priority if wishes else 0, **wishes)
+            self._runtime.describe_again()
 
     async def _watch(self, name: str, client: ResourceClient) -> None:
         """Learn which of its outputs is the first: ``rate`` alone is that one's."""

@@ -131,6 +131,11 @@ class Runtime:
             self._texts[name] = (publisher, text)
             publisher.publish(publisher.make({"data": text}))
 
+    def describe_again(self) -> None:
+        """Say in the descriptor what has changed of it."""
+        self.descriptor = describe(self.resource, self.node.name)
+        self.say_again(TOPIC, self.descriptor.serialize())
+
     def set_parameter(self, name: str, value: ParameterValue) -> None:
         """Set a parameter, and let the parts know.
 
