@@ -37,6 +37,8 @@ def test_a_table_without_numbers_where_they_belong_is_refused() -> None:
         pairs(Table(("sequence", "came_ns"), [("x", 1)]))
 
 
-@pytest.mark.parametrize(("value", "text"), [(None, "-"), (0.0, "0"), (1.23456, "1.23"), (12345.6, "12,346")])
-def test_figures_for_tables(value: float | None, text: str) -> None:
-    assert counted(value) == text
+@pytest.mark.parametrize(
+    ("value", "factor", "text"), [(None, 2.0, "-"), (0.0012345, 1e3, "1.23"), (12.345678, 1e3, "12,346")]
+)
+def test_figures_for_tables(value: float | None, factor: float, text: str) -> None:
+    assert counted(value, factor=factor) == text

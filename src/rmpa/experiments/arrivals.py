@@ -10,6 +10,7 @@ import itertools
 from typing import TYPE_CHECKING, Final
 
 from rmpa.experiments.model import Table
+from rmpa.experiments.report import words
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -52,11 +53,8 @@ def lost(arrivals: Table, sent: Table, **where: Value) -> int:
 
 
 def counted(value: float | None, digits: int = 3, factor: float = 1.0) -> str:
-    """A figure for a table: so many significant digits, but all before the point; a dash for what is not known."""
-    if value is None:
-        return "-"
-    shown = value * factor
-    return f"{shown:,.0f}" if abs(shown) >= 10**digits else f"{shown:.{digits}g}"
+    """A figure for a table, in another unit if a factor is given; a dash for what is not known."""
+    return words.number(None if value is None else value * factor, digits)
 
 
 def _pairs(table: Table, first: str, second: str, where: dict[str, Value]) -> Iterator[tuple[int, int]]:

@@ -30,6 +30,7 @@ CMD: Final = "/cmd"
 VEL: Final = "/vel"
 MODES: Final = ("polled", "event")
 """The paper's velocity node, which looks for a command at 10 Hz, and one that takes each as it comes."""
+_NODES: Final = {"polled": "polled velocity node", "event": "event-driven velocity node"}
 _SIZE: Final = 64
 """Bytes of a message: about a Joy's or a Twist's."""
 _LEAD: Final = 2
@@ -48,8 +49,8 @@ _JITTER_LIMIT: Final = 1.1
 _DELAY_LIMIT_MS: Final = 0.2
 _POLLED_LIMIT: Final = 1.01
 """No worse: within a hundredth, which is half a ms of the mean of 50."""
-_SPREAD_MS: Final = (1e3, 4)
-"""Seconds become ms, with so many digits."""
+_DIGITS: Final = 4
+"""Of means and deviations: as many as the paper has."""
 
 _QUANTITIES: Final = {"cmd": "Command Order", "vel": "Velocity Order", "delay": "Control Computation Delay"}
 _PAPER: Final = {
@@ -275,7 +276,7 @@ def _grid(ways: Ways, client: str, mode: str) -> Grid:
             rows.append(_paper_row(quantity, shown))
     heads = [f"{what}, {contender.label}" for what in ("mean", "sd") for contender in shown]
     return Grid(
-        f"Table 1. {client}, velocity node {mode}; periods and delay, ms",
+        f"Table 1. {client}, {_NODES[mode]}; periods and delay, ms",
         ("at the pc", *heads, "sd, RMPA / classic"),
         rows,
         "Medians over rounds; the ratio is of neighbouring rounds, in brackets its 95 % interval over them.",
@@ -283,8 +284,7 @@ def _grid(ways: Ways, client: str, mode: str) -> Grid:
 
 
 def _of(found: dict[int, Round], figure: Callable[[Round, str], float | None], quantity: str) -> str:
-    factor, digits = _SPREAD_MS
-    return counted(statistics.median(figure(one, quantity) for one in found.values()), digits, factor)
+    return counted(statistics.median(figure(one, quantity) for one in found.values()), _DIGITS, 1e3)
 
 
 def _ratio_text(ways: Ways, quantity: str) -> str:
@@ -294,8 +294,8 @@ def _ratio_text(ways: Ways, quantity: str) -> str:
 
 def _paper_row(quantity: str, shown: Sequence[Contender]) -> tuple[str, ...]:
     mean_ours, mean_theirs, sd_ours, sd_theirs = (1e3 * value for value in _PAPER[quantity])
-    means = {RMPA: counted(mean_ours, 4), CLASSIC: counted(mean_theirs, 4)}
-    deviations = {RMPA: counted(sd_ours, 4), CLASSIC: counted(sd_theirs, 4)}
+    means = {RMPA: counted(mean_ours, _DIGITS), CLASSIC: counted(mean_theirs, _DIGITS)}
+    deviations = {RMPA: counted(sd_ours, _DIGITS), CLASSIC: counted(sd_theirs, _DIGITS)}
     columns = [of.get(contender, "") for of in (means, deviations) for contender in shown]
     return (f"{_QUANTITIES[quantity]}, in the paper", *columns, f"{sd_ours / sd_theirs:.3g}")
 
@@ -320,7 +320,7 @@ def _figure(ways: Ways, client: str, mode: str) -> Figure:
         caption += " The steps of the delay are the phases that both systems were given."
     return Figure(
         f"fig-8-9-{client}-{mode}",
-        f"Figs. 8 and 9. Periods and control computation delay: {client}, velocity node {mode}",
+        f"Figs. 8 and 9. Periods and control computation delay: {client}, {_NODES[mode]}",
         caption,
         tuple(panels),
         columns=3,

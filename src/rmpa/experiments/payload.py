@@ -223,7 +223,7 @@ def _line(ladder: Ladder, *, every: bool) -> tuple[str, str, str, str]:
     if line is None:
         return "-", "-", "-", "-"
     carried = _KB * 8 / (line.slope * 1e3) if line.slope > 0 else None
-    return counted(line.intercept), counted(line.slope, 3, 1e3), counted(carried), f"{line.r2:.5f}"
+    return counted(line.intercept), counted(line.slope, factor=1e3), counted(carried), f"{line.r2:.5f}"
 
 
 def _grids(found: Found) -> Iterator[Grid]:
@@ -236,7 +236,12 @@ def _grids(found: Found) -> Iterator[Grid]:
             for contender in shown:
                 of = samples.summary(ladders[contender].values.get(size, []), ladders[contender].lost.get(size, 0))
                 medians.append(of.p50)
-                row += [counted(of.p50), counted(of.p95), counted(of.largest), f"{of.count} / {of.lost}"]
+                row += [
+                    counted(of.p50),
+                    counted(of.p95),
+                    counted(of.largest),
+                    f"{of.count} / {of.lost}",
+                ]
             ours, theirs = medians if len(medians) > 1 else (None, None)
             rows.append((*row, counted(ours / theirs if ours and theirs else None)))
         heads = [f"{what}, {one.label}" for one in shown for what in ("p50", "p95", "largest", "came / lost")]

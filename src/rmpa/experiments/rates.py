@@ -192,7 +192,7 @@ def _grid(steps: Mapping[Contender, Steps], client: str) -> Grid:
             values = (found.p50, step.quartiles, step.width, found.p95, found.p99, found.p999, found.largest)
             median = base.summary.p50 if base else None
             ratio = found.p50 / median if found.p50 is not None and median else None
-            cells = [counted(value, 3, _MS_TO_US) for value in values]
+            cells = [counted(value, factor=_MS_TO_US) for value in values]
             rows.append((f"{rate} Hz", contender.label, *cells, str(found.count), str(found.lost), counted(ratio)))
     heads = (
         "p50",
