@@ -130,6 +130,8 @@ GREETINGS_PER_SECOND: Final = 25.0
 WHISPERS_PER_SECOND: Final = 10.0
 """Heartbeats by unicast to peers without a link, over all of them: each takes 0.2 ms, and of a roster full of
 invented peers each still gets one a minute."""
+WHISPERS_AT_ONCE: Final = 8
+"""Of these and of those to linked peers, some 0.1 ms each, before anything else has a turn."""
 ROSTER_EVICTIONS_PER_SECOND: Final = 10.0
 """In a full roster, peers without a link that missed a heartbeat and give way to new ones."""
 BEACONS_PER_WAKE: Final = 64
@@ -349,6 +351,10 @@ LEARNT_TYPES_MAX: Final = 256
 """Message types learnt from publishers that a process remembers; the one unused for longest is forgotten."""
 NODE_MASTER_CHECK: Final = 0.5
 """Between a node's looks whether its master still knows it: a restarted core has its nodes back within a second."""
+NODE_UNREGISTER_TIMEOUT: Final = 3.0
+"""For an ending node to take all its registrations back; a master that hangs must not keep it from its end."""
+NODE_UNREGISTER_AT_ONCE: Final = 16
+"""Of these calls at a time: a connection each."""
 RECEIVED_QUEUE: Final = 1000
 """Messages that wait for an ``async for``; the oldest is dropped beyond it."""
 HTTP_BODY_MAX: Final = 8 * MIB

@@ -247,6 +247,50 @@ async def test_unadvertised_and_unsubscribed(core: RosCore) -> None:
         assert "/in" not in core.state().subscribers
 
 
+async def test_an_ending_node_unregisters_side_by_side(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One behind the other they had one second together, and a slow master kept some."""
+    one = node(core, "n")
+    async with one:
+        for number in range(6):
+            await one.advertise(f"/out{number}", "std_msgs/String")
+            await one.subscribe(f"/in{number}", "std_msgs/String")
+        await one.follow_param("/key")
+        call_master, together = one.call_master, asyncio.Barrier(13)
+
+        async def meeting(method: str, *params: Any) -> Any:
+            await together.wait()  # no call goes on before all have begun
+            if params[0] == "/out0":
+                raise PeerRefused("the master", "one that is refused")
+            return await call_master(method, *params)
+
+        monkeypatch.setattr(one, "call_master", meeting)
+    assert core.state().publishers == {"/out0": {"/n": one.uri}} | {
+        topic: who for topic, who in core.state().publishers.items() if "/n" not in who
+    }
+    assert not any("/n" in who for who in core.state().subscribers.values())
+
+
+async def test_a_master_that_hangs_does_not_keep_a_node_from_its_end(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "NODE_UNREGISTER_TIMEOUT", 0.1)
+    one = node(core, "n")
+    async with one:
+        for number in range(20):
+            await one.advertise(f"/out{number}", "std_msgs/String")
+        begun: list[str] = []
+
+        async def hanging(method: str, *_params: Any) -> Any:
+            begun.append(method)
+            await asyncio.Event().wait()
+
+        monkeypatch.setattr(one, "call_master", hanging)
+        async with asyncio.timeout(DEADLINE):
+            await one.close()
+    assert len(begun) == limits.NODE_UNREGISTER_AT_ONCE
+    assert one.stopped.is_set()
+
+
 async def test_names_are_remapped_and_loopback_is_used_for_a_local_master(core: RosCore) -> None:
     environment = RosEnvironment.read({"ROS_NAMESPACE": "robot"}, ["out:=there", "__name:=bob"], ["192.0.2.1"])
     async with Node("n", master_uri=core.uri, environment=environment) as one:

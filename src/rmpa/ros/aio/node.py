@@ -43,7 +43,6 @@ __all__ = ["Node", "Publisher", "Received", "Service", "ServiceClient", "Subscri
 
 _log = logging.getLogger(__name__)
 _REMEDY: Final = "start one (rmpa up, or roscore), or set ROS_MASTER_URI to one that runs"
-_SHORT: Final = 1.0
 _NO_DEFAULT: Final = object()
 
 
@@ -482,11 +481,7 @@ class Node:
             self._watch.cancel()
             await asyncio.wait([self._watch])
         self.stopped.set()
-        try:
-            async with asyncio.timeout(_SHORT):
-                await self._unregister_all()
-        except (TimeoutError, RmpaError) as error:
-            _log.debug("! %s: could not unregister: %s", self.name, error)
+        await self._unregister_all()
         for publisher in self._publishers.values():
             await publisher.drained()
         for subscriber in self._subscribers.values():
@@ -494,11 +489,25 @@ class Node:
         await self._slave.close()
 
     async def _unregister_all(self) -> None:
-        for topic in self._publishers:
-            await self.call_master("unregisterPublisher", topic, self.uri)
-        for topic in self._subscribers:
-            await self.call_master("unregisterSubscriber", topic, self.uri)
-        for service in self._services:
-            await self.call_master("unregisterService", service, self._slave.service_uri)
-        for key in self._followed:
-            await self.call_master("unsubscribeParam", self.uri, key)
+        """Take all registrations back, side by side: what a slow master does not take by one deadline stays there."""
+        at_once = asyncio.Semaphore(limits.NODE_UNREGISTER_AT_ONCE)
+
+        async def take_back(method: str, *params: XmlRpcValue) -> None:
+            try:
+                async with at_once:
+                    await self.call_master(method, *params)
+            except RmpaError as error:
+                _log.debug("! %s: %s %s: %s", self.name, method, params, error)
+
+        everything = [
+            *(take_back("unregisterPublisher", topic, self.uri) for topic in self._publishers),
+            *(take_back("unregisterSubscriber", topic, self.uri) for topic in self._subscribers),
+            *(take_back("unregisterService", service, self._slave.service_uri) for service in self._services),
+            *(take_back("unsubscribeParam", self.uri, key) for key in self._followed),
+        ]
+        try:
+            async with asyncio.timeout(limits.NODE_UNREGISTER_TIMEOUT), asyncio.TaskGroup() as group:
+                for one in everything:
+                    group.create_task(one, name=f"unregister {self.name}")
+        except TimeoutError:
+            _log.debug("! %s: the master at %s is slow; not everything is unregistered", self.name, self.master_uri)
