@@ -181,6 +181,7 @@ def test_the_one_taken_is_feasible_whenever_one_is(profiles: list[Profile], aske
     assert decision.feasible == any(score.feasible for score in scores)
     among = [s for s in scores if s.feasible] or list(scores)
     taken = next(score for score in scores if score.profile == decision.profile)
+    assert decision.distance == taken.distance  # to the bit, however many of them were worked out
     if decision.feasible:
         assert taken.distance == min(score.distance for score in among)
     else:

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 EPSILON: Final = 1e-3
 """What one unit of cost adds to the distance: it decides among profiles that serve nearly alike."""
+_FEW: Final = 3
+"""Of more than one in so many profiles the distances are worked out at once, of fewer one by one."""
 _MISSING: Final = 1.0
 """The shortfall of an attribute that a profile does not offer: as far as the whole range."""
 
@@ -101,21 +103,37 @@ class Decision:
     best_effort: bool = False
 
 
-@dataclass(frozen=True, slots=True)
 class _Column:
     """One attribute under one bound, a value for each profile.
 
     Args:
         bound: What is asked.
         deltas: The shortfalls.
-        weighted: Times the weight.
-        squares: Their squares, times the weight.
     """
 
-    bound: Bound
-    deltas: list[float]
-    weighted: list[float]
-    squares: list[float]
+    __slots__ = ("_squares", "bound", "deltas")
+
+    def __init__(self, bound: Bound, deltas: list[float]) -> None:
+        self.bound = bound
+        self.deltas = deltas
+        self._squares: list[float] | None = None
+
+    @property
+    def weighted(self) -> list[float]:
+        """Times the weight."""
+        weight = self.bound.weight
+        return self.deltas if weight == 1 else [weight * delta for delta in self.deltas]
+
+    @property
+    def squares(self) -> list[float]:
+        """Their squares, times the weight; most decisions need few of them."""
+        if self._squares is None:
+            weight = self.bound.weight
+            if weight == 1:
+                self._squares = [delta * delta for delta in self.deltas]
+            else:
+                self._squares = [weight * delta * delta for delta in self.deltas]
+        return self._squares
 
 
 class Decider:
@@ -177,19 +195,27 @@ class Decider:
             bounds: By attribute; those of attributes that are not declared raise ``KeyError``.
             excluded: Profiles that are left out, by name, and why.
         """
-        distances, hard = self._judge(bounds)
+        columns = [self._column(name, bound) for name, bound in bounds.items()]
         left_out = excluded or {}
         allowed = [index for index, name in enumerate(self._profiles) if name not in left_out]
         names = self.profiles
-        feasible = [index for index in allowed if hard[index] == 0.0]
+        hard_deltas = [column.deltas for column in columns if column.bound.hard]
+        fails = [*map(any, zip(*hard_deltas, strict=True))]  # a shortfall is above 0
+        feasible = [index for index in allowed if not fails[index]] if fails else allowed
+        if len(feasible) == 1 or (feasible and len(feasible) * _FEW < len(names)):
+            near = {index: self._distance(index, columns) for index in feasible}
+            best = min(feasible, key=near.__getitem__)
+            return Decision(names[best], near[best], feasible=True)
         if feasible:
+            distances = self._distances(columns)
             best = min(feasible, key=distances.__getitem__)
             return Decision(names[best], distances[best], feasible=True)
         if self._best_effort and self._best_effort not in left_out:
             best = names.index(self._best_effort)
-            return Decision(names[best], distances[best], feasible=False, best_effort=True)
+            return Decision(names[best], self._distance(best, columns), feasible=False, best_effort=True)
         if not allowed:
             return Decision("", math.inf, feasible=False)
+        distances, hard = self._judge(bounds)
         best = min(allowed, key=lambda index: (hard[index], distances[index], self._costs[index]))
         return Decision(names[best], distances[best], feasible=False)
 
@@ -207,34 +233,40 @@ class Decider:
 
     def distance(self, name: str, bounds: Mapping[str, Bound]) -> float:
         """One profile's distance."""
-        return self._judge(bounds)[0][self.profiles.index(name)]
+        columns = [self._column(asked, bound) for asked, bound in bounds.items()]
+        return self._distance(self.profiles.index(name), columns)
 
     def _judge(self, bounds: Mapping[str, Bound]) -> tuple[list[float], list[float]]:
         """Distances, and largest weighted hard shortfalls, by profile."""
-        if not bounds:
-            return list(self._costs), [0.0] * len(self._profiles)
         columns = [self._column(name, bound) for name, bound in bounds.items()]
-        scale = sum(bound.weight for bound in bounds.values())
-        sums = map(sum, zip(*(column.squares for column in columns), strict=True))
-        distances = [math.sqrt(total / scale) + cost for total, cost in zip(sums, self._costs, strict=True)]
+        distances = self._distances(columns)
         hard = [column.weighted for column in columns if column.bound.hard]
         if not hard:
             return distances, [0.0] * len(self._profiles)
         return distances, [*map(max, zip(*hard, strict=True))] if len(hard) > 1 else hard[0]
+
+    def _distances(self, columns: Sequence[_Column]) -> list[float]:
+        """``D`` of every profile."""
+        if not columns:
+            return list(self._costs)
+        scale = sum(column.bound.weight for column in columns)
+        sums = map(sum, zip(*(column.squares for column in columns), strict=True))
+        return [math.sqrt(total / scale) + cost for total, cost in zip(sums, self._costs, strict=True)]
+
+    def _distance(self, index: int, columns: Sequence[_Column]) -> float:
+        """``D`` of one profile, to the bit as ``_distances`` has it."""
+        if not columns:
+            return self._costs[index]
+        scale = sum(column.bound.weight for column in columns)
+        total = sum(column.bound.weight * column.deltas[index] * column.deltas[index] for column in columns)
+        return math.sqrt(total / scale) + self._costs[index]
 
     def _column(self, name: str, bound: Bound) -> _Column:
         """One attribute's part in every profile's distance; most bounds are as they were at the last decision."""
         known = self._columns.get(name)
         if known is not None and known.bound == bound:
             return known
-        deltas = self._deltas(name, bound)
-        weight, weighted = bound.weight, deltas
-        if weight != 1:
-            weighted = [weight * delta for delta in deltas]
-            squares = [weight * delta * delta for delta in deltas]
-        else:
-            squares = [delta * delta for delta in deltas]
-        made = self._columns[name] = _Column(bound, deltas, weighted, squares)
+        made = self._columns[name] = _Column(bound, self._deltas(name, bound))
         return made
 
     def _deltas(self, name: str, bound: Bound) -> list[float]:
