@@ -9,6 +9,9 @@ from typing import Final
 
 _TEXT: Final = re.compile(r"(?P<ip>[0-9.]+):(?P<port>[0-9]+)(?:#(?P<incarnation>[0-9]+))?")
 
+_LOOPBACK: Final = 127
+_MULTICAST: Final = 224
+
 
 @dataclass(frozen=True, slots=True, order=True)
 class Guid:
@@ -73,7 +76,8 @@ class Guid:
     @property
     def endpoint(self) -> tuple[str, int]:
         """``(address, port)`` as sockets want it; shared by all incarnations of one peer."""
-        return str(self.address), self.port
+        high = self.value >> 32
+        return f"{high >> 24}.{high >> 16 & 255}.{high >> 8 & 255}.{high & 255}", self.port
 
     @property
     def place(self) -> int:
@@ -83,7 +87,12 @@ class Guid:
     @property
     def dialable(self) -> bool:
         """Whether one peer can be reached there; see ``dialable``."""
-        return dialable(self.address, self.port)
+        return _is_of_one(self.value >> 56) and self.port != 0
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether its address leads back to whoever uses it."""
+        return self.value >> 56 == _LOOPBACK
 
     def __str__(self) -> str:
         """``10.0.0.1:40001#7``."""
@@ -95,5 +104,9 @@ def dialable(address: IPv4Address, port: int) -> bool:
 
     Who named such an address could make those who believe it shout at a whole network.
     """
-    high = int(address) >> 24
-    return 0 < high < 224 and port != 0
+    return _is_of_one(int(address) >> 24) and port != 0
+
+
+def _is_of_one(first: int) -> bool:
+    """Whether an address that begins with this byte is of one machine."""
+    return 0 < first < _MULTICAST

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import TYPE_CHECKING
 
 from rmpa.core import limits
@@ -39,7 +40,7 @@ class GossipTurn:
             if voice is to or not (voice.linked or now - voice.heard <= limits.MULTICAST_SILENCE):
                 continue
             guid = voice.identity.guid
-            if near or not guid.address.is_loopback:
+            if near or not guid.is_loopback:
                 guids.append(guid)
                 if len(guids) == limits.BEACON_GOSSIP_MAX:
                     self._turn = number + 1
@@ -53,6 +54,9 @@ class Whispers:
     def __init__(self) -> None:
         self._turn = 0
         self._allowed = Bucket(limits.WHISPERS_PER_SECOND, limits.WHISPERS_PER_SECOND * limits.HEARTBEAT_INTERVAL)
+        self._waiting: deque[Voice] = deque()
+        self.at: float | None = None
+        """When ``some`` has somebody."""
 
     def choose(self, voices: Sequence[Voice], now: float) -> tuple[list[Voice], bool]:
         """Those of ``voices`` who get one now, the others in turn from call to call; whether that is all of them."""
@@ -65,3 +69,18 @@ class Whispers:
             chosen.append(voice)
             self._turn = (self._turn + 1) % len(others)
         return chosen, True
+
+    def plan(self, voices: Sequence[Voice], now: float) -> bool:
+        """Let those whom ``choose`` chooses have one; whether that is all of them."""
+        chosen, everybody = self.choose(voices, now)
+        waiting = set(map(id, self._waiting))
+        self._waiting += [voice for voice in chosen if id(voice) not in waiting]
+        self.at = now if self._waiting else None
+        return everybody
+
+    def some(self) -> list[Voice]:
+        """The next of them; so few that whoever else has something to do need not wait."""
+        few = [self._waiting.popleft() for _ in range(min(limits.WHISPERS_AT_ONCE, len(self._waiting)))]
+        if not self._waiting:
+            self.at = None
+        return few

@@ -214,7 +214,7 @@ class Roster:
             return
         if self._multicast:
             self._outputs.append(SendMulticast(self._beacon(BeaconKind.GOODBYE)))
-        for voice in self._whispered_to(now):
+        for voice in self._whispers.choose(self._unheard_by_multicast(now), now)[0]:
             for address in _addresses(voice):
                 self._send(BeaconKind.GOODBYE, address)
         self._closed = True
@@ -226,6 +226,7 @@ class Roster:
         return earliest(
             self._heartbeat_at,
             self._spread_at,
+            self._whispers.at,
             self._burst[0] if self._burst else None,
             self._greetings.next_timer(),
             self._seats.next_timer(),
@@ -251,6 +252,10 @@ class Roster:
                     self._send(BeaconKind.ANNOUNCE, address)
         if self._spread_at is not None and self._spread_at <= now:
             self._spread(now)
+        for voice in self._whispers.some():
+            gossip = self._gossip(self._seats.present(), voice, now)
+            for address in _addresses(voice):
+                self._send(BeaconKind.HEARTBEAT, address, gossip)
         for address in self._greetings.due(now):
             self._send(BeaconKind.ANNOUNCE, address)
 
@@ -428,11 +433,10 @@ class Roster:
 
     def _evict(self) -> bool:
         """Make room for a linked peer: the one that is silent for longest has no link to prove that it exists."""
-        oldest = min(self._seats.unlinked(), default=None)
-        if oldest is None:
-            return False
-        self._remove(oldest[1])
-        return True
+        oldest = self._seats.oldest_unlinked()
+        if oldest is not None:
+            self._remove(oldest[1])
+        return oldest is not None
 
     def _evict_silent(self, now: float) -> bool:
         """Make room for one that speaks: another has no link and has missed a heartbeat, and may be invented.
@@ -441,15 +445,13 @@ class Roster:
         """
         if now < self._no_room_until:
             return False
-        heard, key = min(self._seats.unlinked(), default=(now, 0))
+        heard, key = self._seats.oldest_unlinked() or (now, 0)
         self._no_room_until = heard + limits.HEARTBEAT_LATE
-        if now < self._no_room_until:
-            return False
-        if not self._room.take(now):
-            self._no_room_until = self._room.next(now)
-            return False
-        self._remove(key)
-        return True
+        if now >= self._no_room_until and self._room.take(now):
+            self._remove(key)
+            return True
+        self._no_room_until = max(self._no_room_until, self._room.next(now))
+        return False
 
     def _remove(self, key: int) -> None:
         seat = self._seats.get(key)
@@ -484,17 +486,9 @@ class Roster:
             self._outputs.append(SendMulticast(self._beacon(kind, gossip)))
 
     def _whisper(self, now: float) -> None:
-        """The heartbeat, and all we know, to each peer that multicast does not join with us."""
-        for voice in self._whispered_to(now):
-            gossip = self._gossip(self._seats.present(), voice, now)
-            for address in _addresses(voice):
-                self._send(BeaconKind.HEARTBEAT, address, gossip)
-
-    def _whispered_to(self, now: float) -> list[Voice]:
-        chosen, everybody = self._whispers.choose(self._unheard_by_multicast(now), now)
-        if not everybody:
+        """The heartbeat, and all we know, to peers that multicast does not join with us; a few at once."""
+        if not self._whispers.plan(self._unheard_by_multicast(now), now):
             self.counters.add("beacon.whisper_limited")
-        return chosen
 
     def _spread(self, now: float) -> None:
         self._spread_at = None
@@ -539,7 +533,7 @@ class Roster:
     def _hearsay(self, beacon: Beacon, now: float) -> None:
         """Greet those whom the sender knows and we do not; only their own word puts them into the roster."""
         for guid in beacon.gossip:
-            if guid.place in self._seats or (guid.address.is_loopback and not self._own.guid.address.is_loopback):
+            if guid.place in self._seats or (guid.is_loopback and not self._own.guid.is_loopback):
                 continue
             if not self._greetings.learn(guid.endpoint, now):
                 self.counters.add("gossip.full")
@@ -556,12 +550,12 @@ class Roster:
         met = {*self._own.endpoints}
         for voice in self._seats.present():
             met.update(voice.identity.endpoints, _addresses(voice))
-        near = self._own.guid.address.is_loopback
+        near = self._own.guid.is_loopback
         return [a for a in addresses if a not in met and (near or not a[0].startswith("127."))]
 
     def _gossip(self, voices: list[Voice], to: Voice | None, now: float) -> tuple[Guid, ...]:
         identity = to.identity if to is not None else self._own
-        return self._gossip_turn.choose(voices, to, now, near=identity.guid.address.is_loopback)
+        return self._gossip_turn.choose(voices, to, now, near=identity.guid.is_loopback)
 
     # --- small reads ------------------------------------------------------------------------------------------
 

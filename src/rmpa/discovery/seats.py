@@ -88,10 +88,14 @@ class Seats:
                     self._by_name.setdefault(seat.current.identity.name, []).append(seat)
         return list(self._by_name.get(name, ()))
 
-    def unlinked(self) -> Iterator[tuple[float, int]]:
-        """When each seat's peer without a link was last heard, and its place."""
-        for place, seat in self._all.items():
-            if seat.current is None:
-                yield float("-inf"), place
-            elif not seat.current.linked:
-                yield seat.current.heard, place
+    def oldest_unlinked(self) -> tuple[float, int] | None:
+        """Of the seats without a linked peer the one that was heard the longest ago: when, and its place."""
+        never = float("-inf")
+        return min(
+            (
+                (seat.current.heard if seat.current is not None else never, place)
+                for place, seat in self._all.items()
+                if seat.current is None or not seat.current.linked
+            ),
+            default=None,
+        )
