@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -18,9 +20,11 @@ from rmpa.experiments.report.figures import draw
 from rmpa.experiments.report.panels import Drawn, settle, thinned
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from matplotlib.axes import Axes
+    from matplotlib.legend import Legend
 
 LATE = [60.0, 70.0, 900.0] * 40
 UP = [1.0, 2.0, 4.0, 8.0]
@@ -102,7 +106,7 @@ def _drawn(*shown: Panel) -> list[Drawn]:
         axes = canvas.add_subplot(1, len(shown), at + 1, sharey=first)
         first = first or axes
         found.append(panels.draw(axes, panel, look))
-    settle(found, look)
+    settle(found)
     return found
 
 
@@ -167,3 +171,51 @@ def test_a_box_shows_no_percentile_that_its_samples_do_not_carry(count: int, p99
     lines: list[Any] = [*drawn.axes.lines]
     shown = {float(y) for line in lines if line.get_marker() == "_" for y in line.get_ydata()}
     assert shown == ({989.0} if p99 else set())
+
+
+def test_whole_numbers_stay_whole() -> None:
+    (drawn,) = _drawn(Panel("", "message", "ms", (Series("a", [0, 1, 2, 3], UP),)))
+    assert all(float(tick).is_integer() for tick in drawn.axes.get_xticks())
+
+
+def test_panels_that_say_different_things_have_legends_of_their_own(tmp_path: Path) -> None:
+    def panel(*labels: str) -> Panel:
+        return Panel("", "x", "y", tuple(Series(label, UP, UP, "line", "rmpa") for label in labels))
+
+    figure = Figure("fig", "", "", (panel("a", "b", "c"), panel("d", "e", "f")))
+    with _kept_canvas() as canvases:
+        draw(figure, LATE, tmp_path)
+        draw(replace(figure, panels=(panel("a", "b"), panel("b"))), LATE, tmp_path)
+    apart, together = canvases
+    assert [_said(axes.get_legend()) for axes in apart.axes] == [["a", "b", "c"], ["d", "e", "f"], []]
+    assert apart.legends == []
+    assert [_said(legend) for legend in together.legends] == [["a", "b"]]
+
+
+def test_a_line_through_points_with_their_label_is_told_of_once_as_points(tmp_path: Path) -> None:
+    points, fit = Series("a", UP, UP, "points", "rmpa"), Series("a", [1, 8], [1, 8], "line", "rmpa")
+    other = Series("b", UP, UP, "line", "classic")
+    with _kept_canvas() as canvases:
+        draw(Figure("fig", "", "", (Panel("", "x", "y", (points, fit, other)),)), [], tmp_path)
+    (legend,) = canvases[0].legends
+    assert _said(legend) == ["a", "b"]
+    assert [line.get_linestyle() for line in legend.get_lines()] == ["None", "-"]
+
+
+def _said(legend: Legend | None) -> list[str]:
+    return [text.get_text() for text in legend.get_texts()] if legend else []
+
+
+@contextmanager
+def _kept_canvas() -> Iterator[list[Canvas]]:
+    """What is drawn meanwhile, to be looked at."""
+    kept: list[Canvas] = []
+
+    class Kept(Canvas):
+        def savefig(self, *args: Any, **words: Any) -> None:
+            if self not in kept:
+                kept.append(self)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("matplotlib.figure.Figure", Kept)
+        yield kept

@@ -63,3 +63,10 @@ def test_anchors_are_those_of_code_hosts() -> None:
 def test_values_of_a_manifest() -> None:
     assert words.value([1.23456, True, None, "x", {"a": [1]}]) == "1.235, yes, none, x, a 1"
     assert (words.count(1, "cell"), words.count(1200, "cell")) == ("1 cell", "1,200 cells")
+
+
+@pytest.mark.parametrize(
+    ("carries", "text"), [("100mbit", "100 Mbit/s"), ("9kbit", "9 kbit/s"), ("1gbit", "1 Gbit/s"), ("", "not shaped")]
+)
+def test_what_a_cable_carries(carries: str, text: str) -> None:
+    assert words.link(carries) == text

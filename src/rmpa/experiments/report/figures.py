@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
     from matplotlib.gridspec import GridSpec
+    from matplotlib.legend import Legend
 
     from rmpa.experiments.model import Figure, Panel
     from rmpa.experiments.report.panels import Drawn
@@ -29,6 +30,8 @@ _WIDTH: Final = 9.6
 """Inches; shown 830 pixels wide, as on a project's page, a letter of 9 points is 11 pixels high."""
 _LINE: Final = 105
 """Letters of a title in one line."""
+_LEGEND: Final = 4
+"""Labels that the legend of a whole figure holds where its panels differ in them."""
 _FOOT: Final = 8.0
 """How many times as large the values of one panel may be that shares its axis with another."""
 _STYLE: Final[dict[Any, Any]] = {  # keys of matplotlib's own type, which differs between its versions
@@ -98,6 +101,7 @@ def _height(panel: Panel, rows: int) -> float:
 
 
 def _panels(canvas: Canvas, grid: GridSpec, figure: Figure, rows: Sequence[Sequence[Panel]]) -> None:
+    apart = _legends_apart(figure.panels, rows)
     look = looks(series for panel in figure.panels for series in panel.series)
     above: dict[int, Drawn] = {}
     found: dict[str, Artist] = {}
@@ -110,7 +114,7 @@ def _panels(canvas: Canvas, grid: GridSpec, figure: Figure, rows: Sequence[Seque
             axes = canvas.add_subplot(
                 grid[number, column], sharex=upper and upper.axes, sharey=left[0].axes if left else None
             )
-            drawn = panels.draw(axes, panel, look)
+            drawn = panels.draw(axes, panel, looks(panel.series) if apart else look, _LINE // len(row))
             if upper is not None:
                 upper.axes.set_xlabel("")
                 upper.axes.tick_params(labelbottom=False)
@@ -120,15 +124,30 @@ def _panels(canvas: Canvas, grid: GridSpec, figure: Figure, rows: Sequence[Seque
             else:
                 together.append([drawn])
             above[column] = drawn
+            handles: dict[str, Artist] = {}
             for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-                found.setdefault(label, handle)
+                handles.setdefault(label, handle)  # of a line through points with its label, the points
+            if apart:
+                _clear(axes.legend(handles.values(), handles, loc="upper left", bbox_to_anchor=(-0.05, -0.16)))
+            found |= {label: handle for label, handle in handles.items() if label not in found}
         for drawns in together:
-            panels.settle(drawns, look)
-    if len(found) > 1:
-        legend = canvas.legend(list(found.values()), list(found), loc="outside lower left", ncols=min(4, len(found)))
-        for line in legend.get_lines():
-            line.set_markersize(5)
-            line.set_alpha(1)
+            panels.settle(drawns)
+    if len(found) > 1 and not apart:
+        columns = max(1, min(4, _LINE // (6 + max(map(len, found)))))
+        _clear(canvas.legend(list(found.values()), list(found), loc="outside lower left", ncols=columns))
+
+
+def _legends_apart(shown: Sequence[Panel], rows: Sequence[Sequence[Panel]]) -> bool:
+    """Whether each panel has a legend of its own below it: they say different things, and too many for one."""
+    labels = [frozenset(series.label for series in panel.series if len(series.y)) for panel in shown]
+    return len(rows) == 1 and len(set(labels)) > 1 and len(frozenset().union(*labels)) > _LEGEND
+
+
+def _clear(legend: Legend) -> None:
+    """Show points in a legend as large as one can see them."""
+    for line in legend.get_lines():
+        line.set_markersize(5)
+        line.set_alpha(1)
 
 
 def _same_x(upper: Panel, lower: Panel) -> bool:
@@ -162,8 +181,9 @@ def _lateness(axes: Axes, late: Sequence[float]) -> None:
     axes.spines["right"].set_visible(True)
     axes.spines["left"].set_visible(False)
     axes.set_title("noise of the host", loc="left", fontsize=8.5)
-    for text, percent in (("p50", 50.0), ("p99", 99.0), ("max", 100.0)):
+    for text, percent, above in (("p50", 50.0, True), ("p99", 99.0, False), ("max", 100.0, True)):
         value = percentile(ordered, percent)
         axes.axhline(value, color=panels.QUIET, linewidth=0.8, linestyle=panels.DASHES)
         shown = f"{value:.0f} µs" if value < 1000 else f"{value / 1000:.3g} ms"
-        panels.say(axes, f"{text} {shown}", (1, value), ("axes fraction", "data"), (-2, 1), "right")
+        shift = (-2, 1 if above else -10)
+        panels.say(axes, f"{text} {shown}", (1, value), ("axes fraction", "data"), shift, "right")

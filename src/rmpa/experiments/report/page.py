@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from itertools import groupby
 from typing import TYPE_CHECKING, Final
@@ -28,6 +29,8 @@ _LOOPBACK: Final = (
     "**On loopback**: without root or ROS 1, all ran on this machine's loopback with our own nodes and core "
     "in place of rospy, roscpp and roscore. No cable was shaped or cut. Figures of real ROS 1 may differ."
 )
+_LIBRARIES: Final = {"rospy": "rospy", "roscpp": "roscpp", "own": "our own library"}
+_SAID_WITH_THE_CODE: Final = {"rmpa", "commit"}
 _READING: Final = (
     "Classic ROS and RMPA took turns in one run on one machine; read ratios rather than absolute figures. Latency "
     "counts from the moment at which a message was due, not from when its sender got round to it. Beside each figure "
@@ -82,9 +85,9 @@ def _lead(manifest: Manifest) -> str:
 def _bed(plan: Plan) -> str:
     if plan.bed == "loopback":
         return "Every host of the bed is a process on loopback."
-    link = f"cables of {plan.link}" if plan.link else "cables that are not shaped"
-    nodes = " and ".join(plan.clients)
-    return f"Hosts are network namespaces on one bridge with {link}; nodes are those of {nodes}, unmodified."
+    link = f"cables of {words.link(plan.link)}" if plan.link else "cables that are not shaped"
+    nodes = " and ".join(_LIBRARIES[client] for client in plan.clients)
+    return f"Hosts are network namespaces on one bridge with {link}; both systems run the same nodes, of {nodes}."
 
 
 # --- claims ---------------------------------------------------------------------------------------------------------
@@ -159,7 +162,7 @@ def _grid(grid: Grid) -> Iterator[str]:
     yield f"**{grid.title}**"
     yield words.table(list(grid.columns), [list(row) for row in grid.rows])
     if grid.note:
-        yield grid.note
+        yield re.sub(r"^[*+-] ", r"\\\g<0>", grid.note)  # a footnote is no list
 
 
 def _settings(settings: object) -> str:
@@ -195,14 +198,18 @@ def _manifest(manifest: Manifest) -> Iterator[str]:
         ["size", plan.size],
         ["bed", plan.bed],
         ["nodes of", ", ".join(plan.clients)],
-        ["cables", plan.link or "not shaped"],
+        ["cables", words.link(plan.link)],
         ["seed", str(plan.seed)],
         ["code", f"rmpa {code.version}, digest {code.digest}" + (f", commit {code.commit}" if code.commit else "")],
         ["files changed since that commit", "yes" if code.changed else "no"],
         ["cells measured", f"{done:,} of {len(manifest.cells):,}"],
         ["cells tried more than once", f"{again:,}"],
         ["time spent measuring", f"{spent / 60:.1f} min"],
-        *([name.replace("_", " "), words.value(value)] for name, value in manifest.machine.items() if value != ""),
+        *(
+            [name.replace("_", " "), words.value(value)]
+            for name, value in manifest.machine.items()
+            if value != "" and name not in _SAID_WITH_THE_CODE
+        ),
     ]
     yield words.table(["", ""], [[words.plain(name), words.plain(value)] for name, value in rows])
     for session in manifest.sessions:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import textwrap
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
+    from matplotlib.ticker import Locator
 
     from rmpa.experiments.model import Panel, Series
     from rmpa.experiments.report.colours import Look
@@ -43,11 +45,13 @@ class Drawn:
     Args:
         axes: Where it is.
         panel: What it shows.
+        looks: Of its series, by label.
         beside: Where the distribution of its points goes, if that is wanted.
     """
 
     axes: Axes
     panel: Panel
+    looks: Mapping[str, Look]
     beside: Axes | None
 
     @property
@@ -56,9 +60,16 @@ class Drawn:
         return [y for series in self.panel.series for y in series.y]
 
 
-def draw(axes: Axes, panel: Panel, looks: Mapping[str, Look]) -> Drawn:
-    """Draw a panel's series and words; ``settle`` does the rest when those that share its axes are drawn too."""
-    axes.set_title(panel.title, loc="left")
+def draw(axes: Axes, panel: Panel, looks: Mapping[str, Look], letters: int = 100) -> Drawn:
+    """Draw a panel's series and words; ``settle`` does the rest when those that share its axes are drawn too.
+
+    Args:
+        axes: Where.
+        panel: What.
+        looks: Of its series, by label.
+        letters: Of a title that have room above it; a longer one is broken.
+    """
+    axes.set_title(textwrap.fill(panel.title, letters), loc="left")
     axes.set_xlabel(panel.xlabel)
     axes.set_ylabel(panel.ylabel)
     axes.grid(visible=True, alpha=0.25, linewidth=0.6)
@@ -76,14 +87,16 @@ def draw(axes: Axes, panel: Panel, looks: Mapping[str, Look]) -> Drawn:
         axes.minorticks_off()
     elif places.equal:
         axes.set_xticks(range(len(places.groups)), [f"{x:g}" for x in places.groups])
+    elif not panel.logx and full and all(float(x).is_integer() for one in full for x in one.x):
+        axes.xaxis.set_major_locator(_whole_numbers())  # numbers of messages, of modules
     for text, y in panel.marks.items():
         axes.axhline(y, color=QUIET, linestyle=DASHES, linewidth=1)
         say(axes, text, (1, y), ("axes fraction", "data"), (-3, 2), "right")
     beside = axes.inset_axes((1.01, 0, 0.17, 1), sharey=axes) if panel.distribution else None
-    return Drawn(axes, panel, beside)
+    return Drawn(axes, panel, looks, beside)
 
 
-def settle(together: Sequence[Drawn], looks: Mapping[str, Look]) -> None:
+def settle(together: Sequence[Drawn]) -> None:
     """Bound the vertical axis that some panels share, and draw what depends on it."""
     low, high = _bounds(together)
     for drawn in together:
@@ -101,7 +114,7 @@ def settle(together: Sequence[Drawn], looks: Mapping[str, Look]) -> None:
             _beyond(drawn, low, high)
         _moments(drawn.axes, drawn.panel.moments)
         if drawn.beside is not None:
-            _distribution(drawn.beside, drawn.panel.series, looks)
+            _distribution(drawn.beside, drawn.panel.series, drawn.looks)
 
 
 class _Places:
@@ -283,6 +296,12 @@ def _beyond(drawn: Drawn, low: float, high: float) -> None:
     if below:
         text = f"{len(below)} beyond, down to {min(below):.4g} ▼"
         say(drawn.axes, text, (1, 0), ("axes fraction", "axes fraction"), (-3, 2), "right")
+
+
+def _whole_numbers() -> Locator:
+    from matplotlib.ticker import MaxNLocator
+
+    return MaxNLocator(nbins=8, integer=True, steps=[1, 2, 5, 10])
 
 
 def log_numbers(axis: Axis) -> None:

@@ -56,6 +56,12 @@ def value(found: object) -> str:
     return f"{found:.4g}" if isinstance(found, float) else str(found)
 
 
+def link(carries: str) -> str:
+    """What a cable carries, as ``tc`` has it (``100mbit``), for people."""
+    found = re.fullmatch(r"(\d+)([kmg])bit", carries)
+    return f"{found[1]} {found[2].upper().replace('K', 'k')}bit/s" if found else carries or "not shaped"
+
+
 def count(amount: int, one: str, many: str = "") -> str:
     """An amount of something: ``1 cell``, ``3 cells``."""
     return f"{amount:,} {one if amount == 1 else many or one + 's'}"
@@ -81,7 +87,7 @@ def table(columns: list[str], rows: list[list[str]]) -> str:
 
 
 def _is_figure(cell: str) -> bool:
-    return not cell or cell[0] in "0123456789-≤≥<>±"
+    return not cell or cell[0] in "0123456789-\N{EN DASH}≤≥<>±"
 
 
 def slug(heading: str) -> str:
