@@ -94,9 +94,9 @@ class _Stream:
 
 _ABOUT: Final = f"""\
 *joystick* sends commands of {_SIZE} B at {_RATE:g} Hz and images of 1 MB at {_IMAGE_RATE:g} Hz to *pc*, each by a
-node of its own. The cable carries 100 Mbit/s, less than the images alone would need, so that there is always one waiting.
-Packets leave by the kernel's usual three bands (`pfifo_fast` inside `tbf`). Classic ROS has a connection for each
-topic, with tcp_nodelay. Latency runs from when a command was due.
+node of its own. The cable carries 100 Mbit/s, less than the images alone would need, so that there is always one
+waiting. Packets leave by the kernel's usual three bands (`pfifo_fast` inside `tbf`). Classic ROS has a connection for
+each topic, with tcp_nodelay. Latency runs from when a command was due.
 """
 
 
