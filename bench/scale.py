@@ -20,10 +20,10 @@ from rich.table import Table
 from bench import plot, results, schedule
 from bench.bed import NODES, Bed
 from bench.tables import Target, dash, ratio, show_targets, us
-from rmpa.experiments import samples
+from rmpa.experiments import flow, samples
+from rmpa.experiments.bed import ros
 from rmpa.experiments.bed.processes import eventually
 from rmpa.experiments.usage import Meter, Usage, add
-from tests.interop.ros import compiled
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -127,26 +127,24 @@ class Fan(schedule.Stream):
         bed: As of ``Stream``; so are the others.
         source: Publishes.
         target: The first receiver.
+        topic: That both listen to.
         between: The two agents.
     """
 
-    def __init__(self, bed: Bed, source: Process, target: Process, between: Mapping[str, Process]) -> None:
-        super().__init__(bed, source, target, between)
+    def __init__(
+        self, bed: Bed, source: Process, target: Process, topic: str, between: Mapping[str, Process]
+    ) -> None:
+        super().__init__(bed, source, target, topic, between)
         self.far: Process | None = None
         self.far_latencies: list[float] = []
-        self._far_file = bed.home / f"far-{source.pid}"
 
     def end(self) -> schedule.Arrivals:
         """Also read what came to the other receiver."""
         arrivals = super().end()
         self.far_latencies = []
-        if self.far is not None:
-            mark = self.far.mark_events()
-            self.far.tell(f"{self._round} {self._far_file} 0")
-            self.far.wait_event("noted", since=mark)
-            rows = array("Q")
-            rows.frombytes(self._far_file.read_bytes())
-            self.far_latencies = schedule.parse(rows, [], self._lead).latencies()
+        if self.far is not None and self._begun is not None:
+            came = flow.noted(self.far, self._topics, self._home, self._begun.number, settle=0)
+            self.far_latencies = schedule.parse(came, [], self._lead).latencies()
         return arrivals
 
 
@@ -166,11 +164,10 @@ class Mesh:
         self.grow(peers)
         self._control = schedule.direct(bed, network=1).stream(bed, _TOPIC)
         first, second = self.agents[:2]
-        words = ["--topic", _TOPIC, "--nodelay"]
         target = self.receiver(second)
         shell = bed.shell(first.host, first.core_port)
-        source = shell.start(compiled("pace", NODES), *words, name="pace", commands=True)
-        self.stream = Fan(bed, source, target, {"agent 1": first.process, "agent 2": second.process})
+        source = shell.start(ros.compiled("source"), "--topic", _TOPIC, name="source", commands=True)
+        self.stream = Fan(bed, source, target, _TOPIC, {"agent 1": first.process, "agent 2": second.process})
         self.stream.wait_flowing()
 
     def grow(self, peers: int) -> list[Agent]:
@@ -191,8 +188,8 @@ class Mesh:
     def receiver(self, agent: Agent) -> Process:
         """A subscriber of the stream in one module."""
         shell = self._bed.shell(agent.host, agent.core_port)
-        words = ["--topic", _TOPIC, "--nodelay"]
-        made = shell.start(compiled("arrive", NODES), *words, name=f"arrive@{agent.name}", commands=True)
+        words = ["--topics", _TOPIC, "--nodelay"]
+        made = shell.start(ros.compiled("sink"), *words, name=f"sink@{agent.name}", commands=True)
         made.wait_event("up")
         return made
 

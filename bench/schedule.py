@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 
-from bench.bed import NODES, Bed
 from bench.tables import usage_row
-from rmpa.experiments import machine, samples
+from rmpa.experiments import flow, machine, samples
 from rmpa.experiments.bed.agents import RMPA
-from rmpa.experiments.bed.processes import Deadline
+from rmpa.experiments.bed.processes import BedError, Deadline
+from rmpa.experiments.bed.ros import NODES
 from rmpa.experiments.usage import Meter, Usage, add
 from tests.interop.ros import NODES as TEST_NODES
 from tests.interop.ros import compiled
@@ -33,8 +33,10 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+    from bench.bed import Bed
     from rmpa.experiments.bed.agents import Agent
     from rmpa.experiments.bed.processes import Process
+    from rmpa.experiments.model import Table
     from tests.interop.ros import Ros
 
 LEAD_IN: Final = 0.2
@@ -50,7 +52,6 @@ NODE_PRIORITY: Final = 40
 """Of measuring nodes under SCHED_FIFO: below the agents', as a user's nodes would be."""
 _AGENT_PRIORITY: Final = 50
 """What ``--realtime`` asks for by default."""
-_rounds = itertools.count(1)
 
 
 @dataclass(slots=True)
@@ -124,22 +125,26 @@ class Stream:
 
     Args:
         bed: Where scratch files go.
-        source: Runs ``pace``.
-        target: Runs ``arrive``.
+        source: Runs the package's ``source``.
+        target: Runs its ``sink``.
+        topic: That the target listens to.
         between: The processes between them, by name.
     """
 
-    def __init__(self, bed: Bed, source: Process, target: Process, between: Mapping[str, Process]) -> None:
+    def __init__(
+        self, bed: Bed, source: Process, target: Process, topic: str, between: Mapping[str, Process]
+    ) -> None:
         self.source, self.target = source, target
         self.pids = {
             "publisher": source.pid,
             **{name: process.pid for name, process in between.items()},
             "receiver": target.pid,
         }
-        self._sent = bed.home / f"sent-{source.pid}"
-        self._came = bed.home / f"came-{target.pid}"
-        self._round = self._lead = self._mark = 0
-        self._deadline = self._rate = 0.0
+        self._topics = [topic]
+        self._home = bed.home
+        self._begun: flow.Round | None = None
+        self._lead = 0
+        self._rate = 0.0
         self._meter = Meter({})
 
     def wait_flowing(self) -> None:
@@ -149,7 +154,7 @@ class Stream:
             Deadline: None came.
         """
         deadline = time.monotonic() + _FLOWING_DEADLINE
-        self.source.wait_event("connected", _FLOWING_DEADLINE)
+        flow.wait_connected(self.source, timeout=_FLOWING_DEADLINE)
         while not self.run(64, 100.0, 0.1).sequence:
             if time.monotonic() > deadline:
                 raise Deadline(f"nothing of {self.source.name} came to {self.target.name}")
@@ -161,13 +166,11 @@ class Stream:
 
     def begin(self, size: int, rate: float, seconds: float) -> None:
         """Start a round; ``end`` returns what came of it."""
-        self._round = next(_rounds)
         self._lead = max(2, round(rate * LEAD_IN))
         count = self._lead + max(2, round(rate * seconds))
-        self._rate, self._deadline = rate, count / rate + 30.0
-        self._mark = self.source.mark_events()
+        self._rate = rate
         self._meter = Meter(self.pids)
-        self.source.tell(f"{self._round} {size} {rate} {count} {self._sent}")
+        self._begun = flow.begin(self.source, self._home, size=size, rate=rate, count=count)
 
     def wait_lead_in(self, seconds: float) -> None:
         """Let so much of a round that was begun go by."""
@@ -175,24 +178,26 @@ class Stream:
 
     def end(self) -> Arrivals:
         """Wait until all is sent, and nothing more arrives; return what came."""
-        self.source.wait_event("sent", self._deadline, since=self._mark)
+        if self._begun is None:
+            raise BedError("begin() comes first")
+        late = _numbers(flow.sent(self._begun), "late_ns")
         usage = self._meter.read()
-        mark = self.target.mark_events()
-        self.target.tell(f"{self._round} {self._came} {_SETTLE}")
-        self.target.wait_event("noted", since=mark)
-        rows, late = array("Q"), array("Q")
-        rows.frombytes(self._came.read_bytes())
-        late.frombytes(self._sent.read_bytes())
-        arrivals = parse(rows, late, self._lead)
+        came = flow.noted(self.target, self._topics, self._home, self._begun.number, settle=_SETTLE)
+        arrivals = parse(came, late, self._lead)
         arrivals.usage, arrivals.total = usage, len(late)
         return arrivals
 
 
-def parse(rows: Sequence[int], late: Sequence[int], lead: int) -> Arrivals:
-    """Read the files of the two nodes (``arrive.cpp``, ``pace.cpp``), without the first ``lead`` messages."""
-    counted = [at for at in range(0, len(rows), 3) if rows[at] >= lead]
-    sequence, due, came = (array("Q", [rows[at + column] for at in counted]) for column in range(3))
-    return Arrivals(max(0, len(late) - lead), sequence, due, came, late[lead:], lead=lead)
+def parse(came: Table, late: Sequence[int], lead: int) -> Arrivals:
+    """Read what a sink noted and how late its source was (``flow``), without the first ``lead`` messages."""
+    columns = [_numbers(came, name) for name in ("sequence", "due_ns", "came_ns")]
+    counted = [at for at, sequence in enumerate(columns[0]) if sequence >= lead]
+    sequence, due, there = (array("Q", [column[at] for at in counted]) for column in columns)
+    return Arrivals(max(0, len(late) - lead), sequence, due, there, late[lead:], lead=lead)
+
+
+def _numbers(table: Table, name: str) -> Sequence[int]:
+    return array("Q", [value for value in table.column(name) if isinstance(value, int)])
 
 
 @dataclass(slots=True)
@@ -229,9 +234,9 @@ class Way:
             for number, shell in enumerate((self.here, self.there), 1):
                 begin, end = end, f"{topic}_{number}"
                 between[f"relay {number}"] = node(shell, "echo", "--topic", begin, "--reply", end, nodes=TEST_NODES)
-        target = node(self.there, "arrive", "--topic", end)
-        source = node(self.here, "pace", "--topic", topic)
-        made = Stream(bed, source, target, between)
+        target = node(self.there, "sink", "--topics", end)
+        source = node(self.here, "source", "--topic", topic)
+        made = Stream(bed, source, target, end, between)
         made.wait_flowing()
         return made
 

@@ -1,21 +1,19 @@
-// What the talkers send and the listeners check, and the options of every node; payload.py is the same in Python.
+// What the talkers send and the listeners check; payload.py is the same in Python. The rest is every node's (node.hpp).
 #pragma once
-
-#include <ros/ros.h>
-#include <std_msgs/UInt8MultiArray.h>
 
 #include <boost/crc.hpp>
 #include <chrono>
-#include <cstdint>
-#include <cstdio>
-#include <cstring>
-#include <map>
 #include <sstream>
-#include <string>
 #include <thread>
-#include <vector>
+
+#include "node.hpp"
 
 namespace payload {
+
+using node::hints;
+using node::init;
+using node::Options;
+using node::say;
 
 constexpr size_t kHeader = 20;
 constexpr size_t kPeriod = 251;
@@ -29,39 +27,6 @@ inline uint32_t crc32(const uint8_t* data, size_t size) {
 inline uint64_t wall_ns() {
   using namespace std::chrono;
   return duration_cast<nanoseconds>(system_clock::now().time_since_epoch()).count();
-}
-
-// "--word value" pairs and bare "--word" flags.
-class Options {
- public:
-  Options(int argc, char** argv) {
-    for (int i = 1; i < argc; ++i) {
-      std::string word = argv[i];
-      if (word.rfind("--", 0) != 0) continue;
-      bool has_value = i + 1 < argc && std::string(argv[i + 1]).rfind("--", 0) != 0 &&
-                       std::string(argv[i + 1]).find(":=") == std::string::npos;
-      values_[word.substr(2)] = has_value ? argv[i + 1] : "1";
-      if (has_value) ++i;
-    }
-  }
-  std::string text(const std::string& key, const std::string& fallback) const {
-    auto found = values_.find(key);
-    return found == values_.end() ? fallback : found->second;
-  }
-  double number(const std::string& key, double fallback) const {
-    auto found = values_.find(key);
-    return found == values_.end() ? fallback : std::stod(found->second);
-  }
-  bool flag(const std::string& key) const { return values_.count(key) > 0; }
-
- private:
-  std::map<std::string, std::string> values_;
-};
-
-inline void init(int& argc, char** argv, const Options& options, const std::string& program) {
-  std::string name = options.text("name", "");
-  uint32_t how = name.empty() ? uint32_t(ros::init_options::AnonymousName) : 0u;
-  ros::init(argc, argv, name.empty() ? program : name, how);
 }
 
 // Bodies of one size: the same bytes as payload.py makes.
@@ -141,13 +106,5 @@ class Tally {
   uint64_t bytes_ = 0, bad_ = 0;
   std::map<uint32_t, Source> sources_;
 };
-
-// One machine-readable line; fields are JSON members.
-inline void say(const std::string& event, const std::string& fields = "") {
-  std::printf("@ {\"event\": \"%s\"%s%s}\n", event.c_str(), fields.empty() ? "" : ", ", fields.c_str());
-  std::fflush(stdout);
-}
-
-inline ros::TransportHints hints(const Options& options) { return ros::TransportHints().tcpNoDelay(options.flag("nodelay")); }
 
 }  // namespace payload

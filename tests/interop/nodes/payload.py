@@ -5,13 +5,15 @@ CRC-32 of the body (4); then the body: bytes of a fixed pattern that starts else
 """
 
 import argparse
-import json
 import struct
-import sys
-import threading
 import time
 import zlib
 from typing import Any
+
+import node
+from node import say
+
+__all__ = ["HEADER", "Pattern", "Tally", "of_another_release", "parser", "say"]
 
 HEADER = struct.Struct("<IIQI")
 _PERIOD = 251
@@ -91,20 +93,8 @@ def of_another_release(kind: Any) -> type:
     return type(kind.__name__, (kind,), fields)
 
 
-_lock = threading.Lock()
-
-
-def say(event: str, **fields: object) -> None:
-    """Write one machine-readable line."""
-    with _lock:
-        sys.stdout.write("@ " + json.dumps({"event": event, **fields}) + "\n")
-        sys.stdout.flush()
-
-
 def parser(description: str) -> argparse.ArgumentParser:
-    """The options that every node has."""
-    made = argparse.ArgumentParser(description=description, allow_abbrev=False)
-    made.add_argument("--name", default="", help="node name; default: the program's, anonymous")
+    """The options that every node of ours has."""
+    made: argparse.ArgumentParser = node.parser(description)
     made.add_argument("--topic", default="/chatter")
-    made.add_argument("--nodelay", action="store_true", help="ask the publisher for TCP_NODELAY")
     return made

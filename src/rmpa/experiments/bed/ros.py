@@ -91,7 +91,7 @@ class Ros:
     """
 
     nodes: ClassVar[Path] = NODES
-    """Where its nodes are, and what they share (``*.hpp``, modules): the current folder's own, for a subclass."""
+    """Where its nodes are, and what they share (``*.hpp``, modules) beside what those of ``NODES`` do."""
 
     def __init__(self, host: Host = MACHINE, home: Path | None = None, port: int = 11311) -> None:
         self.host = host
@@ -152,7 +152,7 @@ class Ros:
         self, program: str, *remaps: str, nodes: Path | None = None, commands: bool = False, **options: object
     ) -> Process:
         """Start ``nodes/PROGRAM.py``; ``remaps`` are ROS arguments such as ``__name:=x``."""
-        env = {"PYTHONPATH": str(self.nodes)}
+        env = {"PYTHONPATH": os.pathsep.join(str(folder) for folder in dict.fromkeys((self.nodes, NODES)))}
         argv: list[str | Path] = [PYTHON, (nodes or self.nodes) / f"{program}.py", *words(options), *remaps]
         return self.start(*argv, name=f"{program}.py", env=env, commands=commands)
 
@@ -191,13 +191,14 @@ def compiled(program: str, nodes: Path = NODES, headers: Path = NODES) -> Path:
     It is kept where the XDG Base Directory Specification has a user's caches: ``~/.cache/rmpa/nodes``.
     """
     source = nodes / f"{program}.cpp"
-    flags = ["-std=c++17", "-O2", "-Wall", "-Wextra", f"-I{headers}"]
+    folders = list(dict.fromkeys((headers, NODES)))
+    flags = ["-std=c++17", "-O2", "-Wall", "-Wextra", *(f"-I{folder}" for folder in folders)]
     packages = ["actionlib", "roscpp"] if "<actionlib/" in source.read_text() else ["roscpp"]
     libraries = subprocess.run(
         ["pkg-config", "--cflags", "--libs", *packages], capture_output=True, text=True, check=True
     ).stdout.split()
     digest = hashlib.sha256(" ".join([*flags, *libraries]).encode())
-    for part in sorted([source, *headers.glob("*.hpp")]):
+    for part in [source, *(header for folder in folders for header in sorted(folder.glob("*.hpp")))]:
         digest.update(part.read_bytes())
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rmpa" / "nodes"
     binary = cache / f"{program}-{digest.hexdigest()[:12]}"
