@@ -130,6 +130,7 @@ def test_values_that_would_flatten_the_others_are_told_of_in_place_of_shown() ->
     assert 95 < low < 100
     assert 101 < high < 105
     assert _texts(drawn.axes) == ["2 beyond, up to 950 ▲", "1 beyond, down to 3 ▼"]
+    assert {text.get_color() for text in drawn.axes.texts} == {drawn.looks["a"].colour}
 
 
 def test_rows_of_a_timeline_run_from_the_top_down() -> None:

@@ -173,8 +173,11 @@ def _lateness(axes: Axes, late: Sequence[float]) -> None:
     axes.set_ylim(ordered[0] / 1.5, max(1000.0, ordered[-1] * 1.6))
     axes.yaxis.tick_right()
     axes.yaxis.set_label_position("right")
-    panels.log_numbers(axes.xaxis)
     panels.log_numbers(axes.yaxis)
+    most = axes.get_xlim()[1]
+    steps = (1, 10, 100) if most < 2000 else (1, 100, 10_000, 1_000_000)
+    axes.set_xticks([step for step in steps if step < most], [f"{step:,}" for step in steps if step < most])
+    axes.xaxis.set_minor_formatter("")
     axes.set_ylabel("sleeps of 1 ms ended late by, µs", fontsize=8)
     axes.set_xlabel("times", fontsize=8)
     axes.tick_params(labelsize=7.5)

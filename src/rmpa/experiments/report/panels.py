@@ -28,9 +28,10 @@ _FEW: Final = 40
 _BARS_WITH_NUMBERS: Final = 14
 _RASTER: Final = 300
 """Points from which an SVG holds them as an image."""
+_FRACTIONS: Final = ("axes fraction", "axes fraction")
 _CLASSES: Final = 32
 """Of the distribution beside a panel."""
-_ROOM: Final = 1.5
+_ROOM: Final = 0.8
 """How many times the distance of p2 and p98 an axis goes beyond them at the most."""
 _GOLDEN: Final = 0.6180339887498949
 """Multiples of it scatter evenly, and the same each time."""
@@ -287,15 +288,19 @@ def _bounds(together: Sequence[Drawn]) -> tuple[float, float]:
 
 
 def _beyond(drawn: Drawn, low: float, high: float) -> None:
-    """Say at the edge what lies beyond it."""
-    above = [y for y in drawn.values if y > high]
-    below = [y for y in drawn.values if y < low]
-    if above:
-        text = f"{len(above)} beyond, up to {max(above):.4g} ▲"
-        say(drawn.axes, text, (1, 1), ("axes fraction", "axes fraction"), (-3, -9), "right")
-    if below:
-        text = f"{len(below)} beyond, down to {min(below):.4g} ▼"
-        say(drawn.axes, text, (1, 0), ("axes fraction", "axes fraction"), (-3, 2), "right")
+    """Say at the edge, in each series' colour, what of it lies beyond."""
+    above = below = 0
+    for series in drawn.panel.series:
+        beyond = [y for y in series.y if y > high], [y for y in series.y if y < low]
+        colour = drawn.looks[series.label].colour
+        if beyond[0]:
+            text = f"{len(beyond[0])} beyond, up to {max(beyond[0]):.4g} ▲"
+            say(drawn.axes, text, (1, 1), _FRACTIONS, (-3, -9 - 10 * above), "right", colour)
+            above += 1
+        if beyond[1]:
+            text = f"{len(beyond[1])} beyond, down to {min(beyond[1]):.4g} ▼"
+            say(drawn.axes, text, (1, 0), _FRACTIONS, (-3, 2 + 10 * below), "right", colour)
+            below += 1
 
 
 def _whole_numbers() -> Locator:
@@ -335,6 +340,7 @@ def say(
     scales: tuple[str, str],
     shift: tuple[float, float],
     side: Literal["left", "center", "right"],
+    colour: str = QUIET,
 ) -> None:
     """Write a few words, ``shift`` points away from a place that is given in these scales."""
     axes.annotate(
@@ -346,7 +352,7 @@ def say(
         ha=side,
         va="bottom",
         fontsize=8,
-        color=QUIET,
+        color=colour,
     )
 
 
