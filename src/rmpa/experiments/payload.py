@@ -56,6 +56,12 @@ of 100 Mbit/s. The same again, in batches of 100, on a link that is not shaped.
 A straight line is laid through the medians of the sizes, and another one through all samples; R² says how much of
 the variance it explains.
 """
+_NOTES: Final = (
+    (
+        "The shaped link is a token bucket that lets 32 KB through at once: up to there latency is that of an "
+        "unshaped link, and beyond it each KB takes its time on the wire. So the line meets the axis just below 0."
+    ),
+)
 
 
 class Payload:
@@ -97,6 +103,7 @@ class Payload:
             tuple(_figures(found)),
             (*_grids(found), *([_lines(found)] if found else [])),
             tuple(_claims(found, results.plan)),
+            _NOTES if any(kind.link != UNSHAPED for kind in found) else (),
         )
 
 
@@ -270,8 +277,8 @@ def _figures(found: Found) -> Iterator[Figure]:
 
 
 def _straightness(ladders: Mapping[Contender, Ladder], shown: Sequence[Contender]) -> str:
-    lines = [(one.label, line) for one in shown if (line := ladders[one].line()) is not None]
-    return "every message" + "".join(f"; R² {label} {line.r2:.4f}" for label, line in lines)
+    lines = [f"{one.label} {line.r2:.4f}" for one in shown if (line := ladders[one].line()) is not None]
+    return f"R²: {', '.join(lines)}" if lines else "every message"
 
 
 def _link(link: str) -> str:
