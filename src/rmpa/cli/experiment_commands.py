@@ -299,8 +299,12 @@ def _terminated() -> Iterator[None]:
 
 
 def _shown(plan: Plan) -> str:
+    from rmpa.experiments.report.words import link as words_of
+
     where = "hosts as network namespaces" if plan.bed == "namespaces" else "all on loopback"
-    link = f"cables of {plan.link}" if plan.link else "cables not shaped" if plan.bed == "namespaces" else ""
+    link = (
+        f"cables of {words_of(plan.link)}" if plan.link else "cables not shaped" if plan.bed == "namespaces" else ""
+    )
     nodes = f"nodes of {' and '.join(plan.clients)}" if plan.clients != ("own",) else "our own nodes"
     return ", ".join(filter(None, (where, link, nodes, plan.size)))
 

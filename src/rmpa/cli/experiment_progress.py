@@ -127,7 +127,7 @@ class Bars:
         table = Table.grid(padding=(0, 1))
         table.add_column(no_wrap=True)
         table.add_column(width=24)
-        table.add_column()
+        table.add_column(no_wrap=True, overflow="ellipsis")
         gone, takes = estimate.cell(now)
         table.add_row(
             Text("all", style="bold"),
@@ -143,7 +143,7 @@ class Bars:
             table.add_row(
                 Text(cell.experiment, style="bold"),
                 ProgressBar(100.0, 100 * min(1.0, gone / takes) if takes else 0.0, width=24),
-                Text(f"{settings}: {duration(gone)} of about {duration(takes)}{again}"),
+                Text(f"{duration(gone)} of about {duration(takes)}{again}: {settings}"),
             )
         return table
 
