@@ -25,7 +25,7 @@ from module import arguments, joined, run
 from rate import Rate
 from rmpa.core.errors import RmpaError
 from rmpa.monitor.aio.control_client import ControlClient, choose_agent
-from watch import HERE, TOPICS, PoseView, View, Watch
+from watch import HERE, MODULES, TOPICS, PoseView, View, Watch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from rmpa.monitor.snapshot import Snapshot
     from rmpa.ros.aio.node import Node, Received
 
+PROFILE = "std_msgs/String"
+"""The type of a resource's topic that says which profile it runs."""
 LOOKS = 4
 """Looks a second at our agent, and drawings of the table."""
 SWITCH = 2e-4
@@ -47,7 +49,7 @@ async def pc(master_uri: str, screen: Screen, *, events: bool) -> None:
     looking = asyncio.create_task(_look(watch))
     try:
         with screen:
-            async with joined("pc", master_uri, *(about.type for about in TOPICS.values())) as node:
+            async with joined("pc", master_uri, PROFILE, *(about.type for about in TOPICS.values())) as node:
                 await _subscribe(node, watch)
                 async for _ in Rate(screen.rate):
                     view = watch.view(time.monotonic())
@@ -71,8 +73,14 @@ async def _subscribe(node: Node, watch: Watch) -> None:
 
         return came
 
+    def running(module: str) -> Callable[[Received], None]:
+        return lambda received: watch.profile(module, str(received.message.data))
+
     for topic, about in TOPICS.items():
         await node.subscribe(topic, about.type, counting(topic))
+    for module in MODULES:
+        if module != HERE:  # each is a Smart Resource of its own name
+            await node.subscribe(f"/{module}/profile", PROFILE, running(module))
 
 
 def _pose(received: Received) -> PoseView:

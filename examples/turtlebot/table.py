@@ -46,12 +46,12 @@ def live(view: View, trail: Sequence[tuple[float, float]], *, unicode: bool = Tr
 
 def _modules(view: View) -> Table:
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
-    for name in ("module", "state", "for", "first message"):
-        table.add_column(name, justify="left" if name in {"module", "state"} else "right")
+    for name in ("module", "state", "for", "first", "profile"):
+        table.add_column(name, justify="right" if name in {"for", "first"} else "left", no_wrap=True)
     for name, module in view.modules.items():
         state = Text(module.state, style=COLOURS.get(module.state, "bold red"))
         first = NONE if module.first_message is None else f"{module.first_message:.2f} s"
-        table.add_row(name, state, f"{module.since:.0f} s", first)
+        table.add_row(name, state, f"{module.since:.0f} s", first, module.profile or NONE)
     for restart in view.restarts[-3:]:
         table.add_row(Text(_restart(restart.module, restart.seen_gone_after, restart.back_after), style="dim"))
     return table
@@ -87,7 +87,7 @@ def _pose(view: View) -> Text:
     pose = view.pose
     if pose is None:
         return Text("no odometry yet", style="dim")
-    return Text(f"x {pose.x:+.2f} m  y {pose.y:+.2f} m  {math.degrees(pose.heading):+4.0f}°  {pose.speed:.2f} m/s")
+    return Text(f"x {pose.x:+.2f} y {pose.y:+.2f} m {math.degrees(pose.heading):+4.0f}° {pose.speed:.2f} m/s")
 
 
 def _restart(module: str, gone: float | None, back: float | None) -> str:
@@ -99,7 +99,8 @@ def _restart(module: str, gone: float | None, back: float | None) -> str:
 
 def line(view: View) -> str:
     """One line, for a file or a pipe."""
-    parts = [f"{view.seconds:5.0f} s ", " ".join(f"{name}:{m.state}" for name, m in view.modules.items())]
+    modules = (f"{name}:{m.state}" + (f"/{m.profile}" if m.profile else "") for name, m in view.modules.items())
+    parts = [f"{view.seconds:5.0f} s ", " ".join(modules)]
     for name, topic in view.topics.items():
         latency = f" {ms(topic.latency.p50)}" if topic.latency else ""
         parts.append(f"{TOPICS[name].label} {topic.rate:.1f} Hz{latency}")

@@ -72,11 +72,13 @@ class ModuleView:
 
     ``state`` is ``waiting`` (not seen yet), ``here`` (the pc itself), ``linked`` or another word of the pc's agent,
     or ``gone``; ``since`` so many seconds. ``first_message`` came so many seconds after the module's last start.
+    ``profile`` is the System Profile that its resource runs; empty: not known.
     """
 
     state: str
     since: float
     first_message: float | None
+    profile: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +147,7 @@ class _Module:
     started: float | None = None
     first_message: float | None = None
     restart: Restart | None = None
+    profile: str = ""
 
 
 class Watch:
@@ -231,6 +234,7 @@ class Watch:
             if state == module.state:
                 continue
             if module.state == "linked":
+                module.profile = ""
                 self._interrupted(name)
                 if module.restart is not None and module.restart.seen_gone_after is None:
                     module.restart.seen_gone_after = now - self._start - module.restart.killed
@@ -241,10 +245,14 @@ class Watch:
         module = self._modules[name]
         module.started, module.first_message = at, None
 
+    def profile(self, name: str, profile: str) -> None:
+        """A module's resource said which profile it runs."""
+        self._modules[name].profile = profile
+
     def killed(self, name: str, at: float) -> None:
         """The supervisor killed a module, as it was asked to."""
         module = self._modules[name]
-        module.started = None
+        module.started, module.profile = None, ""
         module.restart = Restart(name, at - self._start)
         self._restarts.append(module.restart)
         self._interrupted(name)
@@ -268,7 +276,7 @@ class Watch:
         return View(
             seconds=now - self._start,
             modules={
-                name: ModuleView(module.state, now - module.since, module.first_message)
+                name: ModuleView(module.state, now - module.since, module.first_message, module.profile)
                 for name, module in self._modules.items()
             },
             topics={name: self._topic(flow, now, whole=whole) for name, flow in self._flows.items()},

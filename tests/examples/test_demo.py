@@ -217,6 +217,11 @@ def test_a_killed_module_is_seen_gone_the_others_go_on_and_it_comes_back(tidy: d
         with command("start", "base") as start:
             assert start.wait() == 0, start.output
         wait_for_view(demo, lambda view: all_linked(view) and flows(view), "base back")
+        wait_for_view(
+            demo,
+            lambda view: [one["profile"] for one in view["modules"].values()] == ["steady", "direct", "full", ""],
+            "the profile of each resource",
+        )
         assert demo.interrupt() == 0, demo.output
     (restart,) = summary_of(demo)["restarts"]
     assert restart["module"] == "base"

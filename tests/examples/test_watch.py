@@ -90,9 +90,12 @@ def test_a_module_is_seen_gone_and_back_and_the_outage_is_no_period() -> None:
         "base": "linked",
         "pc": "here",
     }
+    for name, profile in (("joystick", "steady"), ("base", "full")):
+        watch.profile(name, profile)
     watch.killed("base", 105.0)
     watch.peers({**everyone, "base": "linking"}, 105.25)
     assert watch.view(105.3).modules["base"].state == "gone"
+    assert [module.profile for module in watch.view(105.3).modules.values()] == ["steady", "", "", ""]
     watch.started("base", 106.0)
     watch.message(ODOM, 106.01)  # of the run before
     watch.peers(everyone, 106.5)
@@ -104,6 +107,13 @@ def test_a_module_is_seen_gone_and_back_and_the_outage_is_no_period() -> None:
     assert (restart.module, restart.killed) == ("base", 5.0)
     assert restart.seen_gone_after == pytest.approx(0.25)
     assert restart.back_after == pytest.approx(0.6)
+    watch.profile("base", "saving")
+    view = watch.view(109.6)
+    assert "base:linked/saving" in table.line(view)
+    assert view.modules["joystick"].profile == "steady"
+    watch.peers({**everyone, "joystick": "linking"}, 109.8)
+    assert watch.view(109.8).modules["joystick"].profile == "", "it may be another when it comes back"
+    view = watch.view(109.8, whole=True)
     assert view.topics[ODOM].period.maximum == pytest.approx(0.02)
 
 
@@ -117,18 +127,22 @@ def test_a_module_that_was_never_seen_is_waited_for_not_gone() -> None:
 def test_everything_can_be_shown() -> None:
     watch = Watch(100.0)
     console = Console(width=80, record=True, force_terminal=True)
+    watch.peers(dict.fromkeys(("joystick", "velocity", "base"), "linked"), 100.0)
     for at in (100.0, 105.0):
         console.print(table.live(watch.view(at), watch.trail()))
         drive(watch, 100.0, 5.0)
         watch.pose(PoseView(1.0, 2.0, 0.5, 0.3, 0.1), 104.0)
         watch.killed("base", 104.5)
         watch.note("joystick: is gone")
+        watch.profile("base", "saving")
     view = watch.view(105.0, whole=True)
     console.print(*table.summary(view))
     text = console.export_text()
     assert "joystick: is gone" in text
     assert "base killed" in text
+    assert "saving" in text
     assert max(map(len, text.splitlines())) <= 80
+    assert "…" not in text, "a column is too narrow"
     assert "CMD 10.0 Hz" in table.line(watch.view(105.0))
     assert json.loads(table.json_line(Watch(0.0).view(0.0)))["command_to_velocity"]["mean"] is None
     assert json.loads(table.json_summary(view))["summary"]["topics"][ODOM]["messages"] == 500
