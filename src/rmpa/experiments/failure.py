@@ -131,10 +131,14 @@ class Robot:
                 self._running.pop(node.name).end()
 
     def switch_on(self, host: str) -> None:
-        """Switch a host on, and start its nodes as soon as its agent is ready or its master answers."""
+        """Switch a host on, and start its nodes as soon as its agent is ready or its master answers.
+
+        So are nodes elsewhere that gave up for want of a master: their supervisors try again.
+        """
         began = self.system.start(host)
         self.note("on", began)
-        self._again([node for node in NODES if node.host == host], "on up", _UP_WITHIN)
+        gone = {name for name, process in self._running.items() if process.returncode is not None}
+        self._again([node for node in NODES if node.host == host or node.name in gone], "on up", _UP_WITHIN)
 
     def start_again(self, name: str, within: float) -> None:
         """Kill one node and start it at once, as its supervisor does when it crashed; it has so many seconds."""

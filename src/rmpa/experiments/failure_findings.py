@@ -277,7 +277,12 @@ def _claims(told: Sequence[tuple[Cell, list[Fate]]]) -> Iterable[Claim]:
             if cell.settings["system"] == system and cell.settings["scenario"] in (scenarios or SCENARIOS)
         ]
 
-    classic = [sum(not fate.back for fate in found) for found in of("classic", "master")]
+    stock = [(cell, found) for cell, found in told if cell.settings["client"] != "own"]
+    classic = [
+        sum(not fate.back for fate in found)
+        for cell, found in stock
+        if (cell.settings["system"], cell.settings["scenario"]) == ("classic", "master")
+    ]
     text = "classic, the master's host killed and on again: flows that do not come back by themselves"
     yield Claim(text, min(classic, default=None), 1, at_least=True)
     ours = of("rmpa")
@@ -319,6 +324,8 @@ def _notes(told: Sequence[tuple[Cell, Measured, list[Fate]]]) -> Iterable[str]:
                 f" that is new finds them: {never} flows needed {by_hand} nodes of other hosts to be started anew"
                 " by hand."
             )
+    if any(cell.settings["client"] == "own" for cell, _, _ in told):
+        yield "Our own nodes register again when a master comes back, which nodes of rospy and roscpp never do."
     if any(str(cell.settings["scenario"]).startswith("cable") for cell, _, _ in told):
         yield (
             "With the cable out, classic ROS's connections live on: TCP tries again 0.2, 0.6, 1.4, 3, 6.2 s after"

@@ -164,7 +164,7 @@ class Images:
             figures=tuple(_figure(client, scores) for client in clients),
             grids=(_commands(scores), _images(scores)),
             claims=tuple(_claims(scores)),
-            notes=_NOTES,
+            notes=_NOTES if any(score.shares for score in scores.values()) else (),
         )
 
 
