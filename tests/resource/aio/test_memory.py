@@ -110,7 +110,7 @@ async def test_a_latched_request_that_has_expired_does_not_come_again(core: RosC
         seen: list[object] = []
         member.adapter.on_asked.append(lambda: seen.append(dict(member.adapter.loop.requirements)))
         assert client._asking is not None
-        again: Any = {"header": {"stamp": float(next(iter(member.adapter._expiries))[1])}}
+        again: Any = {"header": {"stamp": float(next(iter(member.adapter.clients.expiries))[1])}}
         pairs: Any = [{"key": "noise", "value": "<= 5 cm"}, {"key": "expires", "value": "300 ms"}]
         message = client._asking.make({**again, "status": [{"name": "x", "values": pairs}]})
         client._asking.publish(message)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
@@ -21,7 +20,6 @@ from rmpa.resource.adaptation import (
     Adaptation,
     AdaptationSettings,
     Alarm,
-    AlarmKind,
     Apply,
     Clear,
     Raise,
@@ -30,11 +28,12 @@ from rmpa.resource.adaptation import (
 from rmpa.resource.aio.applying import Applier
 from rmpa.resource.aio.preconditions import Preconditions
 from rmpa.resource.aio.runtime import RuntimePart
-from rmpa.resource.decision import Decider, wanted
+from rmpa.resource.clients import Clients
+from rmpa.resource.decision import Decider
+from rmpa.resource.measuring import Measuring
 from rmpa.resource.observed import Missing, Observed
-from rmpa.resource.quality import ObservedQuality, TopicQuality
 from rmpa.resource.remembered import Asked, Cooling, Remembered
-from rmpa.resource.requirement_text import parse_requirement
+from rmpa.resource.reports import ALARM_LEVELS, alarm_values, answer_to, decision_of, health, told
 from rmpa.resource.requirements import Requirement
 from rmpa.ros.diagnostic_array import ARRAY_TYPE, Level, Status, frame_array
 from rmpa.ros.tcpros import LENGTH, printable
@@ -79,14 +78,12 @@ class Adapter(RuntimePart):
         self._attributes = resource.attributes
         profiles = [declared.profile for declared in resource.profiles.values()]
         self.loop = Adaptation(self._attributes, Decider(resource.name, self._attributes, profiles), settings)
-        self._labels = resource.labels
-        self._topics: dict[str, TopicQuality] = {}
-        self._observed: dict[str, ObservedQuality] = {}
-        self._answers: dict[str, Status] = {}
-        self._marks: dict[str, str] = {}
-        self._absent: dict[str, int] = {}
+        self.clients = Clients(resource.name, self._attributes)
+        self._measuring: Measuring | None = None
+        """``None`` before the start."""
         self._measured: dict[str, Value] = {}
         self._publishers: dict[str, Publisher] = {}
+        self._responded: list[bytes] | None = None
         self._sequence = 0
         self._asking: Subscriber | None = None
         self._applier = Applier(
@@ -108,20 +105,12 @@ class Adapter(RuntimePart):
         """Called when what is asked, chosen or running may be another."""
         self.recalled = Remembered()
         """What there was before a restart; set before the start."""
-        self._said: dict[str, tuple[tuple[str, str], ...]] = {}
-        """By client: what it asked, in its own words."""
-        self._stamps: dict[str, str] = {}
-        """By client: its request's stamp, or empty."""
-        self._expiries: dict[tuple[str, str], float] = {}
-        """By client and stamp: when a request expires, so that the same message, latched, does not begin anew."""
         self.on_missing: list[Callable[[str, bool], None]] = []
         """Called when something that is needed is missing (true), and when it is back."""
         self.on_late: list[Callable[[str], None]] = []
         """Called when a function that was given up does something, or ends; with the text."""
         self._observed_by = Observed(self._attributes, resource.name, limits.RESOURCE_REPORT_WINDOWS * window)
         self._missing = Missing()
-        self._grace: dict[str, float] = {}
-        """By client that asked before a restart: until when it may come back."""
         self.troubles: Callable[[], tuple[list[str], list[str]]] = lambda: ([], [])
         """What is wrong beside the quality: (what is missing, what does not work), each ready to read."""
 
@@ -132,15 +121,8 @@ class Adapter(RuntimePart):
         self._loop = asyncio.get_running_loop()
         await self._preconditions.start()
         now = self._loop.time()
-        resource, node = self._runtime.resource, self._runtime.node
-        for name, output in resource.outputs.items():
-            self._topics[name] = TopicQuality(now, stamped=_stamped(output), deadline=output.contract.deadline)
-        for name, item in resource.inputs.items():
-            self._topics[name] = TopicQuality(
-                now, stamped=_stamped(item), numbered=True, deadline=item.contract.deadline
-            )
-        for name, declared in resource.declared_attributes.items():
-            self._observed[name] = ObservedQuality(declared.attribute)
+        node = self._runtime.node
+        self._measuring = Measuring(self._runtime.resource, now)
         for name, latch in (("quality", False), ("alarms", False), ("responses", True)):
             topic = f"{node.name}/{name}"
             self._publishers[name] = await node.advertise(topic, ARRAY_TYPE, latch=latch)
@@ -168,18 +150,18 @@ class Adapter(RuntimePart):
 
     def published(self, output: Output, raw: bytes, now_ns: int) -> None:
         """Measure an output."""
-        if (quality := self._topics.get(output.name)) is not None:
-            quality.message(raw, self._loop.time(), now_ns)
+        if self._measuring is not None:
+            self._measuring.message(output.name, raw, self._loop.time(), now_ns)
 
     def received(self, item: Input, message: Received) -> None:
         """Measure an input."""
-        if (quality := self._topics.get(item.name)) is not None:
-            quality.message(message.raw, self._loop.time(), message.stamp_ns, message.caller_id)
+        if self._measuring is not None:
+            self._measuring.message(item.name, message.raw, self._loop.time(), message.stamp_ns, message.caller_id)
 
     def observed(self, attribute: str, value: Value) -> None:
         """Measure an attribute of the user's own."""
-        if (quality := self._observed.get(attribute)) is not None:
-            quality.observe(value)
+        if self._measuring is not None:
+            self._measuring.observed(attribute, value)
 
     @property
     def measured(self) -> Mapping[str, Value]:
@@ -195,10 +177,8 @@ class Adapter(RuntimePart):
     def _restart_windows(self) -> None:
         """Another profile runs: it is not judged by what was measured under the last one."""
         now = self._loop.time()
-        for topic in self._topics.values():
-            topic.restart(now)
-        for quality in self._observed.values():
-            quality.restart()
+        if self._measuring is not None:
+            self._measuring.restart(now)
         if (timer := self._timers.get("window")) is not None:
             timer.cancel()
             self._next_window(now)
@@ -206,16 +186,7 @@ class Adapter(RuntimePart):
     def _end_window(self, due: float) -> None:
         self._next_window(due)
         now = self._loop.time()
-        measured: dict[str, Value] = {}
-        for position, (name, topic) in enumerate(self._topics.items()):
-            base = self._labels[name]
-            for key, value in topic.window(now).items():
-                measured[f"{base}.{key}"] = value
-                if position == 0 and self._runtime.resource.outputs:
-                    measured[key] = value
-        for name, quality in self._observed.items():
-            if (seen := quality.window()) is not None:
-                measured[name] = seen
+        measured = self._measuring.window(now) if self._measuring is not None else {}
         self._observed_by.judge(measured, self.loop.requirements, now)
         self._measured = measured
         for text, gone in self._missing.look(self.troubles()[0]):
@@ -232,8 +203,7 @@ class Adapter(RuntimePart):
         try:
             self._observed_by.told(message.caller_id, values, self._loop.time())
         except ConfigError as error:
-            known = self._answers.get(message.caller_id)
-            if known is None or known.message != str(error):  # it will say so once a second
+            if self.clients.refusal(message.caller_id) != str(error):  # it will say so once a second
                 self.refuse(message.caller_id, str(error))
 
     def _miss(self, text: str, *, gone: bool) -> None:
@@ -251,18 +221,15 @@ class Adapter(RuntimePart):
 
     def _asked(self, message: Received) -> None:
         """A client says what it asks."""
-        client = message.caller_id
-        self._grace.pop(client, None)
+        client, stamp = message.caller_id, message.message.header.stamp
         mark = next((str(s.hardware_id) for s in message.message.status), "")
-        self._marks[client] = mark[: limits.REQUIREMENT_TEXT_MAX]  # it goes to everybody, again and again
-        stamp = message.message.header.stamp
-        self._stamps[client] = f"{stamp.sec}.{stamp.nanosec:09}" if stamp.sec or stamp.nanosec else ""
+        self.clients.speaks(client, mark, f"{stamp.sec}.{stamp.nanosec:09}" if stamp.sec or stamp.nanosec else "")
         try:
             values = [(str(pair.key), str(pair.value)) for status in message.message.status for pair in status.values]
             self.require(client, values)
         except ConfigError as error:
             _log.warning("! %s: %s asks for what cannot be: %s", self._runtime.node.name, printable(client), error)
-            self._answers[client] = self._answer(Level.ERROR, client, str(error), {})
+            self.clients.refuse(client, str(error))
             self._respond()
 
     def require(self, client: str, values: list[tuple[str, str]]) -> None:
@@ -272,17 +239,9 @@ class Adapter(RuntimePart):
             ConfigError: It cannot be; what it asked before stays.
         """
         now = self._loop.time()
-        name = self._runtime.resource.name
-        requirement = parse_requirement(client, values, self._attributes, name, now)
-        if requirement.expires is not None and (stamp := self._stamps.get(client, "")):
-            due = self._expiries.setdefault((client, stamp), requirement.expires)
-            while len(self._expiries) > limits.RESOURCE_STAMPS_MAX:
-                del self._expiries[next(iter(self._expiries))]
-            if due <= now:
-                return  # a latched message that comes again, behind its time
-            requirement = replace(requirement, expires=due)
-        self._answers.pop(client, None)
-        self._said[client] = tuple(values)
+        requirement = self.clients.read(client, values, now)
+        if requirement is None:
+            return
         if requirement.bounds:
             self._act(self.loop.require(requirement, now))
         elif client in self.loop.requirements:
@@ -291,30 +250,12 @@ class Adapter(RuntimePart):
 
     def asked(self, now_ns: int) -> list[Asked]:
         """What each client asks, in its own words, at a time of the wall clock."""
-        now, found = self._loop.time(), []
-        for client, requirement in self.loop.requirements.items():
-            if (values := self._said.get(client)) is not None:
-                expires = None
-                if requirement.expires is not None:
-                    expires = now_ns + round((requirement.expires - now) * 1e9)
-                mark, stamp = self._marks.get(client, ""), self._stamps.get(client, "")
-                found.append(Asked(client=client, values=values, mark=mark, stamp=stamp, expires_ns=expires))
-        return found
+        return self.clients.asked(self.loop.requirements, self._loop.time(), now_ns)
 
     def _recall(self, now: float) -> None:
         """Take up what was asked before a restart; who does not come back within the grace is forgotten."""
-        found, name, now_ns = [], self._runtime.resource.name, time.time_ns()
-        for asked in self.recalled.asked:
-            requirement = asked.requirement(self._attributes, name, now, now_ns)
-            if requirement is None:
-                continue
-            found.append(requirement)
-            self._said[asked.client] = asked.values
-            self._marks[asked.client] = asked.mark
-            self._grace[asked.client] = now + limits.RESOURCE_CLIENT_GRACE
-            self._stamps[asked.client] = asked.stamp
-            if asked.stamp and requirement.expires is not None:
-                self._expiries[asked.client, asked.stamp] = requirement.expires
+        now_ns = time.time_ns()
+        found = self.clients.recall(self.recalled.asked, now, now_ns)
         left = {name: one.left(now, now_ns) for name, one in self.recalled.cooling.items()}
         self.loop.remember(found, self.recalled.last, {name: one for name, one in left.items() if one}, now)
 
@@ -353,7 +294,7 @@ class Adapter(RuntimePart):
     def refuse(self, client: str, text: str) -> None:
         """Tell a client among the responses that what it said cannot be."""
         _log.warning("! %s: %s: %s", self._runtime.node.name, printable(client), text)
-        self._answers[client] = self._answer(Level.ERROR, client, text, {})
+        self.clients.refuse(client, text)
         self._respond()
 
     def explain(self) -> tuple[Score, ...]:
@@ -369,23 +310,7 @@ class Adapter(RuntimePart):
         """Forget those that are gone: killed, unplugged, or simply over."""
         self._later("clients", _LOOK, self._look_at_clients)
         callers = self._asking.callers if self._asking is not None else set()
-        for client in {*self.loop.requirements, *self._answers}:
-            if client in callers or client.startswith("context "):
-                self._absent.pop(client, None)
-                self._grace.pop(client, None)
-                continue
-            if self._grace.get(client, 0.0) > self._loop.time():
-                continue
-            # Twice in a row: a proxy's subscribers connect anew when its link was gone for a moment.
-            self._absent[client] = self._absent.get(client, 0) + 1
-            if self._absent[client] < 2:
-                continue
-            del self._absent[client]
-            self._answers.pop(client, None)
-            self._marks.pop(client, None)
-            self._stamps.pop(client, None)
-            self._said.pop(client, None)
-            self._grace.pop(client, None)
+        for client in self.clients.gone(callers, self._loop.time()):
             if client in self.loop.requirements:
                 _log.info("= %s: %s is gone, and what it asked for", self._runtime.node.name, printable(client))
                 self._act(self.loop.release(client, self._loop.time()))
@@ -406,10 +331,10 @@ class Adapter(RuntimePart):
                     _log.info("= %s: profile %s: %s", self._runtime.node.name, action.profile, action.why)
                     self._applier.begin(action.profile)
                 case Raise():
-                    _log.warning("! %s: %s", self._runtime.node.name, self.told(action.alarm))
+                    _log.warning("! %s: %s", self._runtime.node.name, told(action.alarm))
                     self._publish_alarm(action.alarm, cleared=False)
                 case Clear():
-                    _log.info("= %s: over: %s", self._runtime.node.name, self.told(action.alarm))
+                    _log.info("= %s: over: %s", self._runtime.node.name, told(action.alarm))
                     self._publish_alarm(action.alarm, cleared=True)
                 case Reacted():
                     self.reaction = action.reaction
@@ -475,47 +400,11 @@ class Adapter(RuntimePart):
 
     def decision(self) -> dict[str, Any]:
         """How each profile does at this moment, with each term of it, for ``rmpa profile explain``."""
-        return {
-            "profile": self.loop.profile,
-            "applying": self.loop.applying,
-            "chosen": self.loop.pinned,
-            "reaction": self.reaction,
-            "alarm": self.loop.alarm.kind.value if self.loop.alarm is not None else "",
-            "conflicts": [str(conflict) for conflict in self.loop.asked.conflicts],
-            "clients": sorted(self.loop.requirements),
-            "scores": [
-                {
-                    "profile": score.profile,
-                    "distance": score.distance,
-                    "hard_shortfall": score.hard_shortfall,
-                    "feasible": score.feasible,
-                    "excluded": score.excluded,
-                    "terms": [
-                        {
-                            "attribute": term.attribute,
-                            "wanted": term.wanted,
-                            "offered": term.offered,
-                            "delta": term.delta,
-                            "weight": term.weight,
-                            "hard": term.hard,
-                        }
-                        for term in score.terms
-                    ],
-                }
-                for score in self.explain()
-            ],
-        }
+        return decision_of(self.loop, self.explain(), self.reaction)
 
     def _publish_quality(self) -> None:
         level, message = self._health()
-        outputs = self._runtime.resource.outputs
-        # The first one's qualities are also named without it; they are shown once.
-        primary = f"{self._labels[next(iter(outputs))]}." if outputs else ""
-        values = {
-            name: self._attributes[name].show(value)
-            for name, value in self._measured.items()
-            if name in self._attributes and not (primary and name.startswith(primary))
-        }
+        values = self._measuring.shown(self._measured) if self._measuring is not None else {}
         values["profile"] = self.loop.profile
         if self.reaction is not None:
             values["reaction"] = f"{self.reaction:.6g} s"
@@ -528,36 +417,13 @@ class Adapter(RuntimePart):
     def _health(self) -> tuple[Level, str]:
         missing, broken = self.troubles()
         broken += [f"the function of profile {name} hangs; it was given up" for name in self._applier.hanging]
-        alarm = self.loop.alarm
-        if alarm is not None and alarm.kind is AlarmKind.NON_ADAPTABLE:
-            return Level.ERROR, self.told(alarm)
-        if missing:
-            return Level.STALE, "; ".join((*missing, *broken))
-        if not self.loop.profile:
-            return Level.ERROR, "; ".join(("no profile runs", *broken))
-        if alarm is not None or broken:
-            told = [self.told(alarm)] if alarm is not None else []
-            return Level.WARN, "; ".join((*told, *broken))
-        return Level.OK, f"profile {self.loop.profile}"
+        return health(self.loop, missing, broken)
 
     def _publish_alarm(self, alarm: Alarm, *, cleared: bool) -> None:
-        values = {"before": alarm.before, "after": alarm.after, "cleared": str(cleared).lower()}
-        if cleared and self.reaction is not None:
-            values["reaction"] = f"{self.reaction:.6g} s"
-        for short in alarm.shortfalls:
-            attribute = self._attributes[short.attribute]
-            given = attribute.show(short.given) if short.given is not None else "nothing"
-            values[short.attribute] = f"wanted {wanted(attribute, short.wanted)}, given {given}"
-        level = Level.OK if cleared else _LEVELS[alarm.kind]
-        text = f"over: {self.told(alarm)}" if cleared else self.told(alarm)
+        values = alarm_values(alarm, self._attributes, cleared=cleared, reaction=self.reaction)
+        level = Level.OK if cleared else ALARM_LEVELS[alarm.kind]
+        text = f"over: {told(alarm)}" if cleared else told(alarm)
         self._publish("alarms", [self._status(level, self._runtime.resource.name, text, values)])
-
-    def told(self, alarm: Alarm) -> str:
-        """An alarm in words."""
-        names = ", ".join(short.attribute for short in alarm.shortfalls) or "the quality"
-        if alarm.kind is AlarmKind.ADAPTATION:
-            return f"adaptation: {names} fell short under {alarm.before}; {alarm.after} takes over"
-        return f"non-adaptable: no profile gives {names} as asked; {alarm.after} is the best there is"
 
     def _respond(self) -> None:
         """Tell each client what it asked and what it is given, and everybody how the profiles do now."""
@@ -566,44 +432,33 @@ class Adapter(RuntimePart):
             hear()
         statuses = []
         for client, requirement in self.loop.requirements.items():
-            lost = [c for c in self.loop.asked.conflicts if c.client == client]
-            values, short = {}, []
-            for name, bound in requirement.bounds.items():
-                attribute = self._attributes[name]
-                seen = self._observed_by.given(client, name)
-                given = seen if seen is not None else self._measured.get(name)
-                shown = attribute.show(given) if given is not None else "not measured yet"
-                values[name] = f"wanted {wanted(attribute, bound)}, given {shown}"
-                if given is not None and not bound.met_by(attribute, given):
-                    short.append(name)
-            level, message = self._judged(short, bool(lost))
-            if lost:
-                message = "; ".join(map(str, lost))
-            if (answer := self._answers.get(client)) is not None:
-                level, message = answer.level, f"{answer.message}; what was asked before stays"
+            level, message, values = answer_to(requirement, self.loop, self._attributes, self._given(requirement))
+            if refusal := self.clients.refusal(client):
+                level, message = Level.ERROR, f"{refusal}; what was asked before stays"
             statuses.append(self._answer(level, client, message, values))
-        statuses += [answer for client, answer in self._answers.items() if client not in self.loop.requirements]
+        statuses += [
+            self._answer(Level.ERROR, client, self.clients.refusal(client), {})
+            for client in self.clients.refused
+            if client not in self.loop.requirements
+        ]
         if (publisher := self._publishers.get("responses")) is not None and not self._closed:
             known = [status.serialize() for status in statuses]
-            if known != getattr(self, "_responded", None):
+            if known != self._responded:
                 self._responded = known
                 publisher.publish_raw(self._frame(statuses))
 
-    def _judged(self, short: list[str], lost: bool) -> tuple[Level, str]:
-        alarm = self.loop.alarm
-        if alarm is not None and alarm.kind is AlarmKind.NON_ADAPTABLE:
-            return Level.ERROR, self.told(alarm)
-        if not self.loop.profile:
-            return Level.WARN, "no profile runs yet"
-        if short or lost:
-            return Level.WARN, f"{', '.join(short)} fall short" if len(
-                short
-            ) > 1 else f"{', '.join(short)} falls short"
-        return Level.OK, f"profile {self.loop.profile}"
+    def _given(self, requirement: Requirement) -> dict[str, Value]:
+        """What a client is given of what it asks for: what it observes, or else what is measured here."""
+        found = {}
+        for name in requirement.bounds:
+            seen = self._observed_by.given(requirement.client, name)
+            if (value := seen if seen is not None else self._measured.get(name)) is not None:
+                found[name] = value
+        return found
 
     def _answer(self, level: Level, client: str, message: str, values: Mapping[str, str]) -> Status:
         """A client's status; the mark on its request comes back, so that it knows which one it is about."""
-        return Status(level, client, message, self._marks.get(client) or self._runtime.resource.name, values)
+        return Status(level, client, message, self.clients.mark(client) or self._runtime.resource.name, values)
 
     def _status(self, level: Level, name: str, message: str, values: Mapping[str, str]) -> Status:
         return Status(level, name, message, self._runtime.resource.name, values)
@@ -616,11 +471,3 @@ class Adapter(RuntimePart):
     def _frame(self, statuses: list[Status]) -> bytes:
         self._sequence += 1
         return frame_array(self._sequence, time.time_ns(), [s.serialize() for s in statuses])[LENGTH.size :]
-
-
-_LEVELS: Final = {AlarmKind.ADAPTATION: Level.WARN, AlarmKind.NON_ADAPTABLE: Level.ERROR}
-
-
-def _stamped(topic: Output | Input) -> bool:
-    fields = topic.type.fields
-    return bool(fields) and fields[0].name == "header"

@@ -11,6 +11,7 @@ import msgspec
 from rmpa.resource.adaptation import Action, AlarmKind, Apply, Clear, Raise, Reacted
 from rmpa.resource.aio.runtime import RuntimePart
 from rmpa.resource.remembered import CHOSEN, CONTEXT, COOL_DOWN, LAST, PARAMETER, REQUIREMENT, Asked, Cooling, recall
+from rmpa.resource.reports import told
 from rmpa.ros.diagnostic_array import Level
 
 if TYPE_CHECKING:
@@ -150,9 +151,9 @@ class Memory(RuntimePart):
                 self._event("apply", Level.OK, action.why, {"profile": action.profile})
             case Raise():
                 level = Level.ERROR if action.alarm.kind is AlarmKind.NON_ADAPTABLE else Level.WARN
-                self._event("alarm", level, self._adapter.told(action.alarm), _details(action.alarm))
+                self._event("alarm", level, told(action.alarm), _details(action.alarm))
             case Clear():
-                self._event("over", Level.OK, self._adapter.told(action.alarm), _details(action.alarm))
+                self._event("over", Level.OK, told(action.alarm), _details(action.alarm))
             case Reacted():
                 details = {"profile": action.profile, "reaction": round(action.reaction, 6)}
                 self._event("reacted", Level.OK, f"{action.profile} runs", details)
