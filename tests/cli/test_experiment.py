@@ -228,9 +228,9 @@ def test_names_and_settings_are_completed(fake: FakeExperiment) -> None:
 PROGRAM = """
 import sys, threading
 from rmpa.cli.main import main
+from rmpa.experiments import code
 from rmpa.experiments.bed import stage
 from rmpa.experiments.registry import EXPERIMENTS
-from rmpa.experiments.report import figures
 from tests.experiments import fakes
 
 def wait(cell, attempt):
