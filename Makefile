@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := venv
-.PHONY: venv demo demo-kill demo-start test tests style format types imports fuzz soak bench ros clean
+.PHONY: venv demo demo-kill demo-start test tests style format types imports fuzz soak bench experiment ros clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -50,6 +50,9 @@ soak: $(STAMP) ros  ## disturb three modules for long and see that nothing leaks
 bench: $(STAMP) ros  ## the measurements, as ratios in one run; results in bench/results
 	-$(BIN)/pip install -q -c constraints.txt -e '.[bench,bench-peers]'  # who cannot have a peer measures without it
 	$(BIN)/python -m bench $(ARGS)
+
+experiment: $(STAMP) ros  ## classic ROS beside RMPA, with a report: make experiment [ARGS="--short"]; docs/experiments.md
+	$(BIN)/rmpa experiment run $(ARGS)
 
 clean:  ## remove what the commands above made
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
