@@ -10,12 +10,14 @@ import sys
 import tempfile
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
 from rmpa.cli.run import load
+from rmpa.cli.topic_pub import read_values
 from rmpa.experiments.bed.processes import Process, eventually
+from rmpa.resource.requirement_text import parse_requirement
 from tests.interop.ros import free_port
 
 if TYPE_CHECKING:
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 ROOT: Final = Path(__file__).parents[2]
 FILES: Final = ROOT / "examples" / "resources"
 TUTORIAL: Final = (ROOT / "docs" / "tutorials" / "resources.md").read_text(encoding="utf-8")
+README: Final = (ROOT / "README.md").read_text(encoding="utf-8")
 STEP: Final = re.compile(r"^```console\n(.*?)^```$|^<!-- ctrl-c: (\S+) -->$", re.MULTILINE | re.DOTALL)
 COMMAND: Final = re.compile(r"^\$ (.*)\n((?:[^$].*\n)*)", re.MULTILINE)
 NUMBER: Final = re.compile(r"\d+(?:\.\d+)?(?:e-?\d+)?")
@@ -34,6 +37,26 @@ def test_its_files_are_the_examples() -> None:
     assert [name for name, _ in shown] == ["sonar.py", "keeper.py", "ask.py"]
     for name, text in shown:
         assert (FILES / name).read_text(encoding="utf-8") == text, name
+
+
+def test_the_readme_has_a_resource_that_can_be_run(tmp_path: Path) -> None:
+    (text,) = re.findall(r"`camera\.py`:\n\n```python\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
+    path = tmp_path / "camera.py"
+    path.write_text(text, encoding="utf-8")
+    (camera,) = load(path)
+    assert camera.profiles.keys() == {"small", "full"}
+    sent: list[int] = []
+    outlet = SimpleNamespace(publish=lambda values, _message: sent.append(len(values["data"])))
+    camera.outputs["frames"].outlet = outlet
+    for name in camera.profiles:
+        camera.profiles[name].apply()
+        camera.tasks["shoot"].function()
+    assert sent == [320 * 30, 640 * 30]
+    (asked,) = re.findall(r"/camera/requirements \S+ \\\n +'(.*)'$", README, re.MULTILINE)
+    array: Any = read_values((asked,))
+    values = [(pair["key"], pair["value"]) for pair in array["status"][0]["values"]]
+    bounds = parse_requirement("/someone", values, camera.attributes, "camera", 0.0).bounds
+    assert {name: bound.hard for name, bound in bounds.items()} == {"sharpness": False, "rate": True}
 
 
 def test_the_keeper_says_how_close_it_keeps() -> None:
