@@ -125,7 +125,7 @@ def test_classic_without_its_master_takes_no_new_node_until_it_is_back(plan: Pla
         with pytest.raises(Deadline):
             lost.wait_event("up", 1.5)
         robot.start("pc")
-        sink = robot.node("pc", "sink", client, nodelay=True)
+        sink = robot.node("pc", "sink", client, nodelay=True, topics="/cmd")
         if plan.bed == "loopback":  # our own nodes register with a new master, roscpp's do not
             flow.wait_flowing(source, sink, ["/cmd"], stage.scratch)
         else:
