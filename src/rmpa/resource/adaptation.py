@@ -23,6 +23,7 @@ from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import LocalProtocolError, PeerRefused
+from rmpa.resource.actions import Action, Alarm, AlarmKind, Apply, Clear, Raise, Reacted, Shortfall
 from rmpa.resource.requirements import Merged, Requirement, merge
 
 if TYPE_CHECKING:
@@ -32,6 +33,22 @@ if TYPE_CHECKING:
     from rmpa.resource.decision import Decider, Decision, Score
     from rmpa.resource.requirements import Bound
 
+__all__ = [
+    "COOL_DOWN_GROWTH",
+    "EXPECTED",
+    "Action",
+    "Adaptation",
+    "AdaptationSettings",
+    "Alarm",
+    "AlarmKind",
+    "Apply",
+    "Clear",
+    "CoolDown",
+    "ProfileState",
+    "Raise",
+    "Reacted",
+    "Shortfall",
+]
 COOL_DOWN_GROWTH: Final = 2.0
 """Each time that a profile disappoints again its cool-down is so many times as long, up to ``cool_down_max``."""
 
@@ -64,90 +81,6 @@ class AdaptationSettings:
     cool_down: float = 10.0
     cool_down_max: float = 160.0
     apply_timeout: float = 5.0
-
-
-class AlarmKind(Enum):
-    """What an alarm says; the level of REP 107 that it is shown with."""
-
-    ADAPTATION = "adaptation"
-    """A quality is not satisfied, and another profile takes over: WARN."""
-    NON_ADAPTABLE = "non_adaptable"
-    """No profile meets what is asked; the most similar one runs: ERROR."""
-
-
-@dataclass(frozen=True, slots=True)
-class Shortfall:
-    """One attribute that is not as asked.
-
-    Args:
-        attribute: Its name.
-        wanted: The bound.
-        given: What was measured, or what the profile offers; ``None``: nothing.
-    """
-
-    attribute: str
-    wanted: Bound
-    given: Value | None
-
-
-@dataclass(frozen=True, slots=True)
-class Alarm:
-    """What every client is told.
-
-    Args:
-        kind: Adaptation or non-adaptable.
-        shortfalls: What was asked and is not given.
-        before: The profile that ran, or empty.
-        after: The one that takes over, or the same.
-        at: When, monotonic seconds.
-    """
-
-    kind: AlarmKind
-    shortfalls: tuple[Shortfall, ...]
-    before: str
-    after: str
-    at: float
-
-
-# --- what the driver is asked for -----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Apply:
-    """Apply this profile, and report ``applied`` or ``failed``; ``why`` is for people."""
-
-    profile: str
-    why: str
-
-
-@dataclass(frozen=True, slots=True)
-class Raise:
-    """Tell every client, and the diagnostics."""
-
-    alarm: Alarm
-
-
-@dataclass(frozen=True, slots=True)
-class Clear:
-    """What an alarm said is over."""
-
-    alarm: Alarm
-
-
-@dataclass(frozen=True, slots=True)
-class Reacted:
-    """A reconfiguration is complete.
-
-    Args:
-        profile: The one that runs now.
-        reaction: Seconds since the request that called for it, or since the first window that did so began.
-    """
-
-    profile: str
-    reaction: float
-
-
-Action = Apply | Raise | Clear | Reacted
 
 
 class ProfileState(Enum):

@@ -19,39 +19,56 @@ A mistake is found when it is written: each call raises ``ConfigError`` with wha
 from __future__ import annotations
 
 import inspect
-import math
-from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
-from rmpa.core.config_contract import read_contracts
-from rmpa.core.config_file import LISTS
-from rmpa.core.config_values import BadValue, did_you_mean
-from rmpa.core.contract import Contract
-from rmpa.core.errors import ConfigError, LocalProtocolError
+from rmpa.core.config_values import did_you_mean
+from rmpa.core.errors import ConfigError
 from rmpa.core.names import is_legal_name
 from rmpa.resource.adaptation import AdaptationSettings
 from rmpa.resource.attributes import MEASURED, Attribute, Category, Direction, Scale
+from rmpa.resource.behaviour import Context, DeclaredProfile, Hook, OnFailure, Task, TaskFunction
+from rmpa.resource.connections import DeclaredAttribute, Demand, Input, Output
 from rmpa.resource.contexts import parse_rule
-from rmpa.resource.fence import passage
+from rmpa.resource.declared_words import check_takes, read_contract, read_word
+from rmpa.resource.parameters import INT_MAX, INT_MIN, Parameter, ParameterValue
 from rmpa.resource.profiles import Profile, check_profiles
-from rmpa.resource.requirements import Bound, bound, find_attribute
+from rmpa.resource.requirements import find_attribute
 from rmpa.resource.units import quantity
+from rmpa.resource.wishes import Wish, at_least, at_most, between, exactly
 from rmpa.ros.messages import MessageType
 
 if TYPE_CHECKING:
-    from rmpa.resource.answer import Answer
     from rmpa.resource.attributes import Value
 
-ParameterValue = bool | int | float | str
-Hook = Callable[[], Awaitable[None] | None]
-TaskFunction = Callable[..., Awaitable[None] | None]
-"""Without arguments if periodic; with the message if it runs on an input."""
+__all__ = [
+    "INT_MAX",
+    "INT_MIN",
+    "NOT_ATTRIBUTES",
+    "RESERVED",
+    "Context",
+    "DeclaredAttribute",
+    "DeclaredProfile",
+    "Demand",
+    "Hook",
+    "Input",
+    "OnFailure",
+    "Output",
+    "Parameter",
+    "ParameterValue",
+    "Resource",
+    "Role",
+    "Task",
+    "TaskFunction",
+    "Wish",
+    "at_least",
+    "at_most",
+    "between",
+    "exactly",
+]
 _RATE_MAX: Final = 10_000
 """Hz, of a periodic task."""
-INT_MIN: Final = -(2**31)
-INT_MAX: Final = 2**31 - 1
 _Function = TypeVar("_Function", bound=Callable[..., object])
 RESERVED: Final = frozenset(
     {
@@ -70,341 +87,6 @@ class Role(StrEnum):
     SENSING = "sensing"
     ACTING = "acting"
     CONTROLLING = "controlling"
-
-
-class OnFailure(StrEnum):
-    """What becomes of a task that raised, or that is stuck."""
-
-    RESTART = "restart"
-    """It goes on, after a pause that grows with each failure in a row."""
-    STOP = "stop"
-    """It ends; the resource goes on without it, and says so."""
-    DEACTIVATE = "deactivate"
-    """The whole resource becomes inactive."""
-
-
-@dataclass(frozen=True, slots=True)
-class Wish:
-    """What is asked of one attribute, before it is known which resource it is asked of."""
-
-    at_least: float | str | None = None
-    at_most: float | str | None = None
-    exactly: float | str | tuple[str, ...] | None = None
-    weight: float = 1.0
-    hard: bool = False
-
-    def __str__(self) -> str:
-        """As ``resource.requirement_text`` reads it: ``>= 20 Hz hard weight=2``."""
-        if self.exactly is not None:
-            values = self.exactly if isinstance(self.exactly, tuple) else (self.exactly,)
-            text = "= " + " | ".join(map(str, values))
-        elif self.at_least is not None and self.at_most is not None:
-            text = f"{self.at_least} .. {self.at_most}"
-        else:
-            text = f">= {self.at_least}" if self.at_least is not None else f"<= {self.at_most}"
-        hard = " hard" if self.hard else ""
-        return text + hard + (f" weight={self.weight:g}" if self.weight != 1 else "")
-
-    def bound(self, attribute: Attribute) -> Bound:
-        """Read it as a bound of an attribute.
-
-        Raises:
-            ConfigError: It makes no sense for that one.
-        """
-        return bound(
-            attribute,
-            at_least=self.at_least,
-            at_most=self.at_most,
-            exactly=self.exactly,
-            weight=self.weight,
-            hard=self.hard,
-        )
-
-
-def at_least(value: float | str, *, hard: bool = False, weight: float = 1.0) -> Wish:
-    """Ask for this or more: ``at_least("20 Hz")``."""
-    return Wish(at_least=value, hard=hard, weight=weight)
-
-
-def at_most(value: float | str, *, hard: bool = False, weight: float = 1.0) -> Wish:
-    """Ask for this or less: ``at_most("50 ms")``."""
-    return Wish(at_most=value, hard=hard, weight=weight)
-
-
-def exactly(*values: float | str, hard: bool = False, weight: float = 1.0) -> Wish:
-    """Ask for this value, or for one of these words."""
-    one: Any = values[0] if len(values) == 1 else tuple(map(str, values))
-    return Wish(exactly=one, hard=hard, weight=weight)
-
-
-def between(low: float | str, high: float | str, *, hard: bool = False, weight: float = 1.0) -> Wish:
-    """Ask for a value within an interval."""
-    return Wish(at_least=low, at_most=high, hard=hard, weight=weight)
-
-
-class Outlet(Protocol):
-    """Where an output's messages go while the resource is active."""
-
-    def publish(self, values: Mapping[str, Any], message: object | None) -> None:
-        """Send a message, built from values or given whole."""
-        ...
-
-
-class ParameterWatch(Protocol):
-    """Who hears of a parameter's changes while the resource runs."""
-
-    def changed(self, parameter: Parameter) -> None:
-        """It has another value; called in whichever thread set it."""
-        ...
-
-
-class Observer(Protocol):
-    """Where an attribute's observations go."""
-
-    def observe(self, attribute: str, value: Value) -> None:
-        """Take one."""
-        ...
-
-
-@dataclass(eq=False)
-class Output:
-    """A topic that the resource publishes.
-
-    Args:
-        name: As declared, in the resource's namespace unless it is global.
-        type: Its message type.
-        contract: What its messages need; the agent's rules apply on top.
-        latch: Whether a late subscriber gets the last message.
-    """
-
-    name: str
-    type: MessageType
-    contract: Contract
-    latch: bool = False
-    outlet: Outlet | None = field(default=None, repr=False)
-
-    def publish(self, message: object | None = None, /, **values: Any) -> None:
-        """Send a message: whole, or its fields; it is dropped while the resource is not active.
-
-        Raises:
-            MessageError: It does not fit the output's type.
-            LocalProtocolError: The resource does not run, or the profile whose function calls was given up.
-        """
-        if self.outlet is None:
-            raise LocalProtocolError(f"{self.name} has nowhere to go: its resource does not run (rmpa run)")
-        self.outlet.publish(values, message)
-
-
-@dataclass(frozen=True, slots=True)
-class Input:
-    """A topic that the resource needs.
-
-    Args:
-        name: As declared.
-        type: Its message type.
-        contract: What is asked of its messages.
-        required: Whether the resource is stale while nobody publishes it.
-    """
-
-    name: str
-    type: MessageType
-    contract: Contract
-    required: bool = True
-
-
-@dataclass(eq=False)
-class Parameter:
-    """A configuration or task parameter; its value may change while the resource runs.
-
-    Args:
-        name: A ROS base name.
-        default: Its value before anybody set it; its type is the parameter's.
-        low: The least value of a number.
-        high: The greatest.
-        choices: The only values, if there are only some.
-        unit: For people.
-        description: For people.
-    """
-
-    name: str
-    default: ParameterValue
-    low: float | None = None
-    high: float | None = None
-    choices: tuple[ParameterValue, ...] = ()
-    unit: str = ""
-    description: str = ""
-    watch: ParameterWatch | None = field(default=None, repr=False)
-
-    def __post_init__(self) -> None:
-        self._value: Any = self.default
-        self.given = False
-        """Whether it was set for this start (``rmpa run --set``), and not what it was before counts."""
-
-    @property
-    def value(self) -> Any:
-        """What it is now; whoever sets it, in any thread, is told by a ``ConfigError`` if it cannot be that.
-
-        From the function of a profile that was given up it cannot be set any more (``LocalProtocolError``).
-        """
-        return self._value
-
-    @value.setter
-    def value(self, value: ParameterValue) -> None:
-        with passage(f"set parameter {self.name}"):
-            before, self._value = self._value, self.check(value)
-            if self.watch is not None and self._value != before:
-                self.watch.changed(self)
-
-    @property
-    def type(self) -> str:
-        """``bool``, ``int``, ``double`` or ``str``, as dynamic_reconfigure has it."""
-        kinds = {bool: "bool", int: "int", float: "double", str: "str"}
-        return kinds[type(self.default)]
-
-    @property
-    def bounds(self) -> tuple[float, float]:
-        """The least and the greatest value of a number; whole ones have 32 bits in dynamic_reconfigure."""
-        widest = (INT_MIN, INT_MAX) if isinstance(self.default, int) else (-math.inf, math.inf)
-        return (
-            self.low if self.low is not None else widest[0],
-            self.high if self.high is not None else widest[1],
-        )
-
-    def check(self, value: ParameterValue) -> ParameterValue:
-        """A value as this parameter may have it; whole numbers are numbers with a point too.
-
-        Raises:
-            ConfigError: It is of another type, out of range, or none of the choices.
-        """
-        where = f"parameter {self.name}"
-        if isinstance(self.default, float) and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
-        if type(value) is not type(self.default):
-            raise ConfigError(where, f"{value!r} is no {self.type}", f"for example {self.default!r}")
-        if isinstance(value, float) and not math.isfinite(value):
-            raise ConfigError(where, f"{value} is no number that can be used", f"for example {self.default!r}")
-        if self.choices and value not in self.choices:
-            near = did_you_mean(str(value), map(str, self.choices))
-            remedy = f"did you mean {near}?" if near else f"it is one of {', '.join(map(str, self.choices))}"
-            raise ConfigError(where, f"{value!r} is none of its values", remedy)
-        if not isinstance(value, str | bool):
-            low, high = self.bounds
-            if value < low:
-                raise ConfigError(where, f"{value:g} is too little", f"the least is {low:g}")
-            if value > high:
-                raise ConfigError(where, f"{value:g} is too much", f"the most is {high:g}")
-        return value
-
-
-@dataclass(eq=False)
-class DeclaredAttribute:
-    """An attribute of the user's own; ``observe`` what was measured of it."""
-
-    attribute: Attribute
-    observer: Observer | None = field(default=None, repr=False)
-
-    def observe(self, value: Value) -> None:
-        """Take one observation, in the attribute's unit; without effect while the resource does not run.
-
-        Raises:
-            ConfigError: It is no value of this attribute.
-            LocalProtocolError: The profile whose function calls was given up.
-        """
-        checked = self.attribute.check(value, f"observation of {self.attribute.name}")
-        if self.observer is not None:
-            with passage(f"observe {self.attribute.name}"):
-                self.observer.observe(self.attribute.name, checked)
-
-
-class Asker(Protocol):
-    """Carries what a resource asks of others while it runs."""
-
-    def asked(self, demand: Demand) -> None:
-        """It asks for something else; called in any thread."""
-        ...
-
-
-@dataclass(eq=False)
-class Demand:
-    """What a resource asks of another one, here or in another module, for as long as it runs.
-
-    Args:
-        resource: The other one's node, as this module's graph has it: ``sonar``, ``/robot1/sonar``.
-        wishes: By attribute; empty: nothing at present.
-        priority: The higher one wins a conflict between clients.
-        answer: What the other one says to it, the last time; ``None`` before it said anything.
-    """
-
-    resource: str
-    wishes: Mapping[str, Wish] = field(default_factory=dict)
-    priority: int = 0
-    answer: Answer | None = field(default=None, repr=False)
-    asker: Asker | None = field(default=None, repr=False)
-
-    def ask(self, **wishes: Wish) -> None:
-        """Ask for this instead, from now on; from a profile or a task, in any thread. Nothing: ask for nothing.
-
-        Raises:
-            LocalProtocolError: The profile whose function calls was given up.
-        """
-        with passage(f"ask {self.resource}"):
-            self.wishes = wishes
-            if self.asker is not None:
-                self.asker.asked(self)
-
-
-@dataclass(frozen=True, slots=True)
-class DeclaredProfile:
-    """A System Profile with what applies it."""
-
-    profile: Profile
-    apply: Hook
-    needs: Callable[[], str | bool | None] | None = None
-    """Its precondition: true or ``None`` while it can be taken; else false, or a text why it cannot."""
-
-
-@dataclass(frozen=True, slots=True)
-class Context:
-    """A situation of the robot: what it requires, and which information flows.
-
-    Args:
-        name: Unique.
-        when: A rule over topics and parameters (``resource.contexts``) that chooses it, or empty.
-        requires: What it asks of the resource's quality, by attribute.
-        profiles: The only profiles that may run in it; empty: any.
-        outputs: The only outputs that flow in it; ``None``: all.
-        enter: Called when it begins.
-    """
-
-    name: str
-    when: str = ""
-    requires: Mapping[str, Wish] = field(default_factory=dict, hash=False)
-    profiles: tuple[str, ...] = ()
-    outputs: tuple[str, ...] | None = None
-    enter: Hook | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Task:
-    """Something that the resource does again and again.
-
-    Args:
-        name: Unique; the function's name by default.
-        function: Plain (then it runs in a thread of its own) or ``async``.
-        rate: Hz of a periodic one, else ``None``.
-        on: The input whose messages it runs on, else ``None``.
-        on_failure: What becomes of it when it raises or is stuck.
-        stuck_after: Seconds that one run may take before it counts as stuck; ``None``: ten periods, at least 5 s.
-        follows: The parameter whose value is the rate, if there is one; profiles and people change it.
-    """
-
-    name: str
-    function: TaskFunction
-    rate: float | None = None
-    on: Input | None = None
-    on_failure: OnFailure = OnFailure.RESTART
-    stuck_after: float | None = None
-    follows: Parameter | None = None
 
 
 class Resource:
@@ -464,7 +146,7 @@ class Resource:
         if name in self.inputs:
             where = f"output {name} of {self.name}"
             raise ConfigError(where, "it is an input of the same resource", "a global name (/scan) is another topic")
-        made = Output(name, MessageType(kind), _contract(f"output {name} of {self.name}", contract), latch)
+        made = Output(name, MessageType(kind), read_contract(f"output {name} of {self.name}", contract), latch)
         self.outputs[name] = made
         return made
 
@@ -474,7 +156,7 @@ class Resource:
         if name in self.outputs:
             where = f"input {name} of {self.name}"
             raise ConfigError(where, "it is an output of the same resource", "a global name (/scan) is another topic")
-        made = Input(name, MessageType(kind), _contract(f"input {name} of {self.name}", contract), required)
+        made = Input(name, MessageType(kind), read_contract(f"input {name} of {self.name}", contract), required)
         self.inputs[name] = made
         return made
 
@@ -566,10 +248,10 @@ class Resource:
         made = DeclaredAttribute(
             Attribute(
                 name,
-                _word(Direction, better, where),
+                read_word(Direction, better, where),
                 unit,
-                _word(Scale, scale, where),
-                _word(Category, category, where),
+                read_word(Scale, scale, where),
+                read_word(Category, category, where),
                 plain,
                 tuple(words),
             )
@@ -635,9 +317,9 @@ class Resource:
         def declare(function: _Function) -> _Function:
             title = name or function.__name__
             where = f"profile {title} of {self.name}"
-            _takes(function, 0, where)
+            check_takes(function, 0, where)
             if needs is not None:
-                _takes(needs, 0, f"the precondition of {where}")
+                check_takes(needs, 0, f"the precondition of {where}")
                 if inspect.iscoroutinefunction(needs):
                     raise ConfigError(where, "its precondition is a coroutine function", "make it a plain one")
             if title in self.profiles:
@@ -732,10 +414,10 @@ class Resource:
             if on is not None and on not in self.inputs.values():
                 raise ConfigError(where, f"{on.name} is no input of this resource", "declare it there first")
             seconds = quantity(stuck_after, "s", where) if stuck_after is not None else None
-            _takes(function, 1 if on is not None else 0, where)
+            check_takes(function, 1 if on is not None else 0, where)
             if seconds is not None and seconds <= 0:
                 raise ConfigError(where, f"stuck after {seconds:g} s", "it is above 0")
-            policy = _word(OnFailure, on_failure, where)
+            policy = read_word(OnFailure, on_failure, where)
             self.tasks[title] = Task(title, function, hertz, on, policy, seconds, follows)  # type: ignore[arg-type] # as told
             return function
 
@@ -816,7 +498,7 @@ class Resource:
             raise ConfigError(f"resource {self.name}", f"{event} has its function already", "call both from one")
 
         def declare(function: _Function) -> _Function:
-            _takes(function, 0, f"what {self.name} does at {event}")
+            check_takes(function, 0, f"what {self.name} does at {event}")
             self.hooks[event] = function  # type: ignore[assignment] # as told
             return function
 
@@ -840,46 +522,3 @@ class Resource:
             raise ConfigError(where, "there is one of this name already", "name it otherwise")
         if name.removeprefix(f"/{self.name}/") in RESERVED:
             raise ConfigError(where, "that name is the resource's own", f"not one of {', '.join(sorted(RESERVED))}")
-
-
-def _takes(function: Callable[..., object], count: int, where: str) -> None:
-    """Check that a function can be called with so many arguments.
-
-    Raises:
-        ConfigError: It cannot.
-    """
-    what = "without arguments" if not count else "with the message"
-    try:
-        inspect.signature(function).bind(*[None] * count)
-    except TypeError as error:
-        name = getattr(function, "__name__", "its function")
-        raise ConfigError(where, f"{name} cannot be called {what}: {error}", "change its arguments") from None
-    except ValueError:
-        pass  # something that tells nothing of itself
-
-
-def _contract(where: str, words: Mapping[str, object]) -> Contract:
-    known = [key for key in LISTS["contract"] if key not in ("topics", "types")]
-    for word in words:
-        if word not in known:
-            near = did_you_mean(word, known)
-            remedy = f"did you mean {near}?" if near else f"known here: {', '.join(known)}"
-            raise ConfigError(where, f"a contract has no {word!r}", remedy)
-    if not words:
-        return Contract()
-    try:
-        rules = read_contracts([{"topics": ["/**"], **words}]).rules
-    except BadValue as error:
-        key = error.at[-1] if error.at else ""
-        remedy = error.remedy or (f"did you mean {error.better}?" if error.better else "")
-        raise ConfigError(f"{where}, {key}" if key else where, error.problem, remedy) from None
-    return Contract(**rules[0].values)  # type: ignore[arg-type] # as Rule.values promises
-
-
-def _word(kind: type[Any], word: str, where: str) -> Any:
-    words = [item.value for item in kind]
-    if word not in words:
-        near = did_you_mean(word, words)
-        remedy = f"did you mean {near}?" if near else f"it is one of {', '.join(words)}"
-        raise ConfigError(where, f"{word!r} is not known here", remedy)
-    return kind(word)
