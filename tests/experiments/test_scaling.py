@@ -62,6 +62,16 @@ def test_the_table_says_what_was_measured() -> None:
     assert (row["last start to all linked, s"], row["to its first message"]) == ("0.4", "0.5")
 
 
+def test_master_and_helpers_are_one() -> None:
+    told = measured(0.2, [], [None])
+    processes = told.tables["processes"]
+    rows = [("idle", f"{name}@pc", percent, 1) for name, percent in (("roscore", 0.1), ("master", 0.4))]
+    both = Measured({**told.tables, "processes": Table(processes.columns, [*processes.rows, *rows])})
+    grid = EXPERIMENT.findings(Results(Plan(), [(cell("classic", 2), both)])).grids[0]
+    row = dict(zip(grid.columns, grid.rows[0], strict=True))
+    assert (row["idle: % of a core, mean"], row["most"], row["all"]) == ("0.5", "0.5", "0.5")
+
+
 def test_growth_is_held_against_what_classic_ros_did_on_the_same_machine() -> None:
     claims = EXPERIMENT.findings(RESULTS).claims
     growth = next(claim for claim in claims if claim.text.startswith("latency p50 with 32"))

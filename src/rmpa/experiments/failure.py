@@ -86,7 +86,7 @@ class Times:
 
 
 _FULL: Final = Times(2.0, 2.0, 3.0, 8.0)
-_SHORT: Final = Times(0.5, 0.5, 1.0, 2.5)
+_SHORT: Final = Times(0.3, 0.5, 0.8, 2.0)
 
 
 class Robot:

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 RATE: Final = 50.0
 """Messages a second of each source."""
-_STILL: Final = 0.3
-"""Seconds without a message that are an outage: 15 messages; TCP's first attempt to send again takes 0.2 s."""
+_STILL: Final = 0.2
+"""Seconds without a message that are an outage: ten messages."""
 _ON_THE_WAY: Final = 0.3
 """Seconds before the end in which messages that are not there yet are not counted as lost."""
 _LATE: Final = 0.1
@@ -97,7 +97,7 @@ class Fate:
         due: Messages that should have come.
         lost: Of these never came.
         late: Of these came more than 0.1 s after they were due.
-        outage: Seconds of the longest time without a message; 0 if none was longer than 0.3 s.
+        outage: Seconds of the longest time without a message; 0 if none was longer than 0.2 s.
         back: Whether it ran at the end.
         after_start: Seconds from the start of what was started again (the agent or master, a node; the cable) until
             it ran again; ``None`` if it never stood still, or never came back.

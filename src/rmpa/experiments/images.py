@@ -59,7 +59,7 @@ class Times:
 
 
 _FULL: Final = Times(5.0, 2.0, 20.0, 2)
-_SHORT: Final = Times(0.5, 0.5, 1.5, 1)
+_SHORT: Final = Times(0.3, 0.3, 1.0, 1)
 
 
 class _Stream:

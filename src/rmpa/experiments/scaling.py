@@ -248,16 +248,20 @@ class Step:
 
 
 def _step(measured: Measured) -> Step:
-    used: dict[str, list[float]] = {"idle": [], "probe": [], "nodes": []}
+    """What one cell shows; classic ROS's master with its helpers counts as one."""
+    used: dict[str, dict[str, float]] = {"idle": {}, "probe": {}}
     for phase, name, percent, _ in measured.tables["processes"].rows:
-        used["nodes" if str(name).startswith("nodes") else str(phase)].append(_float(percent))
+        what, _, host = str(name).partition("@")
+        who = host if what == "agent" else "nodes" if what.startswith("nodes") else "master"
+        used[str(phase)][who] = used[str(phase)].get(who, 0.0) + _float(percent)
+    nodes = used["probe"].pop("nodes", 0.0)
     joins = measured.tables["joins"]
     return Step(
         latencies(measured.tables["arrivals"]),
         lost(measured.tables["arrivals"], measured.tables["sent"]),
-        used["idle"],
-        used["probe"],
-        sum(used["nodes"]),
+        list(used["idle"].values()),
+        list(used["probe"].values()),
+        nodes,
         _crossing(measured.tables["traffic"], "bytes"),
         _crossing(measured.tables["traffic"], "packets"),
         [_float(value) for value in joins.column("linked_s") if value is not None],

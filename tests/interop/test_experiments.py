@@ -1,0 +1,70 @@
+"""All experiments in a short form on real hosts with real ROS: that they run, and leave what the documents promise.
+
+Not how soon anything was: figures have no place in a verdict on a shared machine.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from rmpa.experiments.bed.agents import RMPA
+from rmpa.experiments.registry import EXPERIMENTS
+from rmpa.experiments.store import Store
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(300)]
+_ONLY: Final = {"control": ("mode=event",), "scaling": ("modules=2",)}
+"""What is enough to see that it works, where the short form has more."""
+_ROWS: Final = {
+    "failure": ("flows", "moments"),
+    "scaling": ("joins", "processes", "traffic", "arrivals", "sent"),
+    "images": ("commands", "images"),
+}
+"""Tables that must have something in them; of the others, each that there is."""
+
+
+def rmpa(*words: str | Path) -> None:
+    done = subprocess.run([RMPA, "experiment", *words], capture_output=True, text=True, check=False, timeout=240)
+    assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
+
+
+def namespaces() -> set[str]:
+    listed = subprocess.run(["ip", "netns", "list"], capture_output=True, text=True, check=True, timeout=20)
+    return set(listed.stdout.split())
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_an_experiment_measures_both_systems_and_reports(name: str, tmp_path: Path) -> None:
+    before = namespaces()
+    out = tmp_path / "run"
+    only = [word for setting in _ONLY.get(name, ()) for word in ("--only", setting)]
+    rmpa("run", name, "--short", "--client", "roscpp", "--bed", "namespaces", "--out", out, *only)
+
+    store = Store.load(out)
+    assert store.names == [name]
+    assert not store.failed(name)
+    results = store.results(name)
+    assert {cell.settings["system"] for cell, _ in results.cells} == {"classic", "rmpa"}
+    for cell, measured in results.cells:
+        for table in _ROWS.get(name, tuple(measured.tables)):
+            assert measured.tables[table].rows, f"{cell.key}: nothing in {table}"
+            assert (out / name / cell.key / f"{table}.csv").is_file()
+        assert measured.tables["lateness"].rows
+    manifest = json.loads((out / "manifest.json").read_text(encoding="utf-8"))
+    assert manifest["plan"]["size"] == "short"
+    assert {"kernel", "cores", "rmpa"} <= manifest["machine"].keys()
+
+    report = out / "report"
+    words = (report / "report.md").read_text(encoding="utf-8")
+    assert "classic" in words
+    assert "RMPA" in words
+    drawn = {path.suffix for path in (report / "figures").iterdir()}
+    assert drawn == {".png", ".svg"}
+    assert "data:image/" in (report / "report.html").read_text(encoding="utf-8")
+    assert not {one for one in namespaces() - before if one.startswith("rmpa-")}
