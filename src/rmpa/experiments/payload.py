@@ -13,6 +13,7 @@ from rmpa.experiments import samples, statistics
 from rmpa.experiments.arrivals import counted, latencies, lost
 from rmpa.experiments.contenders import CLASSIC, RMPA, turn
 from rmpa.experiments.model import Cell, Claim, Figure, Findings, Grid, Panel, Series
+from rmpa.experiments.report import words
 from rmpa.experiments.stream import LEAD, SETTLE, stream
 
 if TYPE_CHECKING:
@@ -258,7 +259,7 @@ def _grids(found: Found) -> Iterator[Grid]:
 
 def _figures(found: Found) -> Iterator[Figure]:
     for kind, ladders in found.items():
-        shown = [contender for contender in (RMPA, CLASSIC) if contender in ladders]
+        shown = [contender for contender in (CLASSIC, RMPA) if contender in ladders]
         labels = {one: f"{one.label}, {kind.client}" for one in shown}
         points = [_points(ladders[one], labels[one], one.system) for one in shown]
         lines = [series for one in shown for series in _drawn(ladders[one], labels[one], one.system)]
@@ -277,12 +278,12 @@ def _figures(found: Found) -> Iterator[Figure]:
 
 
 def _straightness(ladders: Mapping[Contender, Ladder], shown: Sequence[Contender]) -> str:
-    lines = [f"{one.label} {line.r2:.4f}" for one in shown if (line := ladders[one].line()) is not None]
+    lines = [f"{one.label} {line.r2:.3f}" for one in shown if (line := ladders[one].line()) is not None]
     return f"R²: {', '.join(lines)}" if lines else "every message"
 
 
 def _link(link: str) -> str:
-    return "link not shaped" if link == UNSHAPED else f"link of {link}"
+    return "link not shaped" if link == UNSHAPED else f"link of {words.link(link)}"
 
 
 def _points(ladder: Ladder, label: str, system: str) -> Series:

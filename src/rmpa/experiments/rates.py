@@ -214,7 +214,7 @@ def _grid(steps: Mapping[Contender, Steps], client: str) -> Grid:
 
 
 def _figure(steps: Mapping[Contender, Steps], client: str) -> Figure:
-    shown = [contender for contender in (RMPA, CLASSIC) if steps[contender]]
+    shown = [contender for contender in (CLASSIC, RMPA) if steps[contender]]
     boxes = [_boxes(steps[contender], f"{contender.label}, {client}", contender.system) for contender in shown]
     curves = [
         Series(f"{contender.label}, {name}", *_curve(steps[contender], name), style="line", system=contender.system)
