@@ -158,6 +158,10 @@ def test_what_was_asked_chosen_and_set_is_back_after_a_crash(pair: tuple[Running
     heard(watcher, "diagnostics", OK, name="viewer", since=again)
 
     assert second.interrupt() == 0
+    eventually(lambda: known(viewer) == {"/viewer": True, "/camera": False}, LONG, what="the camera to be remembered")
+    assert viewer.process is not None
+    viewer.process.kill()
+    eventually(lambda: known(viewer) == {"/viewer": False, "/camera": False}, LONG, what="both to be remembered")
     events = [str(row) for row in rows(store, "SELECT event, message FROM events ORDER BY id")]
     assert any("small was chosen by hand" in event for event in events), events
     assert rows(store, "SELECT count(*) FROM windows")[0][0]
@@ -165,6 +169,15 @@ def test_what_was_asked_chosen_and_set_is_back_after_a_crash(pair: tuple[Running
     third = camera.start()
     assert "camera.sqlite is damaged (file is not a database); it is set aside" in third.output
     assert store.with_name("camera.sqlite.damaged").exists()
+
+
+def known(where: Running) -> dict[str, bool]:
+    """Which resources a module knows, and whether they are here."""
+    code, text = where.agent.rmpa("resource", "list", "--known", "--json", timeout=LONG)
+    assert code == 0, text
+    found = json.loads(text[text.index("[") :])
+    assert all(one["here"] or one["last_seen_ago"] < 10 * LONG for one in found)
+    return {one["name"]: one["here"] for one in found}
 
 
 def stored(store: Path, name: str) -> str:

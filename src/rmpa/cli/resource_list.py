@@ -53,9 +53,17 @@ class _Present:
 @master_option
 def list_(known: bool, state: str | None, as_json: bool, agent: str | None, master: str | None) -> None:
     """List the resources of this module, and those of peers with the peers' names."""
-    chosen = choose_master(master, agent, os.environ)
-    here = _here(chosen, known=known)
-    gone = remembered(chosen, state, [each.seen for each in here]) if known else []
+    here: list[_Present] = []
+    module = agent or os.environ.get("RMPA_AGENT")
+    try:
+        chosen = choose_master(master, agent, os.environ)
+        here = _here(chosen)
+        module = snapshot.agent.name if (snapshot := chosen.snapshot()) is not None else None
+    except UnreachableError as error:
+        if not known:
+            raise
+        warn(printable(str(error)))
+    gone = remembered(module, state, [each.seen for each in here]) if known else []
     if as_json:
         more = {"here": True} if known else {}
         print_json([_as_json(e.seen, e) | more for e in here] + [_as_json(e.seen) | _as_known(e) for e in gone])
@@ -63,8 +71,8 @@ def list_(known: bool, state: str | None, as_json: bool, agent: str | None, mast
         _print(here, gone)
 
 
-def _here(master: Master, *, known: bool) -> list[_Present]:
-    """The resources that the master's graph shows now; none if it does not answer and others are known."""
+def _here(master: Master) -> list[_Present]:
+    """The resources that the master's graph shows now."""
     found: list[_Present] = []
 
     async def body(room: Room) -> None:
@@ -75,12 +83,7 @@ def _here(master: Master, *, known: bool) -> list[_Present]:
         states, profiles, contexts = await room.texts(room.seen, "state", "profile", "context")
         found.extend(_Present(one, states.get(one), profiles.get(one), contexts.get(one)) for one in room.seen)
 
-    try:
-        asyncio.run(look_around(master, body))
-    except UnreachableError as error:
-        if not known:
-            raise
-        warn(printable(str(error)))
+    asyncio.run(look_around(master, body))
     return found
 
 

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
-    from rmpa.cli.master import Master
-
 
 @dataclass(frozen=True, slots=True)
 class Remembered:
@@ -47,25 +45,21 @@ class Remembered:
         return f"last seen {duration(self.ago)} ago, not here now"
 
 
-def remembered(master: Master, state: str | None, here: Iterable[Seen]) -> list[Remembered]:
+def remembered(module: str | None, state: str | None, here: Iterable[Seen]) -> list[Remembered]:
     """The resources that were seen before and are not here now, the latest first.
 
     Args:
-        master: If it is an agent's, those that its module has seen; else those of all modules of this machine.
+        module: Which has seen them; ``None``: any of this machine.
         state: Where they are written down; ``None``: where ``rmpa run`` does so by default.
         here: Those that are here.
     """
     directory = state_dir(os.environ, state)
     if directory is None:
         return []
-    snapshot = master.snapshot()
-    paths = [module_dir(directory, snapshot.agent.name) / FILE] if snapshot is not None else []
+    paths = [module_dir(directory, module) / FILE] if module is not None else directory.glob(f"*/{FILE}")
     present = {(each.path, each.peer) for each in here}
     found = [
-        each
-        for path in paths or sorted(directory.glob(f"*/{FILE}"))
-        for each in _read(path)
-        if (each.seen.path, each.seen.peer) not in present
+        each for path in sorted(paths) for each in _read(path) if (each.seen.path, each.seen.peer) not in present
     ]
     return sorted(found, key=lambda each: -each.last)
 
