@@ -299,6 +299,37 @@ async def many_peers_shout(world: World) -> None:
     assert len(world.near.station.discovery.peers()) > 25
 
 
+async def thousands_of_peers_are_invented(world: World) -> None:
+    """From sixty addresses, so that what one may send is no bound; then whatever has to be done about them."""
+
+    def work() -> None:
+        senders = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(60)]
+        for number, out in enumerate(senders):
+            out.bind((f"127.0.0.{2 + number}", 0))
+            out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
+        for number in range(3000):
+            guid = Guid.of(f"127.1.{number // 250}.{1 + number % 250}", 4000)
+            gossip = tuple(Guid.of(f"127.2.{number // 250}.{n}", 4000) for n in range(1, 9))
+            identity = Identity(guid, os.urandom(16), f"invented{number}")
+            beacon = Beacon(BeaconKind.ANNOUNCE, identity, 120_000, 1, gossip)
+            senders[number % 60].sendto(beacon.serialize(), world.group)
+            if number % 20 == 19:
+                time.sleep(0.02)
+        for out in senders:
+            out.close()
+        path = next(world.near._control.path.parent.glob("near.sock"))
+        with ControlClient(path, timeout=DEADLINE) as client:
+            for _ in range(4):
+                client.snapshot()
+                time.sleep(2 * limits.HEARTBEAT_INTERVAL / 4)
+
+    await world.beside(work)
+    assert world.near.station is not None
+    assert len(world.near.station.discovery.peers()) > limits.ROSTER_PEERS_MAX / 2
+    assert world.near.station.discovery.counters["roster.full"] > 0
+    assert world.linked()
+
+
 async def the_fleet_leaves(world: World) -> None:
     nodes = [fleet("unregisterPublisher", node, world.api) for node in range(NODES)]
     await world.beside(*(calls(world.far, bodies) for bodies in nodes))
@@ -315,6 +346,7 @@ PHASES: Final[tuple[Callable[[World], Awaitable[None]], ...]] = (
     other_rules_hold,
     the_link_falls_and_comes_back,
     many_peers_shout,
+    thousands_of_peers_are_invented,
     the_fleet_leaves,
 )
 

@@ -35,7 +35,9 @@ class PeersView:
         """Every peer that is known, by name."""
         now = self._clock.now()
         links = {attached.link.guid: attached for attached in self._bridge.attached()}
+        breathe()  # a millisecond each with a full roster
         roster = {view.identity.guid: view for view in station.discovery.peers()}
+        breathe()
         statuses = {status.identity.guid: status for status in station.mesh.peers()}
         infos = []
         for guid in {*roster, *statuses, *links}:
