@@ -195,7 +195,8 @@ def test_the_agents_part_of_ros_starts_without_numpy() -> None:
         "import pkgutil, sys, importlib, rmpa.ros, rmpa.ros.aio\n"
         "for room in (rmpa.ros, rmpa.ros.aio):\n"
         "    for module in pkgutil.iter_modules(room.__path__, room.__name__ + '.'):\n"
-        "        importlib.import_module(module.name)\n"
+        "        if module.name != 'rmpa.ros.typestore':\n"  # what the first message imports
+        "            importlib.import_module(module.name)\n"
         "from rmpa.ros.messages import MessageType\n"
         "MessageType('sensor_msgs/Joy').describe()\n"
         "print(sorted({'numpy', 'rosbags', 'rich'} & sys.modules.keys()))\n"

@@ -344,9 +344,11 @@ def _python_name(name: str) -> str:
 
 @functools.cache
 def _known_store() -> Typestore:
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 - see the module's docstring
+    from rosbags.typesys import Stores  # noqa: PLC0415 - see the module's docstring
 
-    return get_typestore(Stores.ROS1_NOETIC)
+    from rmpa.ros.typestore import Ros1Store  # noqa: PLC0415
+
+    return Ros1Store(Stores.ROS1_NOETIC)
 
 
 @functools.lru_cache(maxsize=limits.LEARNT_TYPES_MAX)
@@ -355,10 +357,12 @@ def _learn(name: str, definition: str) -> MessageType:
 
 
 def _learnt_store(name: str, specifications: Mapping[str, Specification]) -> Typestore:
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415 - see the module's docstring
+    from rosbags.typesys import Stores, get_types_from_msg  # noqa: PLC0415 - see the module's docstring
     from rosbags.typesys.base import TypesysError  # noqa: PLC0415
 
-    store = get_typestore(Stores.EMPTY)
+    from rmpa.ros.typestore import Ros1Store  # noqa: PLC0415
+
+    store = Ros1Store(Stores.EMPTY)
     try:
         for each in specifications.values():
             # Written anew from the parsed fields: comments and constants, which a reader does not need, stay out of
