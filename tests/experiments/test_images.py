@@ -74,6 +74,7 @@ def test_the_claims_hold_a_percentile_of_all_rounds() -> None:
 def test_of_few_commands_nothing_is_claimed() -> None:
     found = claims((cell("rmpa"), measured([0.5] * 200)))
     assert found["commands beside images, p99, RMPA, roscpp"].value is None
+    assert found["images' share of the cable, RMPA, roscpp"].value is None
 
 
 def test_without_a_cable_nothing_is_claimed_of_one() -> None:

@@ -37,6 +37,8 @@ _DEADLINE: Final = 1000.0
 _CLASSIC_LIMIT: Final = 10.0
 """ms: "tens"."""
 _SHARE_LIMIT: Final = 0.9
+_ENOUGH_IMAGES: Final = 100
+"""Images below which nothing is said of their share."""
 _NAMES: Final = {"classic": "classic", "rmpa": "RMPA"}
 _UNITS: Final = {"": 1.0, "k": 1e3, "m": 1e6, "g": 1e9}
 
@@ -315,7 +317,7 @@ def _claims(scores: Scores) -> Iterable[Claim]:
         value = None if p99 is None else p99 / 1000
         if system == "rmpa":
             yield Claim(f"commands beside images, p99, RMPA, {client}", value, _DEADLINE / 1000, unit="ms")
-            share = _mean(score.shares)
+            share = _mean(score.shares) if len(score.images) >= _ENOUGH_IMAGES else None
             yield Claim(f"images' share of the cable, RMPA, {client}", share, _SHARE_LIMIT, at_least=True)
         else:
             text = f"commands beside images, p99, classic, {client}"
