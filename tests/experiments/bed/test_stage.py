@@ -225,12 +225,12 @@ class TestCables:
         with _system(NETWORK, "classic") as (stage, robot):
             source, _ = _nodes(robot, stage)
             address = robot._place.host("velocity").address
-            standing = _connections_to(address)
+            standing = _connections(robot, address)
             robot.kill("velocity")
             # The source's packets to it are lost by now, and nothing has come back.
             flow.sent(flow.begin(source, stage.scratch, size=64, rate=100, count=10))
             assert standing
-            assert _connections_to(address) == standing
+            assert _connections(robot, address) == standing
             assert not [event for event in source.events("connected") if event["subscribers"] == 1][1:]
 
     def test_own_clients_run_here_too(self) -> None:
@@ -255,15 +255,10 @@ class TestCables:
             assert time.monotonic() - began < 30
 
 
-def _connections_to(address: str) -> set[str]:
-    """The established connections of joystick's namespace to an address, as ``ss`` names them."""
-    name = next(line.split()[0] for line in _namespaces().splitlines() if line.split()[0].endswith("-joystick"))
-    shown = subprocess.run(
-        ["ip", "netns", "exec", name, "ss", "-Htn", "state", "established", "dst", address],
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
+def _connections(robot: Robot, address: str) -> set[str]:
+    """The established connections of joystick to an address, as ``ss`` names them."""
+    here = robot._place.host("joystick")
+    shown = run(here.command(["ss", "-Htn", "state", "established", "dst", address]))
     return {" ".join(line.split()[2:4]) for line in shown.splitlines()}
 
 
