@@ -80,6 +80,7 @@ def run(
 
     from rmpa.core.log import configure_logging
 
+    gc.disable()  # nothing that an import makes is garbage; it is on again when the resources are active
     configure_logging(log_level, sys.stderr, as_json=False)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _told_to_end)
@@ -330,6 +331,7 @@ async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None, s
 
     def ready() -> None:
         gc.freeze()  # a full collection, in the midst of a task, need not look at all that was loaded
+        gc.enable()
         _log.info("= %s: active on %s", ", ".join(printable(r.name) for r in resources), uri)
 
     failure: RmpaError | None = None

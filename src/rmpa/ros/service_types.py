@@ -6,13 +6,10 @@ come with us; others are found where ROS finds them on this machine (``ros.insta
 
 from __future__ import annotations
 
-import functools
-import json
 import re
-from importlib.resources import files
 from typing import TYPE_CHECKING
 
-from rmpa.ros.definitions import DefinitionError, Specification, known_specifications, service_md5sum
+from rmpa.ros.definitions import DefinitionError, Specification, known_specifications, packaged_texts, service_md5sum
 from rmpa.ros.messages import MessageType
 from rmpa.ros.services import ServiceDescription
 
@@ -69,10 +66,8 @@ def _complete(
         _complete(known[name], known, find)
 
 
-@functools.cache
 def _texts() -> Mapping[str, str]:
-    texts: dict[str, str] = json.loads(files("rmpa.ros").joinpath("service_definitions.json").read_text("utf-8"))
-    return texts
+    return packaged_texts("service_definitions.json")
 
 
 def known_services() -> tuple[str, ...]:
