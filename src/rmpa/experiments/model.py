@@ -132,7 +132,7 @@ class Series:
         y: As many.
         style: ``points`` for samples, ``line``, ``steps`` for a distribution function, ``bars``; ``spans`` for thick
             horizontal bars, one for each pair of points: ``x`` where it begins and ends, ``y`` its row, twice;
-            ``box`` for samples ``y`` grouped by their ``x`` (quartiles, p5 to p95, p99), the groups equally far apart.
+            ``box`` for samples ``y`` grouped by their ``x`` (quartiles, p5 to p95, p99), groups equally far apart.
         system: Decides the colour, the same in all figures: ``classic``, ``rmpa`` or something else.
     """
 
