@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -64,6 +65,13 @@ def test_the_tools_of_dynamic_reconfigure_configure_it_from_another_module(pair:
     assert (described["level"]["min"], described["level"]["max"], described["level"]["type"]) == (0.0, 10.0, "double")
     assert described["level"]["description"] == "of the supply [V]"
     assert "'value': 'blue'" in described["colour"]["edit_method"]
+    for name, each in described.items():  # what rqt_reconfigure's editors look up when they are opened
+        if each["edit_method"]:
+            values = [item["value"] for item in ast.literal_eval(each["edit_method"])["enum"]]
+            assert each["default"] in values, name
+            assert first[name] in values, name
+        elif each["type"] == "int":  # a slider's ends have 32 bits
+            assert -(2**31) <= int(each["min"]) < int(each["max"]) < 2**31, name
 
     since = client.mark_events()
     done = change(client, level=99, steps="7", on="false", colour="BLUE", profile="fast")
