@@ -153,8 +153,8 @@ class ResourceClient:
         return self._answer
 
     async def answers(self) -> AsyncIterator[Answer]:
-        """Each answer from now on, as it changes."""
-        seen = self._version
+        """The present answer, if there is one, and each from now on, as it changes."""
+        seen = 0
         while True:
             while self._version == seen:
                 self._change.clear()
