@@ -102,8 +102,8 @@ class Sightings:
         before = self._known.get(place)
         first_ns = before.first_ns if before is not None else now_ns
         self._known[place] = Sighting(path, caller, text, first_ns, now_ns)
+        rows = self._times(place) if place not in self._here or self._is_due(place, now_ns) else {}
         self._here.add(place)
-        rows = self._times(place)
         if before is None or before.text != text:
             rows[DESCRIPTOR, _name(place)] = text
         return rows | self._bound()
@@ -113,8 +113,7 @@ class Sightings:
         rows: Rows = {}
         for place in self._known.keys() & set(here):
             self._known[place].last_ns = now_ns
-            # By either sign: a clock that was set is written at once.
-            if abs(now_ns - self._written.get(place, 0)) >= limits.KNOWN_WRITE * 1e9:
+            if self._is_due(place, now_ns):
                 rows |= self._times(place)
         for place in self._here - set(here):
             rows |= self._times(place)
@@ -127,6 +126,10 @@ class Sightings:
         for place in self._here:
             rows |= self._times(place)
         return rows
+
+    def _is_due(self, place: Place, now_ns: int) -> bool:
+        """Whether its time is to be written again; by either sign, so that a clock that was set is written at once."""
+        return abs(now_ns - self._written.get(place, 0)) >= limits.KNOWN_WRITE * 1e9
 
     def _times(self, place: Place) -> Rows:
         one = self._known.get(place)
