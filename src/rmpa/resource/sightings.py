@@ -128,7 +128,7 @@ class Sightings:
         return rows
 
     def _is_due(self, place: Place, now_ns: int) -> bool:
-        """Whether its time is to be written again; by either sign, so that a clock that was set is written at once."""
+        """Whether its time is to be written again; at once where the clock was set, by either sign."""
         return abs(now_ns - self._written.get(place, 0)) >= limits.KNOWN_WRITE * 1e9
 
     def _times(self, place: Place) -> Rows:
