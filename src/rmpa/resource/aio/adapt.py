@@ -129,7 +129,7 @@ class Adapter(RuntimePart):
         self._publishers["diagnostics"] = await node.advertise("/diagnostics", ARRAY_TYPE)
         for name in ("profile", "decision"):
             await self._runtime.say(name, "")
-        self._recall(now)
+        self._recall(now := self._loop.time())  # registering has taken a while
         self._asking = await node.subscribe(f"{node.name}/requirements", ARRAY_TYPE, self._asked)
         await node.subscribe(f"{node.name}/observed", ARRAY_TYPE, self._told_of)
         self._bar()
