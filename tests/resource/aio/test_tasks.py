@@ -219,9 +219,11 @@ async def test_a_task_that_overruns_its_period_is_reported_once_and_goes_on(benc
     bench.tasks.activate()
     await count.wait()
     bench.tasks.judge()
-    count = Counter(4)
-    await count.wait()
-    bench.tasks.judge()
+    assert bench.problems == [], "one window may be the machine's business"
+    for _ in range(2):
+        count = Counter(4)
+        await count.wait()
+        bench.tasks.judge()
     assert [problem.kind for problem in bench.problems] == ["too slow"]
     (trouble,) = bench.tasks.troubles
     assert "task t too slow:" in trouble

@@ -134,7 +134,9 @@ class Tasks(RuntimePart):
         self._on_deactivate = on_deactivate
         self._runners: dict[str, _Runner] = {}
         self._slow: dict[str, TaskProblem] = {}
-        """Tasks that were too slow in the last window in which they ran."""
+        """Tasks that were too slow in the last two windows in which they ran."""
+        self._lagged: set[str] = set()
+        """Those that were in the last one: once is the machine's business."""
         self._looker: asyncio.TimerHandle | None = None
         self._gate = Gate()
 
@@ -166,10 +168,14 @@ class Tasks(RuntimePart):
                 continue  # nothing that could be judged
             runner, known = self._runners[name], self._slow.pop(name, None)
             if text := too_slow(report, runner.period):
-                self._slow[name] = TaskProblem(runner.task, "too slow", text)
-                if known is None:
-                    self._on_problem(self._slow[name])
-            elif known is not None:
+                if name in self._lagged:
+                    self._slow[name] = TaskProblem(runner.task, "too slow", text)
+                    if known is None:
+                        self._on_problem(self._slow[name])
+                self._lagged.add(name)
+                continue
+            self._lagged.discard(name)
+            if known is not None:
                 _log.info("= /%s: task %s keeps up again", self._runtime.resource.name, name)
 
     def activate(self) -> None:
@@ -185,6 +191,7 @@ class Tasks(RuntimePart):
             self._looker = None
         runners, self._runners = list(self._runners.values()), {}
         self._slow.clear()
+        self._lagged.clear()
         for runner in runners:
             runner.stop()
         await asyncio.gather(*(runner.ended() for runner in runners))
