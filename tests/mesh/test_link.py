@@ -11,7 +11,7 @@ from rmpa.core.identity import Identity
 from rmpa.mesh.frames import Frame, Kind, pack_data_header, pong
 from rmpa.mesh.handshake import Hello, Refusal, Refuse
 from rmpa.mesh.link import Closed, ControlReceived, HelloReceived, Refused, Role, State, Up
-from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, exchange, pair, side
+from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, exchange, pair, pass_time, side
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 24, 1 << 20])
@@ -196,13 +196,41 @@ def test_keepalive_holds_an_idle_link_for_ever_and_its_clock_is_known() -> None:
 def test_silence_for_the_others_lease_ends_the_link() -> None:
     time = Time()
     dialler, _ = pair(time, lease=2.0)
-    time.now += 1.999
-    dialler.link.handle_timer(time.now)
+    pass_time(dialler.link, time, 1.999)
     assert dialler.link.state is State.UP
-    time.now += 0.001
-    dialler.link.handle_timer(time.now)
+    pass_time(dialler.link, time, 0.001)
     assert dialler.last() == Closed("high was silent for its lease of 2 s", orderly=False)
     assert dialler.link.next_timer() is None
+
+
+def is_up(one: Side) -> bool:
+    return one.link.state is State.UP
+
+
+def test_a_pause_of_our_own_is_no_silence_of_the_others() -> None:
+    time = Time()
+    dialler, _ = pair(time)
+    pass_time(dialler.link, time, 0.3)
+    time.now += 5.0  # stopped, or without a processor
+    dialler.link.handle_timer(time.now)
+    assert is_up(dialler)
+    pass_time(dialler.link, time, 0.4)
+    assert is_up(dialler), "who is back looks for as long as was left"
+    dialler.link.heard(time.now)
+    pass_time(dialler.link, time, 0.99)
+    assert is_up(dialler)
+    pass_time(dialler.link, time, 0.01)
+    assert not is_up(dialler), "what was excused is over with the next word"
+
+
+def test_a_peer_that_died_in_our_pause_is_given_up_within_its_lease() -> None:
+    time = Time()
+    dialler, _ = pair(time)
+    time.now += 60.0
+    dialler.link.handle_timer(time.now)
+    assert is_up(dialler)
+    pass_time(dialler.link, time, limits.LINK_LEASE)
+    assert not is_up(dialler)
 
 
 def test_bytes_within_a_half_read_frame_renew_the_lease() -> None:
@@ -313,8 +341,7 @@ def test_a_lease_of_a_month_is_cut() -> None:
     hello = Hello(LOW.guid, LOW.instance, LOW.name, 0, 0xFFFFFFFF)
     deliver(Frame(Kind.HELLO, hello.serialize()).serialize(), acceptor.link, time.now)
     acceptor.link.accept(time.now)
-    time.now += limits.LINK_LEASE_MAX
-    acceptor.link.handle_timer(time.now)
+    pass_time(acceptor.link, time, limits.LINK_LEASE_MAX)
     assert acceptor.link.state is State.CLOSED
 
 

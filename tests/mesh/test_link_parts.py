@@ -10,7 +10,7 @@ from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.frames import WHOLE, Frame, Kind, pack_data_header
 from rmpa.mesh.handshake import Lane
 from rmpa.mesh.link import Closed, ControlReceived, HelloReceived, Marked, Role, State, Up
-from tests.mesh.worlds import HIGH, LOW, Time, deliver, exchange, pair, side
+from tests.mesh.worlds import HIGH, LOW, Time, deliver, exchange, pair, pass_time, side
 
 
 def fragments(route: int, sequence: int, payload: bytes, sizes: list[int]) -> list[bytes]:
@@ -158,8 +158,7 @@ def test_a_half_read_frame_keeps_the_link_no_longer_than_its_bytes_come() -> Non
         acceptor.link.receive(memoryview(bytes(1000)), time.now)
         acceptor.link.handle_timer(time.now)
     assert not any(isinstance(event, Closed) for event in acceptor.events)
-    time.now += 1.0
-    acceptor.link.handle_timer(time.now)
+    pass_time(acceptor.link, time, 1.0)
     assert isinstance(acceptor.last(), Closed)
 
 

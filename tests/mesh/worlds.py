@@ -57,6 +57,15 @@ class Time:
         return WALL + round(self.now * 1e9) + self.offset_ns
 
 
+def pass_time(link: Link, time: Time, seconds: float) -> None:
+    """Let time go by as a driver has it: the link's timers are handled when they are due."""
+    end = time.now + seconds
+    while (due := link.next_timer()) is not None and due <= end:
+        time.now = max(time.now, due)
+        link.handle_timer(time.now)
+    time.now = end
+
+
 def side(
     role: Role,
     ours: Identity,

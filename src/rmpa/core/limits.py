@@ -156,6 +156,8 @@ SEED_RETRY_MAX: Final = 30.0
 # --- mesh -----------------------------------------------------------------------------------------------------
 LINK_LEASE: Final = 1.0
 """A link on which nothing arrived for this long is dead (TCP alone would take two hours)."""
+PAUSE_NOTICED: Final = 0.1
+"""A timer that comes later than this tells that its process was away: that time counts as no peer's silence."""
 KEEPALIVE_INTERVAL: Final = 0.25
 """A quarter of the lease: three keepalives may be late before the link falls."""
 KEEPALIVE_ANSWERED: Final = 1.2

@@ -224,6 +224,7 @@ class Link:
         self._deadline = now + limits.HANDSHAKE_TIMEOUT
         self._reason = ""
         self._heard = now
+        self._excused = self._excused_behind = 0.0
         self._welcomed = now
         self._sent = now
         self._pinged = now
@@ -374,6 +375,8 @@ class Link:
         due = self.next_timer()
         if due is None or now < due:
             return
+        if now - due > limits.PAUSE_NOTICED:
+            self._excuse(min(now - due, now - self._heard))
         if self._state is State.CLOSING:
             self._end(self._reason, orderly=True)
         elif self._state is State.HANDSHAKING:
@@ -401,7 +404,16 @@ class Link:
         handshake's time: with the lease alone, no link with a round trip above it would ever come up for good.
         """
         awaited = self.role is Role.ACCEPTOR and self._heard <= self._welcomed
-        return self._heard + (max(self._remote_lease, limits.HANDSHAKE_TIMEOUT) if awaited else self._remote_lease)
+        lease = max(self._remote_lease, limits.HANDSHAKE_TIMEOUT) if awaited else self._remote_lease
+        return self._heard + lease + (self._excused if self._excused_behind == self._heard else 0.0)
+
+    def _excuse(self, late: float) -> None:
+        """Let the other side's silence last longer by the time for which we did not look.
+
+        Whose timers come late was away itself: stopped, or without a processor. That is no peer's death.
+        """
+        before = self._excused if self._excused_behind == self._heard else 0.0
+        self._excused, self._excused_behind = before + late, self._heard
 
     def _admit(self, kind: int) -> bool:
         """Whether a frame of this kind is read now; ``False`` when we are leaving and read nothing more."""
