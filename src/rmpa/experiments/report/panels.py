@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from rmpa.experiments.model import Panel, Series
     from rmpa.experiments.report.colours import Look
 
+_WORDS_LEVEL: Final = 20
+"""Characters of all groups' names that have room beside each other in a panel."""
 _MOST: Final = 3000
 """Points of a series that are drawn; of more, evenly chosen ones and the outermost."""
 _FEW: Final = 40
@@ -87,7 +89,9 @@ def draw(axes: Axes, panel: Panel, looks: Mapping[str, Look], letters: int = 100
         axes.set_xticks([places.back(places.place(x)) for x in panel.ticks.values()], list(panel.ticks))
         axes.minorticks_off()
     elif places.equal:
-        axes.set_xticks(range(len(places.groups)), [f"{x:g}" for x in places.groups])
+        words = [f"{x:g}" for x in places.groups]
+        turned = 45 if sum(map(len, words)) > _WORDS_LEVEL else 0
+        axes.set_xticks(range(len(words)), words, rotation=turned)
     elif not panel.logx and full and all(float(x).is_integer() for one in full for x in one.x):
         axes.xaxis.set_major_locator(_whole_numbers())  # numbers of messages, of modules
     for text, y in panel.marks.items():
