@@ -86,12 +86,10 @@ def draw(axes: Axes, panel: Panel, looks: Mapping[str, Look], letters: int = 100
     for one in full:
         _DRAWN[one.style](axes, one, looks[one.label], places)
     if panel.ticks:
-        axes.set_xticks([places.back(places.place(x)) for x in panel.ticks.values()], list(panel.ticks))
+        _name_places(axes, [places.back(places.place(x)) for x in panel.ticks.values()], list(panel.ticks))
         axes.minorticks_off()
     elif places.equal:
-        words = [f"{x:g}" for x in places.groups]
-        turned = 45 if sum(map(len, words)) > _WORDS_LEVEL else 0
-        axes.set_xticks(range(len(words)), words, rotation=turned)
+        _name_places(axes, range(len(places.groups)), [f"{x:g}" for x in places.groups])
     elif not panel.logx and full and all(float(x).is_integer() for one in full for x in one.x):
         axes.xaxis.set_major_locator(_whole_numbers())  # numbers of messages, of modules
     for text, y in panel.marks.items():
@@ -99,6 +97,11 @@ def draw(axes: Axes, panel: Panel, looks: Mapping[str, Look], letters: int = 100
         say(axes, text, (1, y), ("axes fraction", "data"), (-3, 2), "right")
     beside = axes.inset_axes((1.01, 0, 0.17, 1), sharey=axes) if panel.distribution else None
     return Drawn(axes, panel, looks, beside)
+
+
+def _name_places(axes: Axes, places: Sequence[float], words: list[str]) -> None:
+    """Write words below places, turned where they have no room beside each other."""
+    axes.set_xticks(places, words, rotation=45 if sum(map(len, words)) > _WORDS_LEVEL else 0)
 
 
 def settle(together: Sequence[Drawn]) -> None:
