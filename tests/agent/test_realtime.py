@@ -113,7 +113,7 @@ async def test_no_collection_runs_while_messages_flow(
 async def test_garbage_of_control_work_is_collected_while_the_agent_runs(
     pair: tuple[Agent, Agent], collections: list[int]
 ) -> None:
-    a, _ = pair
+    a, b = pair
     gc.collect()
     collections.clear()
     objects = len(gc.get_objects())
@@ -124,7 +124,8 @@ async def test_garbage_of_control_work_is_collected_while_the_agent_runs(
     await until(lambda: len(gc.get_objects()) < objects + 5 * limits.COLLECT_YOUNG)
     assert 2 <= len(collections) < 40
     assert set(collections) == {0}
-    assert a._view.snapshot().counters["collector.young"] >= 1
+    # Both live on one loop here, and either one's collector may come first.
+    assert sum(agent._view.snapshot().counters.get("collector.young", 0) for agent in (a, b)) >= 1
 
 
 async def test_the_collector_is_the_interpreters_again_when_the_agent_ends(
