@@ -7,7 +7,6 @@ clock (``came_ns``), in seconds where they are spans. A flow is rows of ``(seque
 from __future__ import annotations
 
 import itertools
-import math
 import random
 import statistics
 from dataclasses import dataclass
@@ -58,16 +57,9 @@ def linear_fit(xs: Sequence[float], ys: Sequence[float]) -> Fit:
         raise ValueError(f"{len(xs)} x for {len(ys)} y")
     if len(set(xs)) < 2:
         raise ValueError("a line needs two different x")
-    mean_x, mean_y = statistics.fmean(xs), statistics.fmean(ys)
-    across = math.fsum((x - mean_x) ** 2 for x in xs)
-    both = math.fsum((x - mean_x) * (y - mean_y) for x, y in zip(xs, ys, strict=True))
-    slope = both / across
-    total = math.fsum((y - mean_y) ** 2 for y in ys)
-    fit = Fit(slope, mean_y - slope * mean_x, 1.0)
-    if not total:  # a level line through all points
-        return fit
-    left = math.fsum((y - fit.at(x)) ** 2 for x, y in zip(xs, ys, strict=True))
-    return Fit(fit.slope, fit.intercept, 1 - left / total)
+    slope, intercept = statistics.linear_regression(xs, ys)
+    level = len(set(ys)) == 1  # a line through all points, though nothing varies that it could explain
+    return Fit(slope, intercept, 1.0 if level else statistics.correlation(xs, ys) ** 2)
 
 
 # --- periods --------------------------------------------------------------------------------------------------------
