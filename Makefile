@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := venv
-.PHONY: venv demo demo-kill demo-start test tests style format types imports fuzz soak bench experiment ros clean
+.PHONY: venv demo demo-kill demo-start test test-bare tests style format types imports fuzz soak bench experiment ros clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -20,6 +20,9 @@ demo-kill demo-start: $(STAMP)  ## kill -9 a module of the running demo, start i
 	@$(BIN)/python examples/turtlebot/demo.py $(@:demo-%=%) $(or $(MODULE),$(error name one: make $@ MODULE=base))
 
 test: $(STAMP) ros style types imports tests  ## everything, with Debian's ROS 1 where it can be installed
+
+test-bare:  ## make test on a bare Debian in a chroot, which has almost nothing; some of it: make test-bare ARGS="make demo SECONDS=5"
+	scripts/test-in-chroot $(ARGS)
 
 ros:  ## install Debian's ROS 1 for the interop tests (only where apt and root are there; else says so)
 	scripts/install-ros

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import inspect
+import itertools
 import os
 from collections import Counter
 from pathlib import Path
@@ -14,11 +15,20 @@ import pytest
 from blockbuster import blockbuster_ctx
 
 from rmpa.experiments.bed import namespaces
+from tests import probes
 from tests.interop import ros
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
+_PROBES: Final = {
+    "ros": ros.why_not,
+    "netns": namespaces.why_not,
+    "pty": probes.why_no_pty,
+    "git": probes.why_no_git,
+}
+"""For each marker, why the tests that carry it cannot run here; empty where they can."""
+_numbers = itertools.count(1)
 _SETTLE_ROUNDS: Final = 10
 """Turns of the loop that cancelled tasks and closed transports get before they count as leaked."""
 
@@ -34,7 +44,7 @@ def pytest_itemcollected(item: pytest.Item) -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skip what cannot run here; the probes run only if something asks for them."""
-    for marker, probe in (("ros", ros.why_not), ("netns", namespaces.why_not)):
+    for marker, probe in _PROBES.items():
         marked = [item for item in items if item.get_closest_marker(marker)]
         if marked and (reason := probe()):
             for item in marked:
@@ -91,9 +101,16 @@ def no_blocking() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session")
+def state_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where programs of the tests keep what is to survive their end."""
+    return tmp_path_factory.mktemp("state")
+
+
 @pytest.fixture(autouse=True)
-def clean_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take the user's ROS and rmpa settings away, so that no test depends on them."""
+def clean_environment(monkeypatch: pytest.MonkeyPatch, state_home: Path) -> None:
+    """Take the user's ROS and rmpa settings away, so that no test depends on them; nothing is kept in his home."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(state_home / str(next(_numbers))))
     for name in list(os.environ):
-        if name.startswith(("ROS_", "RMPA_")) or name == "NOTIFY_SOCKET":
+        if name.startswith(("ROS_", "RMPA_")) or name in ("CMAKE_PREFIX_PATH", "NOTIFY_SOCKET"):
             monkeypatch.delenv(name)

@@ -133,6 +133,7 @@ os.execv(sys.executable, [sys.executable, "-m", "rmpa.cli.main", "up", *sys.argv
 """
 
 
+@pytest.mark.pty
 def test_an_agent_whose_terminal_is_closed_ends(tmp_path: Path, unused_tcp_port: int) -> None:
     ours, its = pty.openpty()
     words = ["--name", "a", "--interface", "lo", "--multicast", "off", "--core-port", str(unused_tcp_port)]

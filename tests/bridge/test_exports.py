@@ -4,11 +4,11 @@ import msgspec
 import pytest
 
 from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, SuspendRoute, Warn
+from rmpa.bridge.bounds import Beyond
 from rmpa.bridge.exports import Exports, LocalSource
 from rmpa.bridge.messages import Advertise, Close, Closed, Description, Offer, Open, Opened, Source
 from rmpa.bridge.policy import Decision, Policy
-from rmpa.core import limits
-from rmpa.core.config import PolicySettings
+from rmpa.core.config import LimitSettings, PolicySettings
 from rmpa.core.contract import Contract, Contracts, Durability, Priority, Reliability, Rule
 
 CMD = Source("/cmd", "/joy")
@@ -84,8 +84,8 @@ def test_nothing_is_connected_before_somebody_asks_and_one_connection_serves_all
         AddRoute(CMD, 2, 9, Contract()),
     ]
     assert exports.flowing(CMD) == (1, 2)
-    assert exports.closed(1, Close(7)) == [RemoveRoute(CMD, 1, 7)]
-    assert exports.closed(2, Close(9)) == [RemoveRoute(CMD, 2, 9), Disconnect(CMD)]
+    assert exports.closed(1, Close(7)) == [RemoveRoute(CMD, 1, 7, wished=True)]
+    assert exports.closed(2, Close(9)) == [RemoveRoute(CMD, 2, 9, wished=True), Disconnect(CMD)]
     assert exports.flowing(CMD) == ()
 
 
@@ -113,7 +113,7 @@ def test_a_lost_publisher_closes_every_route_and_forgets_them(exports: Exports) 
     exports.link_up(1)
     exports.opened(1, Open(7, "/cmd", "/joy"))
     exports.described(CMD, ABOUT)
-    assert exports.lost(CMD, "it hung up") == [RemoveRoute(CMD, 1, 7), Send(1, Closed(7, "it hung up"))]
+    assert exports.lost(CMD, "it hung up") == [RemoveRoute(CMD, 1, 7, over=True), Send(1, Closed(7, "it hung up"))]
     assert exports.lost(CMD, "it hung up") == []
     assert exports.closed(1, Close(7)) == []
     assert exports.opened(1, Open(7, "/cmd", "/joy")) == [Connect(CMD, JOY.type, JOY.uri)]
@@ -125,7 +125,7 @@ def test_a_restarted_node_is_left_at_its_old_address(exports: Exports) -> None:
     exports.opened(1, Open(7, "/cmd", "/joy"))
     exports.described(CMD, ABOUT)
     assert graph(exports, {CMD: LocalSource(JOY.type, "http://127.0.0.1:5000/")}) == [
-        RemoveRoute(CMD, 1, 7),
+        RemoveRoute(CMD, 1, 7, over=True),
         Send(1, Closed(7, "the node has restarted")),
         Disconnect(CMD),
     ]
@@ -165,8 +165,12 @@ def test_a_peer_gets_one_copy_of_a_source_however_often_it_asks(exports: Exports
     assert exports.opened(1, Open(10, "/cmd", "/joy")) == [Connect(CMD, JOY.type, JOY.uri)]
 
 
-def test_the_number_of_routes_is_bounded(exports: Exports, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "ROUTES_PER_LINK_MAX", 1)
+def bounded(topics: int) -> Exports:
+    return Exports(Policy(PolicySettings(deny=("/secret",))), most=LimitSettings(topics=topics))
+
+
+def test_the_number_of_routes_is_bounded() -> None:
+    exports = bounded(1)
     graph(exports, {CMD: JOY})
     exports.link_up(1)
     exports.opened(1, Open(7, "/cmd", "/joy"))
@@ -175,11 +179,13 @@ def test_the_number_of_routes_is_bounded(exports: Exports, monkeypatch: pytest.M
     assert isinstance(action.message, Closed)
 
 
-def test_too_many_sources_are_cut_and_said(exports: Exports, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "TOPICS_PER_PEER_MAX", 2)
+def test_too_many_sources_are_cut_and_said() -> None:
+    exports = bounded(2)
     actions = graph(exports, {Source(f"/t{i}", "/n"): JOY for i in range(3)})
     assert [type(action) for action in actions] == [Warn]
     assert len(exports.offered) == 2
+    assert exports.beyond == Beyond("topics", 2, 1)
+    assert exports.is_beyond(Source("/t2", "/n"))
 
 
 def many(count: int) -> dict[Source, LocalSource]:
@@ -217,10 +223,8 @@ def test_what_came_and_went_before_it_was_told_is_not_told(exports: Exports) -> 
     assert exports.tell() == [Send(1, Advertise(added=(Offer("/cmd", "/joy", "std_msgs/Empty"),)))]
 
 
-def test_room_is_given_to_a_source_that_there_were_too_many_for(
-    exports: Exports, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(limits, "TOPICS_PER_PEER_MAX", 2)
+def test_room_is_given_to_a_source_that_there_were_too_many_for() -> None:
+    exports = bounded(2)
     exports.link_up(1)
     graph(exports, many(4))
     assert [source.topic for source in exports.offered] == ["/t0000", "/t0001"]
@@ -324,7 +328,7 @@ def test_a_reliable_route_outlives_its_link_and_goes_on_where_the_peer_says(flow
     assert flowing.link_away(1) == ([SuspendRoute(CMD, 1)], True)
     flowing.link_up(1)
     flowing.opened(1, Open(1, "/cmd", "/joy", RELIABLE, epoch=1, after=50))
-    assert flowing.closed(1, Close(1)) == [RemoveRoute(CMD, 1, 1), Disconnect(CMD)]
+    assert flowing.closed(1, Close(1)) == [RemoveRoute(CMD, 1, 1, wished=True), Disconnect(CMD)]
 
 
 @pytest.mark.parametrize("asked", [SURE, Open(7, "/cmd", "/joy", RELIABLE, epoch=9, after=3)])
@@ -381,8 +385,8 @@ def test_a_publisher_that_goes_takes_suspended_routes_along(flowing: Exports) ->
     flowing.opened(2, SURE)
     flowing.link_away(1)
     assert flowing.lost(CMD, "it died") == [
-        RemoveRoute(CMD, 1, 0),
-        RemoveRoute(CMD, 2, 7),
+        RemoveRoute(CMD, 1, 0, over=True),
+        RemoveRoute(CMD, 2, 7, over=True),
         Send(2, Closed(7, "it died")),
     ]
     flowing.link_up(1)

@@ -68,7 +68,7 @@ def test_a_closed_route_is_asked_for_again_with_a_growing_delay(imports: Imports
     imports.demand(1, CMD, 0.0, wanted=True)
     now, delays = 0.0, []
     for attempt in range(1, 8):
-        assert imports.closed(1, Closed(attempt, "it hung up"), now) == [Detach(1, CMD, attempt)]
+        assert imports.closed(1, Closed(attempt, "it hung up"), now) == [Detach(1, CMD, attempt, missed=True)]
         assert state(imports) is RouteState.WAITING
         timer = imports.next_timer()
         assert timer is not None
@@ -86,7 +86,7 @@ def test_a_closed_route_is_asked_for_again_with_a_growing_delay(imports: Imports
 def test_an_answer_that_does_not_come_is_a_failure(imports: Imports) -> None:
     imports.advertised(1, Advertise(added=(OFFER,)))
     imports.demand(1, CMD, 0.0, wanted=True)
-    assert imports.handle_timer(limits.ROUTE_OPEN_TIMEOUT) == [Send(1, Close(1)), Detach(1, CMD, 1)]
+    assert imports.handle_timer(limits.ROUTE_OPEN_TIMEOUT) == [Send(1, Close(1)), Detach(1, CMD, 1, missed=True)]
     assert state(imports) is RouteState.WAITING
     assert imports.opened(1, Opened(1, ABOUT), 9.0) == []
 
@@ -173,26 +173,6 @@ def test_a_definition_that_does_not_fit_is_told_to_both_sides(imports: Imports) 
     assert told == Send(1, Mismatch("/cmd", "/joy", "/base", "other md5"))
 
 
-def test_the_number_of_topics_is_bounded(imports: Imports, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "TOPICS_PER_PEER_MAX", 1)
-    imports.advertised(1, Advertise(added=(OFFER,)))
-    [action] = imports.advertised(1, Advertise(added=(Offer("/b", "/n", "a/B"),)))
-    assert isinstance(action, Warn)
-
-
-def test_the_number_of_nodes_is_bounded(imports: Imports, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "NODES_PER_PEER_MAX", 1)
-    imports.advertised(1, Advertise(added=(OFFER,)))
-    [action] = imports.advertised(1, Advertise(added=(Offer("/b", "/other", "a/B"),)))
-    assert isinstance(action, Warn)
-    assert action.kind == "nodes.too_many"
-    more = Offer("/b", "/joy", "a/B")
-    assert imports.advertised(1, Advertise(added=(more,))) == [Publish(1, more.source, "a/B")]
-    imports.advertised(1, Advertise(removed=(CMD, more.source)))
-    other = Offer("/b", "/other", "a/B")
-    assert imports.advertised(1, Advertise(added=(other,))) == [Publish(1, other.source, "a/B")]
-
-
 def many(count: int) -> tuple[Offer, ...]:
     return tuple(Offer(f"/t{index:04}", "/n", "a/B") for index in range(count))
 
@@ -248,7 +228,7 @@ def test_a_peer_that_nothing_waits_for_leaves_what_was_open(imports: Imports) ->
     imports.demand(1, CMD, 0.0, wanted=True)
     imports.opened(1, Opened(1, ABOUT), 0.0)
     assert not imports.waits_for(1)
-    assert imports.detached(1) == [Detach(1, CMD, 1)]
+    assert imports.detached(1) == [Detach(1, CMD, 1, missed=True)]
     assert imports.detached(1) == []
     assert len(list(imports.link_down(1))) >= 21
 
@@ -327,7 +307,7 @@ def test_only_what_is_reliable_and_listened_to_waits_for_its_peer(flowing: Impor
     assert flowing.link_away(1) == (
         [
             Detach(1, CMD, 1, keep=True),
-            Detach(1, ODOM.source, 2),
+            Detach(1, ODOM.source, 2, missed=True),
             Retract(1, ODOM.source),
             Retract(1, Source("/idle", "/base")),
         ],
@@ -341,7 +321,7 @@ def test_only_what_is_reliable_and_listened_to_waits_for_its_peer(flowing: Impor
 def test_where_nothing_waits_the_peer_can_be_forgotten(flowing: Imports) -> None:
     flowing.demand(1, CMD, 0.0, wanted=False)
     assert flowing.link_away(1) == (
-        [Detach(1, CMD, 1), Retract(1, CMD), Detach(1, ODOM.source, 2), Retract(1, ODOM.source)],
+        [Detach(1, CMD, 1), Retract(1, CMD), Detach(1, ODOM.source, 2, missed=True), Retract(1, ODOM.source)],
         False,
     )
 
@@ -447,7 +427,7 @@ def test_what_is_latched_waits_for_a_silent_peer_while_somebody_listens(imports:
     assert opens(imports.advertised(1, Advertise(added=(OFFER,)), 10.0)) == [Open(1, "/cmd", "/joy")]
     imports.opened(1, Opened(1, latched), 10.0)
     # A link that somebody closed is not expected back.
-    assert imports.link_away(1) == ([Detach(1, CMD, 1), Retract(1, CMD)], False)
+    assert imports.link_away(1) == ([Detach(1, CMD, 1, missed=True), Retract(1, CMD)], False)
 
 
 def test_a_local_topic_of_another_type_ends_what_waits(flowing: Imports) -> None:

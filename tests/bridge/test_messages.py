@@ -41,7 +41,7 @@ from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 DEFAULT = (
     b'"contract":{"reliability":"best_effort","durability":"volatile","history":"keep_last","depth":1000,'
     b'"deadline":null,"lifespan":null,"liveliness":"automatic","liveliness_lease":null,"priority":"normal",'
-    b'"max_rate":null}'
+    b'"max_rate":null,"outage":30.0}'
 )
 STRICT = Contract(
     Reliability.RELIABLE,
@@ -54,6 +54,7 @@ STRICT = Contract(
     liveliness_lease=1.0,
     priority=Priority.HIGH,
     max_rate=30.0,
+    outage=300.0,
 )
 PAD, R = "0" * 31 + "1", "f" * 32
 ADD_MD5 = "6a2e34150c00229791cc89ff309fff21"
@@ -104,7 +105,7 @@ GOLDEN: list[tuple[Message, bytes]] = [
         (
             b'{"op":"open","route":7,"topic":"/cmd","node":"/joy","contract":{"reliability":"reliable",'
             b'"durability":"transient_local","history":"keep_all","depth":5,"deadline":0.5,"lifespan":2.0,'
-            b'"liveliness":"manual_by_topic","liveliness_lease":1.0,"priority":"high","max_rate":30.0},'
+            b'"liveliness":"manual_by_topic","liveliness_lease":1.0,"priority":"high","max_rate":30.0,"outage":300.0},'
             b'"epoch":3,"after":4711}'
         ),
     ),
@@ -113,6 +114,23 @@ GOLDEN: list[tuple[Message, bytes]] = [
         (
             b'{"op":"opened","route":7,"description":{"type":"sensor_msgs/Joy","md5":"5a9ea5f83505693b71e785041e67a8bb",'
             b'"definition":"Header header\\n","latching":true},' + DEFAULT + b',"epoch":0,"first":1}'
+        ),
+    ),
+    (
+        Opened(7, Description("a/B", ADD_MD5, "", False), STRICT, 3, 1, following=4711),
+        (
+            b'{"op":"opened","route":7,"description":{"type":"a/B","md5":"6a2e34150c00229791cc89ff309fff21",'
+            b'"definition":"","latching":false},"contract":{"reliability":"reliable",'
+            b'"durability":"transient_local","history":"keep_all","depth":5,"deadline":0.5,"lifespan":2.0,'
+            b'"liveliness":"manual_by_topic","liveliness_lease":1.0,"priority":"high","max_rate":30.0,'
+            b'"outage":300.0},"epoch":3,"first":1,"following":4711}'
+        ),
+    ),
+    (
+        Opened(7, Description("a/B", ADD_MD5, "", False), epoch=4, lost=7046, at_least=True),
+        (
+            b'{"op":"opened","route":7,"description":{"type":"a/B","md5":"6a2e34150c00229791cc89ff309fff21",'
+            b'"definition":"","latching":false},' + DEFAULT + b',"epoch":4,"first":1,"lost":7046,"at_least":true}'
         ),
     ),
     (Close(7), b'{"op":"close","route":7}'),
@@ -276,6 +294,12 @@ OPENED = (
         '"max_rate":1e999',
         '"max_rate":NaN',
         '"max_rate":true',
+        '"outage":0.9',
+        '"outage":86401',
+        '"outage":1e999',
+        '"outage":NaN',
+        '"outage":null',
+        '"outage":"5 min"',
         '"reliability":"sometimes"',
         '"durability":0',
         '"history":"RELIABLE"',
@@ -288,6 +312,12 @@ def test_a_contract_that_no_file_could_have_is_the_peers_error(beginning: bytes,
         decode(beginning + b',"contract":{' + term.encode() + b"}}")
 
 
+def test_a_release_that_knows_no_outage_goes_on_with_the_usual_one() -> None:
+    message = decode(OPEN + b',"contract":{"reliability":"reliable"}}')
+    assert isinstance(message, Open)
+    assert message.contract.outage == limits.RESUME_WINDOW
+
+
 @pytest.mark.parametrize(
     "term",
     [
@@ -298,6 +328,8 @@ def test_a_contract_that_no_file_could_have_is_the_peers_error(beginning: bytes,
         '"lifespan":null',
         '"max_rate":0.001',
         '"max_rate":1e6',
+        '"outage":1',
+        '"outage":86400',
         '"later_version":1e999',
     ],
 )
@@ -337,7 +369,7 @@ def test_a_message_beyond_the_limit_is_not_parsed(monkeypatch: pytest.MonkeyPatc
 
 
 def test_too_many_topics_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "TOPICS_PER_PEER_MAX", 2)
+    monkeypatch.setattr(limits, "ADVERTISED_MAX", 2)
     offers = tuple(Offer(f"/t{i}", "/n", "a/B") for i in range(3))
     with pytest.raises(LimitExceeded, match="in topics"):
         decode(encode(Advertise(added=offers)))

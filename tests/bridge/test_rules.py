@@ -299,7 +299,7 @@ def test_a_route_whose_contract_changes_here_is_opened_anew() -> None:
     b = Source("/b", "/n")
     assert changed(imports, new) == [
         Send(1, Close(2)),
-        Detach(1, b, 2),
+        Detach(1, b, 2, missed=True),
         Send(1, Open(3, "/b", "/n", Contract(depth=7))),
     ]
     assert changed(imports, new) == []

@@ -40,6 +40,7 @@ def test_every_check_answers(loopback: Place) -> None:
     checks = {check for check, _ in answers}
     assert checks == {
         *("settings", "agent", "interface", "multicast", "firewall", "rp_filter", "route", "port", "ROS", "clock"),
+        "mtu",
         *("realtime", "files"),
     }
     assert answers["multicast", "lo"]["level"] == "ok"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import json
+import os
 import subprocess
 import sys
 from typing import TYPE_CHECKING
@@ -48,6 +50,54 @@ def test_each_command_but_those_without_an_answer_has_json(path: str, command: c
         assert any("--json" in parameter.opts for parameter in command.params), path
 
 
+WORDS = {"values": "{}", "value": "1"}
+QUIET = {"rmpa doctor", "rmpa multicast send", "rmpa multicast receive", "rmpa experiment list"}
+"""These need neither an agent nor a master."""
+
+
+@pytest.mark.parametrize(
+    ("path", "command"),
+    [
+        (path, command)
+        for path, _, command in ALL
+        if path not in QUIET and any("--json" in parameter.opts for parameter in command.params)
+    ],
+)
+def test_an_error_is_json_too(
+    path: str,
+    command: click.Command,
+    place: Place,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Where neither an agent nor a master answers, and whatever is named is not there."""
+    for name in [name for name in os.environ if name.startswith(("ROS_", "RMPA_"))]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("RMPA_RUNTIME_DIR", str(place.path))
+    monkeypatch.setenv("ROS_MASTER_URI", "http://127.0.0.1:9/")
+    monkeypatch.chdir(place.path)
+    arguments = [
+        WORDS.get(parameter.name or "", "nothere")
+        for parameter in command.params
+        if isinstance(parameter, click.Argument) and (parameter.required or parameter.name == "names")
+    ]
+    code = main([*path.split()[1:], *arguments, "--json"])
+    out, err = capsys.readouterr()
+    said = json.loads(out)
+    assert code in {1, 2}, out
+    assert list(said) == ["error"]
+    assert said["error"] in " ".join(err.split()) or said["error"] in err
+
+
+def test_an_error_is_json_only_where_that_is_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["peer", "info", "--no-such-flag"]) == 2
+    assert capsys.readouterr().out == ""
+    assert main(["peer", "info", "--no-such-flag", "--json"]) == 2
+    assert list(json.loads(capsys.readouterr().out)) == ["error"]
+    assert main(["peer", "info", "--no-such-flag", "--", "--json"]) == 2
+    assert capsys.readouterr().out == ""
+
+
 def test_version() -> None:
     assert CliRunner().invoke(cli, ["--version"]).output == f"rmpa {__version__}\n"
 
@@ -77,7 +127,7 @@ def test_completion_scripts(shell: str) -> None:
 @pytest.mark.parametrize("module", ["rmpa.cli.main", "rmpa.cli.up", "rmpa.cli.peer", "rmpa.cli.topic_graph"])
 def test_heavy_packages_wait_until_they_are_needed(module: str) -> None:
     importlib.import_module(module)
-    heavy = "{'rich', 'numpy', 'rosbags', 'ruamel', 'matplotlib'}"
+    heavy = "{'rich', 'numpy', 'rosbags', 'ruamel', 'yaml', 'matplotlib'}"
     code = f"import sys, {module}; sys.exit(' '.join({heavy} & set(sys.modules)) or 0)"
     assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).stderr == b""
 

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import msgspec
 import pytest
 
 from rmpa.cli.master import read_topic
 from rmpa.cli.message_text import flatten, pick, shorten, to_text
-from rmpa.cli.output import duration, printable, size
+from rmpa.cli.output import Column, duration, print_table, printable, size
+from rmpa.cli.topic_figures import facts
 from rmpa.cli.topic_pub import fill_stamps, read_values
 from rmpa.core.errors import ConfigError, RmpaError
+from rmpa.monitor.snapshot import RouteInfo
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from rmpa.ros.messages import Plain
 
 
@@ -100,3 +105,29 @@ def test_topics_with_and_without_a_peer() -> None:
     for text in ("", ":", ":/x", "a b", "~x", "base:"):
         with pytest.raises(ConfigError):
             read_topic(text)
+
+
+def test_a_contract_is_shown_with_the_units_of_its_keys() -> None:
+    contract: dict[str, str | float | None] = {
+        "reliability": "reliable", "depth": 90, "deadline": 0.2, "lifespan": 90.0, "max_rate": 12.5
+    }  # fmt: skip
+    route = RouteInfo(peer="joystick", node="/joy", direction="out", state="open", contract=contract)
+    # As it comes from the agent: a whole number is a float behind JSON.
+    crossed = msgspec.json.decode(msgspec.json.encode(route), type=RouteInfo)
+    for one in (route, crossed):
+        shown = dict(facts(one))["contract"]
+        assert shown == "reliability reliable, depth 90, deadline 200 ms, lifespan 1 min 30 s, max_rate 12.5 Hz"
+
+
+def test_a_table_measures_its_columns_once(capsys: pytest.CaptureFixture[str]) -> None:
+    class Counting(list[list[str]]):
+        looks = 0
+
+        def __iter__(self) -> Iterator[list[str]]:
+            self.looks += 1
+            return super().__iter__()
+
+    rows = Counting(["/a", str(number)] for number in range(300))
+    print_table((Column("TOPIC"), Column("MESSAGES", right=True)), rows)
+    assert len(capsys.readouterr().out.splitlines()) == 301
+    assert rows.looks < 10, "not once for each row"

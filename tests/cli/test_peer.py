@@ -35,6 +35,7 @@ def test_list_in_a_pipe_is_plain_and_aligned(place: Place, agent: Agent) -> None
     assert err.splitlines() == [
         "! no multicast on eth0",
         "! pc: shares its name with 10.0.0.9:40003#4; give one of them another --name",
+        "! 1 node of laptop stays hidden",
         "! pc: connection refused; next attempt in 1.5 s",
     ]
 
@@ -74,6 +75,17 @@ def test_info(place: Place, agent: Agent) -> None:
     (row,) = (line for line in out.splitlines() if "/cmd" in line)
     assert " ".join(row.split()) == "/cmd sensor_msgs/Joy /joy_node open 600 10.0 Hz 412 µs ±216 µs 790 µs 9"
     assert place.run("peer", "info", "10.0.0.2:40002")[1] == out
+
+
+def test_a_path_that_drops_large_packets(place: Place, agent: Agent) -> None:
+    joystick = SNAPSHOT.peers[0]
+    assert joystick.link is not None
+    link = msgspec.structs.replace(joystick.link, packet=1252, path_problem="a hole", path_remedy="mend it")
+    agent(snapshot=msgspec.structs.replace(SNAPSHOT, peers=(msgspec.structs.replace(joystick, link=link),), notes=()))
+    _, _, err = place.run("peer", "list")
+    assert err == "! joystick: a hole; mend it\n"
+    _, out, _ = place.run("peer", "info", "joystick")
+    assert "Packets:      of at most 1252 bytes to it\nPath:         a hole\nWhat to do:   mend it\n" in out
 
 
 def test_an_unknown_peer(place: Place, agent: Agent) -> None:

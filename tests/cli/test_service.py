@@ -128,7 +128,7 @@ def test_info_type_and_find(rmpa: Rmpa, served: RosCore) -> None:
     code, out, err = rmpa("info", "/my/do")
     assert code == 0
     assert "Type: my_pkg/Do\n" in out
-    assert "is not a service that comes with rmpa" in err
+    assert "service type my_pkg/Do: is not known here; looked in ROS_PACKAGE_PATH (not set)" in err
     assert rmpa("info", "a b")[0] == 2
 
 
@@ -185,7 +185,9 @@ def test_a_type_of_this_machines_packages(
     (folder / "Do.srv").write_text("int32 a\n---\nint64 b\n")
     code, _, err = rmpa("call", "/my/do", "1")
     assert code == 1
-    assert "my_pkg/Do has another definition at the server" in err
+    assert "my_pkg/Do: has the md5 sum " in err
+    assert f"here ({folder}/Do.srv), and " in err
+    assert err.endswith(" there; source the workspace that the node over there was built in\n")
 
 
 def test_info_tells_what_crosses(

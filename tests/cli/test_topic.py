@@ -5,16 +5,20 @@ from __future__ import annotations
 import asyncio
 import json
 import signal
+import socket
 from typing import TYPE_CHECKING
 
 import pytest
 
 from rmpa.ros.aio.node import Node
+from rmpa.ros.messages import MessageType
 from tests.cli.conftest import Background, Place, with_core
+from tests.ros.workspaces import package
 
 if TYPE_CHECKING:
     import subprocess
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     from rmpa.ros.aio.core import RosCore
     from rmpa.ros.aio.topics import Publisher
@@ -38,8 +42,10 @@ def talking(place: Place, core: RosCore) -> Iterator[subprocess.Popen[str]]:
 
 
 def test_list_and_info(place: Place, talking: subprocess.Popen[str], core: RosCore) -> None:
-    # What a bridge would register for peer joystick.
-    reply = core.call("registerPublisher", "/rmpa/joystick/joy", "/cmd", "sensor_msgs/Joy", "http://127.0.0.1:9/")
+    # What a bridge would register for peer joystick; it listens, or the core takes it for dead.
+    stands = socket.create_server(("127.0.0.1", 0))
+    api = f"http://127.0.0.1:{stands.getsockname()[1]}/"
+    reply = core.call("registerPublisher", "/rmpa/joystick/joy", "/cmd", "sensor_msgs/Joy", api)
     assert reply.code == 1
     code, out, _ = place.run("topic", "list")
     assert code == 0
@@ -56,7 +62,8 @@ def test_list_and_info(place: Place, talking: subprocess.Popen[str], core: RosCo
     assert place.run("topic", "type", "/cmd") == (0, "sensor_msgs/Joy\n", "")
     assert place.run("topic", "find", "sensor_msgs/Joy")[1] == "/cmd  [joystick]\n"
     assert place.run("topic", "info", "/cdm") == (1, "", "rmpa: no topic /cdm; did you mean /cmd?\n")
-    core.call("unregisterPublisher", "/rmpa/joystick/joy", "/cmd", "http://127.0.0.1:9/")
+    core.call("unregisterPublisher", "/rmpa/joystick/joy", "/cmd", api)
+    stands.close()
 
 
 def test_echo(place: Place, talking: subprocess.Popen[str]) -> None:
@@ -193,7 +200,9 @@ def test_delay_needs_a_header(place: Place, core: RosCore) -> None:
     [
         (("/x", "std_msgs/String", "{dta: 1}"), 1, "std_msgs/String has no field 'dta'; it has data"),
         (("/x", "std_msgs/String", "{data: ["), 2, "VALUES: not YAML: "),
-        (("/x", "no_msgs/None"), 1, "no_msgs/None"),
+        (("/x", "no_msgs/None"), 1, "message type no_msgs/None: is not known here; looked in ROS_PACKAGE_PATH (not "),
+        (("/x", "no_msgs/None"), 1, "; no ROS master answers at http://localhost:11311 (no agent runs); start one"),
+        (("/x", "std_msgs/Strin"), 1, "did you mean std_msgs/String?"),
         (("base:/x", "std_msgs/String"), 2, "TOPIC: 'base:/x' names a peer; publish on /x: it crosses to every peer"),
         (("-1", "-r", "5", "/x", "std_msgs/String"), 2, "--once: does not go with --rate"),
     ],
@@ -204,6 +213,51 @@ def test_mistakes_are_told_before_anything_is_registered(
     found, out, err = place.run("topic", "pub", *arguments)
     assert (found, out) == (code, "")
     assert message in err
+
+
+def published(place: Place, *arguments: str) -> str:
+    """Publish one message, and end when it is out: what is on stderr."""
+    with place.start("topic", "pub", *arguments) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("published on ")
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=30)
+        assert process.returncode == 0
+    return err
+
+
+def test_types_of_a_workspace_and_of_live_publishers(
+    place: Place, core: RosCore, background: Background, tmp_path: Path
+) -> None:
+    place.environ |= {"ROS_MASTER_URI": core.uri, "ROS_PACKAGE_PATH": str(tmp_path)}
+    package(
+        tmp_path / "stack" / "my_msgs", msg_Path="Header header\nPose[] poses\n", msg_Pose="float64 x\nfloat64 y\n"
+    )
+    assert published(place, "/path", "my_msgs/Path", "{header: auto, poses: [{x: 1}]}") == ""
+    code, _, err = place.run("topic", "pub", "-1", "/path", "my_msgs/Path", "{z: 1}")
+    assert (code, err) == (1, "rmpa: my_msgs/Path has no field 'z'; it has header, poses\n")
+    node = Node("/rmpa/base/camera", master_uri=core.uri)
+
+    async def start() -> None:
+        await node.__aenter__()
+        await node.advertise("/size", MessageType.learn("far_msgs/Size", "int32 width\n"))
+        await node.advertise("/pose", MessageType.learn("my_msgs/Pose", "int32 angle\n"))
+
+    background.do(start())
+    try:
+        # Learnt from a topic of another name, at a peer.
+        assert published(place, "/other", "far_msgs/Size", "width: 7") == ""
+        code, _, err = place.run("topic", "pub", "-1", "/other", "far_msgs/Size", "{widht: 7}")
+        assert (code, err) == (1, "rmpa: far_msgs/Size has no field 'widht'; it has width\n")
+        code, _, err = place.run("topic", "pub", "-1", "/other", "far_msgs/Sice")
+        assert (code, f"; no publisher at {core.uri} tells it; source the workspace" in err) == (1, True)
+        # Of one's own type the version that the topic has already.
+        err = published(place, "/pose", "my_msgs/Pose", "angle: 7")
+        assert "! /rmpa/base/camera publishes /pose with another version of my_msgs/Pose (md5 " in err
+        assert f" than {tmp_path}/stack/my_msgs/msg/Pose.msg has (" in err
+        assert published(place, "/pose2", "my_msgs/Pose", "x: 7") == ""
+    finally:
+        background.do(node.close())
 
 
 def test_no_master(place: Place) -> None:
@@ -229,7 +283,7 @@ def test_the_agents_core_is_asked(place: Place, agent: Callable[..., None], core
     code, out, _ = place.run("topic", "info", "/cmd", "--agent", "base")
     assert code == 0
     assert "MD5: 5a9ea5f83505693b71e785041e67a8bb" in out
-    assert out.splitlines()[-11:] == [
+    assert out.splitlines()[-12:] == [
         " * from joystick: /joy_node open, 600 messages, last 50.00 ms ago",
         "     there      /stick/cmd",
         "     lane       express",
@@ -237,6 +291,7 @@ def test_the_agents_core_is_asked(place: Place, agent: Callable[..., None], core
         "     latency    p50 412 µs, p99 790 µs, max 1.20 ms, last 390 µs; each ± 216 µs",
         "     bandwidth  1.00 kB/s, 100 B a message",
         "     missing    3 lost, 2 late, 4 expired, 1 dropped here",
+        "     too long   2 left out by the agent of joystick, the last of 270 MB; at most 268 MB cross: send parts",
         "     contract   reliability reliable, deadline 200 ms",
         "     events     deadline_missed 3, messages_lost 3",
         "                1 min 2 s ago: messages_lost: 3 messages lost",

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.core import limits
-from rmpa.core.config import HostPort, LaneSettings, PolicySettings, RealtimeSettings, Settings
+from rmpa.core.config import HostPort, LaneSettings, LimitSettings, PolicySettings, RealtimeSettings, Settings
 from rmpa.core.config_file import LISTS, known_keys, line_of, parse_config
 from rmpa.core.config_sources import Flags, Loaded, find_config_file, load_settings
 from rmpa.core.contract import Rule
@@ -118,6 +118,11 @@ deny_types = ["sensor_msgs/Image"]
 [[contract]]
 topics = ["/cmd/**"]
 depth = 1
+[limits]
+nodes = 7
+topics = 8
+services = 9
+params = 10
 [lanes]
 express_dscp = 46
 express_priority = 5
@@ -146,6 +151,7 @@ json = true
         group_port=5000,
         policy=PolicySettings(("/cmd/**",), ("/cmd/secret",), ("sensor_msgs/*",), ("sensor_msgs/Image",)),
         contracts=(Rule(("/cmd/**",), (), {"depth": 1}),),
+        limits=LimitSettings(7, 8, 9, 10),
         lanes=LaneSettings(46, 5, 8, 1),
         realtime=RealtimeSettings(True, 80, (1, 3), False, True),
         log_level="debug",
@@ -170,6 +176,7 @@ def test_every_flag(load: Load) -> None:
         "error",
         True,
         True,
+        True,
     )
     settings = load(flags=flags).settings
     assert settings == Settings(
@@ -178,6 +185,7 @@ def test_every_flag(load: Load) -> None:
         core_port=1,
         core_mode="external",
         core_master="http://h:1",
+        core_fresh=True,
         port=2,
         domain=3,
         interfaces=("lo", "eth0"),
@@ -207,8 +215,11 @@ def test_what_does_not_fit_the_kind_of_core_is_told(load: Load) -> None:
         load(environ={"RMPA_CORE": "external", "RMPA_MASTER": "robot:11311"})
     with pytest.raises(ConfigError, match=r"rmpa\.toml:2: core\.mode: 'extern' is not a kind.* \"external\""):
         load('[core]\nmode = "extern"\n')
-    notes = load("", flags=Flags(core_mode="external", core_port="1")).notes
-    assert notes == ("--core-port: is of no use with an external core",)
+    notes = load("", flags=Flags(core_mode="external", core_port="1", core_fresh=True)).notes
+    assert notes == (
+        "--core-port: is of no use with an external core",
+        "--fresh: is of no use with an external core",
+    )
 
 
 def test_every_variable(load: Load) -> None:
@@ -237,6 +248,8 @@ def test_every_variable(load: Load) -> None:
         "RMPA_LOG_LEVEL": "WARNING",
         "RMPA_LOG_JSON": "yes",
         "RMPA_RUNTIME_DIR": "/run/x",
+        "RMPA_STATE_DIR": "/var/x",
+        "RMPA_FRESH": "yes",
         "RMPA_AGENT": "other",
     }
     loaded = load(environ=environ)
@@ -246,6 +259,7 @@ def test_every_variable(load: Load) -> None:
         domain=3,
         core_host="localhost",
         core_port=1,
+        core_fresh=True,
         port=2,
         interfaces=("lo", "eth0"),
         seeds=(HostPort("h", 1), HostPort("10.0.0.1")),
@@ -256,6 +270,7 @@ def test_every_variable(load: Load) -> None:
         log_level="warning",
         log_json=True,
         runtime_dir="/run/x",
+        state_dir="/var/x",
     )
 
 
@@ -536,3 +551,23 @@ def test_discovery_port_is_shifted_by_the_domain() -> None:
 
 def test_host_port_prints_as_written() -> None:
     assert [str(HostPort("a", 1)), str(HostPort("a"))] == ["a:1", "a"]
+
+
+def test_limits_come_from_variables_too_and_are_positive(load: Load, refuse: Refuse) -> None:
+    environ = {
+        "RMPA_LIMIT_NODES": "5",
+        "RMPA_LIMIT_TOPICS": "6",
+        "RMPA_LIMIT_SERVICES": "7",
+        "RMPA_LIMIT_PARAMS": "8",
+    }
+    assert load(environ=environ).settings.limits == LimitSettings(5, 6, 7, 8)
+    assert refuse("[limits]\nnodes = 0").startswith(
+        "rmpa.toml:2: limits.nodes: 0 is out of range; a limit is between 1"
+    )
+    assert "did you mean limits.nodes?" in refuse("[limits]\nnode = 1")
+
+
+def test_more_followed_parameters_than_their_limit_are_refused_with_it(load: Load, refuse: Refuse) -> None:
+    rules = "".join(f'[[param]]\nkey = "/a{n}"\nfrom = "arm"\n' for n in range(3))
+    assert "3 rules, more than limits.params = 2; raise that" in refuse(f"{rules}[limits]\nparams = 2\n")
+    assert len(load(f"{rules}[limits]\nparams = 3\n").settings.params.follow) == 3

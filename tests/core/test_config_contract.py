@@ -51,6 +51,7 @@ liveliness = "manual_by_topic"
 liveliness_lease_duration = 2
 priority = "high"
 max_rate = "50Hz"
+outage = "5 min"
 
 [[contract]]
 topics = ["/camera/**"]
@@ -68,6 +69,7 @@ priority = "low"
         "liveliness_lease": 2.0,
         "priority": Priority.HIGH,
         "max_rate": 50.0,
+        "outage": 300.0,
     }
     assert set(values) == set(KEYS)
     first = Rule(("/cmd/**",), ("geometry_msgs/*",), values)
@@ -109,13 +111,13 @@ def test_the_rules_of_the_documentation_load(load: Load) -> None:
 
 def test_the_documentation_has_every_key_and_every_default() -> None:
     text = DOCUMENT.read_text().partition("## Both sides")[0]
-    written = dict(re.findall(r"^\| `(\w+)` \| `\"?(\w+)\"?`", text, re.MULTILINE))
+    written = dict(re.findall(r"^\| `(\w+)` \| `\"?([\w ]+)\"?`", text, re.MULTILINE))
     defaults = {
         key: str(
             getattr(Contract(), key.removesuffix("_duration")) or ("unlimited" if key == "max_rate" else "infinite")
         )
         for key in LISTS["contract"][2:]
-    }
+    } | {"outage": f"{Contract().outage:g} s"}
     assert {key: value for key, value in written.items() if key in defaults} == defaults
 
 
@@ -174,6 +176,19 @@ RULE = '[[contract]]\ntopics = ["/a"]\n'
         (RULE + "max_rate = 0", "3: contract.max_rate: 0 is out of range; a rate is between 0.001 and 1000000 Hz; "),
         (RULE + "max_rate = '100 ms'", "3: contract.max_rate: '100 ms' is a duration, not a rate; did you mean"),
         (RULE + "max_rate = 'fast'", "3: contract.max_rate: 'fast' is not a rate; a rate is messages a second as a"),
+        (RULE + "outage = 'forever'", "3: contract.outage: 'forever' is not a duration; an outage is seconds as a"),
+        (RULE + "outage = 'infinite'", "3: contract.outage: 'infinite' is out of range; an outage is between 1 and "),
+        (
+            RULE + "outage = '2 d'",
+            "3: contract.outage: '2 d' is not a duration; an outage is seconds as a number, or ",
+        ),
+        (RULE + "outage = 0.5", "3: contract.outage: 0.5 is out of range; an outage is between 1 and 86400 s: "),
+        (
+            RULE + "outage = '25 h'",
+            "3: contract.outage: '25 h' is out of range; an outage is between 1 and 86400 s: ",
+        ),
+        (RULE + "outage = '5Hz'", "3: contract.outage: '5Hz' is a rate, not a duration; did you mean"),
+        (RULE + "outage = true", "3: contract.outage: true is not a duration"),
         (RULE + "max_rate = false", "3: contract.max_rate: false is not a rate"),
         (
             RULE + "# a comment\n\nliveliness_lease_duration = 1",
@@ -213,6 +228,10 @@ def test_the_probable_value_is_offered(load: Load, line: str, better: str) -> No
         (RULE, "1: contract: a rule that sets nothing"),
         (RULE + "history = 'keep_all'\ndepth = 5", "4: contract.depth: has no effect beside history keep_all"),
         (RULE + "liveliness = 'manual_by_topic'", "3: contract.liveliness: has no effect without a liveliness_leas"),
+        (
+            RULE + "outage = '5 min'",
+            '3: contract.outage: has no effect without reliability = "reliable"',
+        ),
         (
             RULE + "deadline = '100 ms'\nmax_rate = 5",
             "4: contract.max_rate: 5 messages a second miss the deadline of 0.1 s every time",

@@ -35,6 +35,7 @@ VALUES: dict[str, st.SearchStrategy[object]] = {
     "liveliness_lease": SECONDS,
     "priority": st.sampled_from(Priority),
     "max_rate": st.one_of(st.none(), st.sampled_from([1.0, 10.0])),
+    "outage": st.sampled_from([31.0, 300.0]),
 }
 CONTRACTS = st.builds(Contract, **VALUES)
 GLOBS = st.lists(st.sampled_from(["/a", "/a/**", "/*", "/**", "/b/?"]), max_size=2, unique=True).map(tuple)
@@ -148,6 +149,10 @@ def test_invented_topics_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch)
         ),
         (Contract(history=History.KEEP_ALL), Contract(), Contract(history=History.KEEP_ALL)),
         (Contract(depth=5), Contract(depth=9), Contract(depth=9)),
+        (Contract(outage=300.0), Contract(outage=60.0), Contract(outage=300.0)),
+        (Contract(outage=2.0), Contract(), Contract(outage=2.0)),
+        (Contract(), Contract(outage=2.0), Contract(outage=2.0)),
+        (Contract(outage=1.0), Contract(outage=2.0), Contract(outage=2.0)),
         (Contract(deadline=1.0), Contract(), Contract(deadline=1.0)),
         (Contract(deadline=1.0), Contract(deadline=2.0), Contract(deadline=2.0)),
         (Contract(lifespan=1.0), Contract(lifespan=2.0), Contract(lifespan=1.0)),
@@ -181,6 +186,7 @@ def test_neither_end_gets_less_than_it_asked_for(offered: Contract, requested: C
         assert agreed.durability is Durability.TRANSIENT_LOCAL or side.durability is Durability.VOLATILE
         assert agreed.history is History.KEEP_ALL or side.history is History.KEEP_LAST
         assert agreed.depth >= side.depth
+        assert agreed.outage >= side.outage
         assert side.lifespan is None or (agreed.lifespan is not None and agreed.lifespan <= side.lifespan)
         assert side.max_rate is None or (agreed.max_rate is not None and agreed.max_rate <= side.max_rate)
     assert agreed.priority in (offered.priority, requested.priority)

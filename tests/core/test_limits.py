@@ -1,49 +1,151 @@
-"""Limits: each has a reason, and they fit each other."""
+"""docs/limits.md: its figures are the code's, and no bound that a user can meet is missing.
+
+A new ``…_MAX`` of ``core/limits.py`` belongs on the page; or, if no user can ever notice it, into ``INTERNAL`` below.
+Others may be on the page too, and are then compared with it.
+"""
 
 from __future__ import annotations
 
-import ast
+import re
 from pathlib import Path
+from typing import Final, NamedTuple
+
+import pytest
 
 from rmpa.core import limits
+from rmpa.core.config_file import known_keys
+
+PAGE: Final = Path(__file__).parents[2] / "docs" / "limits.md"
+INTERNAL: Final = {
+    "ADVERTISED_MAX",
+    "ADVERTISEMENT_MAX",
+    "ANSWER_ADDRESSES_MAX",
+    "ASK_NAME_MAX",
+    "BACKOFF_MAX",
+    "BEACON_ADDRESSES_MAX",
+    "BEACON_GOSSIP_MAX",
+    "BEACON_SOURCES_MAX",
+    "BOUND_MAX",
+    "COLLECT_GROWTH_MAX",
+    "CONTEXT_RULE_MAX",
+    "CONTRACT_RATE_MAX",
+    "CONTRACT_TIME_MAX",
+    "CONTROL_PATH_MAX",
+    "CONTROL_PAYLOAD_MAX",
+    "CONTROL_PINGS_MAX",
+    "CONTROL_REQUEST_MAX",
+    "CONTROL_TEXT_MAX",
+    "CORE_STATE_NAME_MAX",
+    "CPU_MAX",
+    "DATA_PAYLOAD_MAX",
+    "DEFINITION_DEPTH_MAX",
+    "DEFINITION_FIELDS_MAX",
+    "DESCRIPTOR_MAX",
+    "DOCTOR_OUTPUT_MAX",
+    "DOMAIN_MAX",
+    "EXPRESS_MESSAGE_MAX",
+    "GREETINGS_MAX",
+    "GREETING_MAX",
+    "HELLO_PAYLOAD_MAX",
+    "HTTP_HEADERS_MAX",
+    "KNOWN_TEXT_MAX",
+    "LEARNT_TYPES_MAX",
+    "LINK_LEASE_MAX",
+    "LOG_KINDS_MAX",
+    "LOOPBACK_RESTING_MAX",
+    "LOST_TOLD_MAX",
+    "MASTER_LOOK_MAX",
+    "MASTER_WRITES_MAX",
+    "MISMATCHES_MAX",
+    "NOTIFY_RETRY_MAX",
+    "PACKAGE_FILE_MAX",
+    "PATHS_MAX",
+    "PENDING_LINKS_MAX",
+    "RESOURCE_STAMPS_MAX",
+    "ROSTER_LEASE_MAX",
+    "SEAT_VOICES_MAX",
+    "SEED_RETRY_MAX",
+    "STORE_BYTES_MAX",
+    "STORE_DESCRIPTORS_MAX",
+    "STORE_PENDING_MAX",
+    "TAKE_UP_RETRY_MAX",
+    "TCPROS_MESSAGE_MAX",
+    "TCPROS_RETRY_MAX",
+    "TYPES_FOUND_MAX",
+    "TYPES_MISSING_MAX",
+    "XMLRPC_DEPTH_MAX",
+}
+"""Of parsers, packets, retries and caches: nothing that a user could notice or mend."""
+
+_NONE: Final = "\N{EN DASH}"
 
 
-def test_every_limit_has_its_reason() -> None:
-    body = ast.parse(Path(limits.__file__).read_text(encoding="utf-8")).body
-    for number, node in enumerate(body):
-        if (
-            isinstance(node, ast.AnnAssign)
-            and isinstance(node.target, ast.Name)
-            and node.target.id not in ("KIB", "MIB")
-        ):
-            reason = body[number + 1] if number + 1 < len(body) else None
-            assert isinstance(reason, ast.Expr), node.target.id
-            assert isinstance(reason.value, ast.Constant), node.target.id
+class Row(NamedTuple):
+    line: int
+    bound: str
+    default: str
+    setting: str
+    happens: str
+    told: str
+    name: str
 
 
-def test_limits_fit_each_other() -> None:
-    assert limits.KEEPALIVE_INTERVAL * 3 < limits.LINK_LEASE
-    assert limits.HEARTBEAT_INTERVAL * 3 < limits.ROSTER_LEASE
-    assert limits.BACKOFF_FIRST < limits.BACKOFF_MAX
-    assert limits.TCPROS_MESSAGE_MAX + 4 == limits.MESSAGE_MAX <= limits.DATA_PAYLOAD_MAX * 65536
-    assert limits.CONTROL_PAYLOAD_MAX <= limits.LINK_URGENT_BYTES
-    assert limits.MULTICAST_PORT + limits.DOMAIN_MAX < 65536
-    largest = 42 + limits.PEER_NAME_MAX + 4 * limits.BEACON_ADDRESSES_MAX + 1 + 8 * limits.BEACON_GOSSIP_MAX
-    assert largest <= limits.BEACON_MAX_BYTES
+def rows() -> list[Row]:
+    found = []
+    for number, line in enumerate(PAGE.read_text(encoding="utf-8").splitlines(), 1):
+        cells = [cell.strip() for cell in line.strip().strip("|").split(" | ")]
+        if line.startswith("| ") and not line.startswith("| bound |"):
+            assert len(cells) == 6, f"line {number}: {len(cells)} cells instead of 6"
+            found.append(Row(number, *cells))
+    return found
 
 
-def test_the_limits_of_the_lanes_fit_each_other() -> None:
-    assert limits.EXPRESS_MESSAGE_MAX <= limits.FRAGMENT_BYTES <= limits.DATA_PAYLOAD_MAX
-    assert limits.CUT_THROUGH_BYTES <= limits.FRAGMENT_BYTES <= limits.DATA_PAYLOAD_MAX
-    assert limits.COMMIT_BYTES <= 4 * limits.FRAGMENT_BYTES, "what is prepared delays whoever comes next"
-    assert limits.BULK_UNSENT_BYTES < limits.LINK_UNSENT_BYTES <= limits.COMMIT_BYTES
-    assert limits.LINK_LEASE < limits.LINK_UNACKED < limits.BULK_LEASE, "the lease, which can say why, speaks first"
-    assert limits.STALE_HOLD < limits.STALE_TICK < limits.STALE_AGE < limits.BULK_STALE_AGE
-    assert limits.ROUTE_QUEUE_MESSAGES <= limits.CONTRACT_DEPTH_MAX < limits.KEEP_ALL_MESSAGES
+def figures(value: float) -> set[str]:
+    """How a page may write it."""
+    texts = {f"{value:,.0f}", f"{value:g} s"}
+    for unit, size in (("KiB", limits.KIB), ("MiB", limits.MIB)):
+        if value % size == 0:
+            texts.add(f"{value / size:,.0f} {unit}")
+    if value % 60 == 0:
+        texts |= {f"{value / 60:g} min", f"{value / 3600:g} h"}
+    return texts
 
 
-def test_a_reliable_sender_never_waits_for_a_delayed_acknowledgement() -> None:
-    assert limits.RELIABLE_WINDOW_MESSAGES >= 2 * limits.ACK_MESSAGES
-    assert limits.RELIABLE_WINDOW_BYTES >= 2 * limits.ACK_BYTES
-    assert limits.RELIABLE_WINDOW_BYTES <= limits.REPLAY_BYTES <= limits.RESUME_BYTES_MAX
-    assert limits.ACK_DELAY < limits.LINK_LEASE < limits.RESUME_WINDOW
+@pytest.mark.parametrize("row", rows(), ids=lambda row: row.name)
+def test_each_row_has_the_codes_figure(row: Row) -> None:
+    names = re.findall(r"`([A-Z_0-9]+)`", row.name)
+    assert names, f"line {row.line}: no name in the last column"
+    for name in names:
+        assert hasattr(limits, name), f"line {row.line}: there is no {name} in core/limits.py"
+        value = getattr(limits, name)
+        assert row.default in figures(value), f"line {row.line}: {name} is {value}, not {row.default}"
+
+
+@pytest.mark.parametrize("row", rows(), ids=lambda row: row.name)
+def test_each_row_says_what_happens_and_names_settings_that_there_are(row: Row) -> None:
+    assert row.happens not in ("", _NONE), f"line {row.line}: what happens at it?"
+    assert row.told, f"line {row.line}: where is it told? ({_NONE} for nowhere)"
+    known = {".".join(key) for key in known_keys()}
+    for setting in re.findall(r"`([a-z_]+\.[a-z_]+)`", row.setting):
+        assert setting in known, f"line {row.line}: there is no setting {setting}"
+
+
+def test_no_bound_is_missing() -> None:
+    shown = {name for row in rows() for name in re.findall(r"`([A-Z_0-9]+)`", row.name)}
+    bounds = {name for name in vars(limits) if name.endswith("_MAX")}
+    missing = bounds - shown - INTERNAL
+    assert not missing, f"add a row to {PAGE.name}, or to INTERNAL here: {', '.join(sorted(missing))}"
+    assert bounds >= INTERNAL, f"there is none of these any more: {', '.join(sorted(INTERNAL - bounds))}"
+    assert not shown & INTERNAL, f"on the page and in INTERNAL: {', '.join(sorted(shown & INTERNAL))}"
+
+
+def test_the_settings_of_the_page_are_those_that_there_are() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    block = text.partition("```toml\n[limits]\n")[2].partition("```")[0]
+    written = {key: int(value) for key, value in (line.split(" = ") for line in block.splitlines())}
+    from rmpa.core.config import LimitSettings
+
+    defaults = LimitSettings()
+    assert written == {key: getattr(defaults, key) for _, key in (k for k in known_keys() if k[0] == "limits")}
+    for key in written:
+        assert f"`RMPA_LIMIT_{key.upper()}`" in text

@@ -58,3 +58,4 @@ def test_few_files() -> None:
     _, files = judge_rights(replace(FREE, files=1024))
     assert files.level is Level.WARN
     assert "LimitNOFILE" in files.remedy
+    assert [found.check for found in judge_rights(replace(FREE, files=None))] == ["realtime"], "agents tell theirs"

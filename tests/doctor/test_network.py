@@ -12,6 +12,7 @@ from rmpa.doctor.network import (
     Echo,
     Port,
     judge_cards,
+    judge_mtu_probing,
     judge_multicast,
     judge_ports,
     judge_routes,
@@ -117,9 +118,22 @@ def test_ports() -> None:
         Port("the ROS core", 11311, "Address already in use", "roscore (pid 7)"),
         Port("the mesh (TCP)", 40001, "Address already in use", "agent base", ours=True),
         Port("beacons (UDP)", 11411),
+        Port("beacons (UDP)", 11412, owner="agent base and python3 (pid 7)"),
     )
-    core, mesh, beacons = judge_ports(ports)
+    core, mesh, beacons, shared = judge_ports(ports)
     assert (core.level, mesh.level, beacons.level) == (Level.FAIL, Level.OK, Level.OK)
     assert "roscore (pid 7)" in core.text
     assert "11311" in core.remedy
     assert "agent base" in mesh.text
+    assert beacons.text == "beacons (UDP): free"
+    text = "beacons (UDP): used by agent base and python3 (pid 7); others may use it too"
+    assert (shared.level, shared.text) == (Level.OK, text)
+
+
+def test_mtu_probing() -> None:
+    assert judge_mtu_probing(None, black_hole=True).level is Level.SKIPPED
+    assert judge_mtu_probing(1, black_hole=True).level is Level.OK
+    assert judge_mtu_probing(0, black_hole=False).level is Level.OK
+    warned = judge_mtu_probing(0, black_hole=True)
+    assert warned.level is Level.WARN
+    assert "tcp_mtu_probing=1" in warned.remedy

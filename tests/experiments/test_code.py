@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 from typing import TYPE_CHECKING
 
+import pytest
+
 from rmpa.experiments.code import code_here, digest
 
 if TYPE_CHECKING:
@@ -42,6 +44,7 @@ def test_the_digest_changes_with_what_measures_and_not_with_what_shows(tmp_path:
     assert digest(where) not in (before, changed)
 
 
+@pytest.mark.git
 def test_a_clone_knows_its_commit_and_whether_it_was_changed(tmp_path: Path) -> None:
     where = package(tmp_path)
     assert (code_here(where).commit, code_here(where).changed) == ("", False)

@@ -91,7 +91,7 @@ def _check_follow_rules(raw: object) -> None:
     try:
         rules = read_follow_rules(raw)
     except values.BadValue as error:
-        if error.at == () and isinstance(raw, list) and len(raw) <= limits.FOLLOWED_MAX:
+        if error.at == () and isinstance(raw, list) and len(raw) <= limits.FOLLOW_RULES_MAX:
             raise AssertionError("a wrong rule, but nothing says which") from error
         return
     for index, rule in enumerate(rules):

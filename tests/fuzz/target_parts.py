@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rmpa.bridge.aio.flows import ImportFlow, LinkTime
+from rmpa.bridge.aio.flows import ImportFlow
+from rmpa.bridge.aio.link_time import LinkTime
 from rmpa.core import limits
 from rmpa.core.contract import Contract, Reliability
 from rmpa.core.errors import RemoteProtocolError

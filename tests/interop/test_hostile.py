@@ -49,8 +49,10 @@ def test_hostile_bytes_on_every_port_while_traffic_flows(modules: ModuleFactory)
     assert len([key for key in ports if key.startswith("tcp:")]) >= 3, ports  # mesh, XML-RPC, TCPROS
     script = NODES / "hostile.py"
     local = a.ros.start(sys.executable, script, "127.0.0.1", "5", *ports, name="attack from inside")
+    (proxy,) = re.findall(r"http://(127[0-9.]+):\d+/\s+/rmpa/b/", a.ros.tool("rosnode", "list", "-a"))
+    within = a.ros.start(sys.executable, script, proxy, "5", *ports, name="attack on a proxy")
     outer = b.ros.start(sys.executable, script, a.host.address, "5", *ports, name="attack from outside")
-    for attack in (local, outer):
+    for attack in (local, within, outer):
         assert int(str(attack.wait_event("done", 60.0)["attacks"])) > 100
     report = flows(heard, 50)
     assert (report["bad"], report["gaps"], report["doubled"]) == (0, 0, 0)

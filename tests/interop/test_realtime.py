@@ -107,7 +107,8 @@ def test_an_agent_is_scheduled_and_locked_as_the_kernel_says(agent: AgentFactory
     memory = status(made.pid)
     assert memory["VmLck"] > 20_000
     assert status(plain.pid)["VmLck"] == 0
-    assert memory["VmRSS"] < status(plain.pid)["VmRSS"] + 15_000
+    # What is mapped and never read is in memory too then: 11 to 15 MB, by how the interpreter was built.
+    assert memory["VmRSS"] < status(plain.pid)["VmRSS"] + 20_000
     assert said(made, "warning") == []
     assert [text.split(":")[1].strip() for text in said(made, "info")] == [
         "SCHED_FIFO",

@@ -26,9 +26,9 @@ COUNT = 10_000
 """At 1 kHz."""
 
 
-def contract(depth: int) -> str:
+def contract(depth: int, more: str = "") -> str:
     """A reliable topic."""
-    return f'[[contract]]\ntopics = ["/chatter"]\nreliability = "reliable"\ndepth = {depth}\n'
+    return f'[[contract]]\ntopics = ["/chatter"]\nreliability = "reliable"\ndepth = {depth}\n{more}'
 
 
 def recorders(module: Module) -> list[Process]:
@@ -138,6 +138,48 @@ def test_an_outage_longer_than_the_buffer_is_told_with_the_exact_count(
     recent = [(event["count"], event["text"]) for event in found["recent"]]  # type: ignore[attr-defined]  # promised
     assert recent == [(missing[0], f"{missing[0]} messages lost")]
     b.agent.process.wait_for(rf"(?i)warning.*/chatter.*\b{missing[0]} messages lost")
+
+
+def test_an_outage_longer_than_the_contracts_is_told_exactly_at_both_ends(
+    modules: ModuleFactory, tmp_path: Path
+) -> None:
+    a, b = modules("a", "b", config=contract(100_000, 'outage = "2 s"\n'))
+    heard = recorders(b)
+    teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
+    first = connected(teller, heard)
+    for listener in heard:
+        recorded(listener, tmp_path)
+    teller.tell("64 2000 200")
+    time.sleep(0.5)
+    b.host.outage(1.5)  # less than it, for the link falls a second later
+    eventually(lambda: route(a)["state"] == route(b)["state"] == "open", what="the link")
+    assert (route(a)["lost"], route(b)["lost"]) == (0, 0)
+    b.host.cut()
+    a.agent.process.wait_for(r"(?i)warning.* b has been away for 2 s: \d+ messages for it are given up, of /chatter")
+    eventually(lambda: int(str(route(a)["lost"])) > 600, what="more of them")
+    away = route(a)
+    assert (away["state"], away["peer"], away["kept"]) == ("away", "b", 0)
+    assert "b is away for" in str(away["problem"])
+    b.host.restore()
+    last = first + 2000
+    teller.wait_event("told", where=lambda event: event["sent"] == last)
+    missing = []
+    for listener in heard:
+        wait_last(listener, last)
+        sequences = [row.sequence for row in recorded(listener, tmp_path)]
+        assert sequences == sorted(set(sequences))
+        assert (sequences[0], sequences[-1]) == (first + 1, last)
+        missing.append(2000 - len(sequences))
+    # The proxy has left the graph meanwhile: what came before the slower one of both had it again is not its loss.
+    assert min(missing) > 600
+    found = route(b)
+    lost = int(str(found["lost"]))
+    assert (found["events"], route(a)["lost"]) == ({"messages_lost": lost}, lost)
+    assert lost == min(missing)
+    a.agent.process.wait_for(rf"(?i)warning.*/chatter.*: b has missed {lost} messages")
+    b.agent.process.wait_for(rf"(?i)warning.*/chatter.*\b{lost} messages lost")
+    _, output = b.agent.rmpa("why", "a:/chatter")  # its publisher is silent by now
+    assert f"{lost} of them given up" in output
 
 
 def test_best_effort_is_fresh_after_a_cut(modules: ModuleFactory, tmp_path: Path) -> None:

@@ -196,7 +196,7 @@ def test_the_stock_tools_say_what_they_say_under_one_roscore(
     one, mesh = answers
     assert "it sticks" in mesh["error"]
     assert (one["node"].strip(), mesh["node"].strip()) == ("/switch", "/rmpa/a/switch")
-    assert mesh["uri"].startswith("rosrpc://127.0.0.1:")
+    assert mesh["uri"].startswith("rosrpc://127.")
     for said in answers:
         said["info"] = said["info"].replace("/rmpa/a/switch", "/switch").replace(said["uri"].strip(), "URI")
         said["error"] = said["error"].replace("/rmpa/a/switch", "/switch")

@@ -223,6 +223,18 @@ def test_a_pause_of_our_own_is_no_silence_of_the_others() -> None:
     assert not is_up(dialler), "what was excused is over with the next word"
 
 
+def test_the_reason_names_the_lease_and_our_own_pause_apart() -> None:
+    time = Time()
+    dialler, _ = pair(time, lease=2.0)
+    pass_time(dialler.link, time, 0.3)
+    time.now += 1.5
+    dialler.link.handle_timer(time.now)
+    pass_time(dialler.link, time, 2.0)
+    closed = dialler.last()
+    assert isinstance(closed, Closed)
+    assert "silent for its lease of 2 s, our own pauses of 1." in closed.reason
+
+
 def test_a_peer_that_died_in_our_pause_is_given_up_within_its_lease() -> None:
     time = Time()
     dialler, _ = pair(time)

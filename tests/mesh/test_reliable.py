@@ -6,7 +6,7 @@ import gc
 import time
 
 import pytest
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
@@ -401,12 +401,12 @@ def test_sequences_wrap(first: int) -> None:
 
 
 def parked(
-    table: ResumeTable[str], key: str, *, count: int = 2, now: float = 0.0
+    table: ResumeTable[str], key: str, *, count: int = 2, until: float = 30.0
 ) -> tuple[ReliableSender, list[str]]:
     machine = sender()
     fill(machine, count)
     machine.take()
-    return machine, table.park(key, machine, now)
+    return machine, table.park(key, machine, until)
 
 
 def test_a_parked_sender_is_suspended_and_given_back() -> None:
@@ -414,75 +414,173 @@ def test_a_parked_sender_is_suspended_and_given_back() -> None:
     machine, gone = parked(table, "a")
     assert gone == []
     assert (len(table), table.pending_bytes, machine.under_way) == (1, 8, 0)
-    assert table.claim("b", 7, 1.0) is None
-    assert table.claim("a", 7, 1.0) is machine
-    assert table.claim("a", 7, 1.0) is None
-    assert (len(table), table.pending_bytes, table.given_up, table.next_timer()) == (0, 0, 0, None)
+    assert table.claim("b", 7) is None
+    assert table.claim("a", 7) is machine
+    assert table.claim("a", 7) is None
+    assert (len(table), table.pending_bytes, table.next_timer()) == (0, 0, None)
 
 
 @pytest.mark.parametrize("epoch", [None, 6, 8])
 def test_another_epoch_has_no_use_for_it(epoch: int | None) -> None:
     table: ResumeTable[str] = ResumeTable()
     parked(table, "a")
-    assert table.claim("a", epoch, 1.0) is None
-    assert (len(table), table.given_up) == (0, 2)
+    assert table.claim("a", epoch) is None
+    assert len(table) == 0
 
 
-def test_its_time_is_bounded() -> None:
+def test_each_keeps_for_a_time_of_its_own_and_then_only_counts() -> None:
     table: ResumeTable[str] = ResumeTable()
-    parked(table, "a", now=10.0)
-    parked(table, "b", now=11.0)
-    due = 10.0 + limits.RESUME_WINDOW
-    assert table.next_timer() == due
-    assert table.expire(due - 0.001) == []
-    assert table.expire(due) == ["a"]
-    assert table.claim("b", 7, due + 1.0) is None, "too late, though nobody has called expire yet"
-    assert (len(table), table.given_up, table.next_timer()) == (0, 4, None)
+    long, _ = parked(table, "long", until=300.0)
+    short, _ = parked(table, "short", until=20.0)
+    assert table.next_timer() == 20.0
+    assert table.expire(19.9) == []
+    assert table.expire(20.0) == ["short"]
+    assert table.next_timer() == 300.0
+    assert (len(table), table.pending_bytes) == (2, 8)
+    for key in ("long", "short"):
+        assert table.offer(key, payload(3), 0) == []
+    assert (long.pending, long.lost) == (3, 0)
+    assert (short.pending, short.lost, short.forgone) == (0, 3, True)
+    assert table.claim("short", 7) is short
+    short.resume(0)
+    assert (short.following, short.lost, short.forgone) == (4, 3, False)
 
 
 def test_parking_again_begins_a_new_time() -> None:
     table: ResumeTable[str] = ResumeTable()
-    parked(table, "a", now=10.0)
-    parked(table, "b", now=11.0)
-    machine, gone = parked(table, "a", now=12.0)
+    parked(table, "a", until=40.0)
+    parked(table, "b", until=41.0)
+    machine, gone = parked(table, "a", until=42.0)
     assert gone == []
     assert (len(table), table.pending_bytes) == (2, 16)
-    assert table.expire(11.5 + limits.RESUME_WINDOW) == ["b"]
-    assert table.claim("a", 7, 12.0) is machine
+    assert table.expire(41.5) == ["b"]
+    assert table.claim("a", 7) is machine
 
 
-def test_its_number_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_that_only_counts_goes_on_counting_when_it_is_parked_again() -> None:
+    table: ResumeTable[str] = ResumeTable()
+    machine, _ = parked(table, "a", until=1.0)
+    table.expire(1.0)
+    assert table.park("a", machine, 99.0) == []
+    assert (table.next_timer(), len(table)) == (None, 1)
+    table.move("a", "b")
+    table.offer("b", payload(3), 0)
+    assert (table.claim("a", 7), table.claim("b", 7), machine.lost) == (None, machine, 3)
+
+
+def test_the_number_of_those_that_keep_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "RESUMES_MAX", 2)
     table: ResumeTable[str] = ResumeTable()
     assert [parked(table, key)[1] for key in "abcd"] == [[], [], ["a"], ["b"]]
-    assert (len(table), table.given_up, table.pending_bytes) == (2, 4, 16)
+    assert (len(table), table.pending_bytes) == (4, 16)
+
+
+def test_the_number_of_those_that_count_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "RESUMES_COUNTED_MAX", 2)
+    table: ResumeTable[str] = ResumeTable()
+    for key in "abcd":
+        parked(table, key)
+    assert table.expire(30.0) == ["a", "b", "c", "d"]
+    assert table.forget() == ["a", "b"]
+    assert table.forget() == []
+    assert table.claim("a", 7) is None
+    assert table.claim("c", 7) is not None
 
 
 def test_its_bytes_are_bounded_and_the_oldest_is_given_up_first(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "RESUME_BYTES_MAX", 100)
     table: ResumeTable[str] = ResumeTable()
-    parked(table, "a")
-    parked(table, "b")
-    parked(table, "c")
+    machines = [parked(table, key)[0] for key in "abc"]
     assert table.offer("c", bytes(76), 0) == []
     assert table.pending_bytes == 100
     assert table.offer("c", bytes(1), 0) == ["a"]
     assert table.offer("a", bytes(1000), 0) == []
     assert table.offer("c", bytes(1000), 0) == ["b", "c"]
-    assert (len(table), table.pending_bytes, table.given_up) == (0, 0, 2 + 2 + 5)
+    assert (len(table), table.pending_bytes) == (3, 0)
+    assert [machine.lost for machine in machines] == [3, 2, 5]
     assert parked(table, "d", count=26)[1] == ["d"]
 
 
 def test_what_is_offered_while_parked_is_kept_within_the_senders_own_bounds() -> None:
     table: ResumeTable[str] = ResumeTable()
     machine = sender(depth=3)
-    table.park("a", machine, 0.0)
+    table.park("a", machine, 30.0)
     for number in range(10):
         assert table.offer("a", payload(number), 0) == []
     assert table.pending_bytes == machine.pending_bytes == 12
-    assert table.claim("a", 7, 1.0) is machine
+    assert table.claim("a", 7) is machine
     machine.resume(0)
     assert numbers(machine) == [7, 8, 9]
+
+
+# --- senders that keep nothing any more -----------------------------------------------------------------------------
+
+
+def test_only_a_sender_without_a_link_lets_go_of_its_messages() -> None:
+    machine = sender()
+    with pytest.raises(LocalProtocolError):
+        machine.forgo()
+
+
+def test_what_was_under_way_when_all_was_let_go_of_may_have_come() -> None:
+    machine = sender()
+    fill(machine, 5)
+    machine.take(3)
+    machine.suspend()
+    machine.forgo()
+    fill(machine, 2)
+    assert (machine.pending, machine.pending_bytes, machine.lost) == (0, 0, 7)
+    machine.resume(2)
+    assert (machine.lost, machine.following) == (5, 8)
+    fill(machine, 1)
+    assert [message.sequence for message in machine.take()] == [8]
+
+
+def test_a_count_that_no_receiver_could_tell_from_an_old_message_stays_below(monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = sender()
+    monkeypatch.setattr("rmpa.mesh.reliable._HALF", 100)
+    machine.suspend()
+    machine.forgo()
+    fill(machine, 250)
+    assert machine.lost == 250
+    machine.resume(0)
+    receiver = ReliableReceiver(7, 1)
+    assert 0 < receiver.skip(machine.following) < 100
+
+
+@given(st.data())
+def test_an_ended_numbering_knows_what_it_cost_wherever_its_receiver_was(data: st.DataObject) -> None:
+    first = data.draw(st.sampled_from([1, 0xFFFFFFF8]))
+    machine = ReliableSender(data.draw(st.integers(1, 6)), 1 << 20, 4, 1 << 20, 7, first=first)
+    receiver = ReliableReceiver(7, first)
+    offered = came = 0
+    for step in data.draw(st.lists(st.sampled_from(["offer", "offer", "send", "lose", "ack", "forgo"]), max_size=40)):
+        if step == "offer":
+            machine.offer(payload(offered), 0)
+            offered += 1
+        elif step == "ack" and (position := receiver.position()) is not None:
+            machine.acknowledged(position[1])
+        elif step == "send":
+            for message in machine.take(2):
+                came += receiver.accept(message.sequence, 7, 0.0).deliver
+        elif step == "lose":
+            machine.take(1)
+            machine.suspend()
+            machine.resume((receiver.position() or (7, first - 1 & 0xFFFFFFFF))[1])
+            receiver.skip(machine.following)
+        elif step == "forgo":
+            machine.suspend()
+            machine.forgo()
+            for _ in range(3):
+                machine.offer(b"", 0)
+            offered += 3
+            machine.resume((receiver.position() or (7, first - 1 & 0xFFFFFFFF))[1])
+            receiver.skip(machine.following)
+    ended, position = machine.ended(), receiver.position()
+    after = position[1] if position is not None else None
+    assert came + receiver.gap_total + ended.untold(after) == offered
+    assert came + ended.lost(after) == offered
+    assert ended.lost() >= ended.lost(after)
 
 
 # --- every interleaving ---------------------------------------------------------------------------------------

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from rmpa.monitor.snapshot import (
     AgentInfo,
+    BoundInfo,
     EventInfo,
+    FilesInfo,
     LatencyInfo,
     LinkInfo,
     PeerInfo,
@@ -31,6 +33,11 @@ SNAPSHOT = Snapshot(
         interfaces=("wlan0",),
         config_file="/etc/rmpa/rmpa.toml",
         realtime=("SCHED_FIFO 50: granted",),
+        core_memory="kept in /s/core-11311.sqlite; 2 of 2 nodes of the run before are taken up",
+        files=FilesInfo(open=57, limit=1024, hard=1_048_576, reserved=64, refused=3),
+        proxies=17,
+        proxy_sockets=2,
+        proxy_listening="two for all, ports 40011 and 40012, and an address 127.a.b.c for each",
     ),
     taken=1_700_003_725.0,
     peers=(
@@ -69,6 +76,7 @@ SNAPSHOT = Snapshot(
             last_error="connection refused",
             next_attempt=1.5,
             conflicts=("shares its name with 10.0.0.9:40003#4; give one of them another --name",),
+            beyond=(BoundInfo(kind="nodes", limit=2, hidden=1, here=True, text="1 node of laptop stays hidden"),),
         ),
     ),
     topics=(
@@ -89,6 +97,8 @@ SNAPSHOT = Snapshot(
                     bytes=60_000,
                     dropped=1,
                     lost=3,
+                    oversized=2,
+                    oversized_bytes=270_000_000,
                     late=2,
                     expired=4,
                     age=0.05,

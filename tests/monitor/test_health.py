@@ -7,14 +7,14 @@ import pytest
 
 from rmpa.core import limits
 from rmpa.monitor.health import HERE, Health
-from rmpa.monitor.snapshot import EventInfo, PeerInfo, RouteInfo, ServiceInfo, Snapshot
+from rmpa.monitor.snapshot import EventInfo, FilesInfo, PeerInfo, RouteInfo, ServiceInfo, Snapshot, UnreachableInfo
 from rmpa.ros.diagnostic_array import Level, Status
 from tests.monitor.samples import SNAPSHOT
 
 CMD = "rmpa: joystick: /cmd"
 JOYSTICK, PC = SNAPSHOT.peers
 (ROUTE,) = SNAPSHOT.topics[0].routes
-HEALTHY = msgspec.structs.replace(ROUTE, events={}, recent=(), contract={})
+HEALTHY = msgspec.structs.replace(ROUTE, events={}, recent=(), contract={}, oversized=0, oversized_bytes=270_000_000)
 
 
 def with_routes(*routes: RouteInfo, peers: tuple[PeerInfo, ...] = SNAPSHOT.peers, **topic: object) -> Snapshot:
@@ -52,6 +52,15 @@ def test_one_status_for_the_agent_each_peer_and_each_topic_from_a_peer() -> None
     assert all(found[name].values[key] for name in found for key in found[name].values)
 
 
+def test_a_path_that_drops_large_packets_is_a_warning() -> None:
+    assert JOYSTICK.link is not None
+    link = msgspec.structs.replace(JOYSTICK.link, packet=1252, path_problem="a hole", path_remedy="mend it")
+    found = judged(Health(), with_routes(HEALTHY, peers=(msgspec.structs.replace(JOYSTICK, link=link), PC)))
+    status = found["rmpa: joystick"]
+    assert (status.level, status.message) == (Level.WARN, "a hole; mend it")
+    assert (status.values["packet (B)"], status.values["path"]) == ("1252", "a hole")
+
+
 def test_what_goes_out_is_the_receivers_to_judge() -> None:
     assert list(judged(Health(), msgspec.structs.replace(SNAPSHOT, topics=SNAPSHOT.topics[1:]))) == [
         HERE,
@@ -64,6 +73,23 @@ def test_the_agents_notes_are_a_warning() -> None:
     assert level(SNAPSHOT, HERE) == (Level.WARN, "no multicast on eth0")
     quiet = msgspec.structs.replace(SNAPSHOT, notes=())
     assert level(quiet, HERE) == (Level.OK, "1 of 2 known peers linked")
+
+
+@pytest.mark.parametrize(
+    ("near", "problem", "expected", "text"),
+    [
+        (False, "", Level.OK, "1 of 2 known peers linked"),
+        (True, "", Level.WARN, "60 of 64 file descriptors are open; raise it: LimitNOFILE="),
+        (True, "node /x has to wait", Level.ERROR, "node /x has to wait"),
+    ],
+)
+def test_file_descriptors(near: bool, problem: str, expected: Level, text: str) -> None:
+    files = FilesInfo(open=60, limit=64, hard=64, reserved=16, near=near, problem=problem)
+    agent = msgspec.structs.replace(SNAPSHOT.agent, files=files)
+    notes = (problem,) if problem else ()
+    found, said = level(msgspec.structs.replace(SNAPSHOT, agent=agent, notes=notes), HERE)
+    assert found is expected
+    assert said.startswith(text)
 
 
 @pytest.mark.parametrize(
@@ -97,6 +123,13 @@ def test_a_subscriber_that_was_refused_is_an_error() -> None:
     assert level(with_routes(HEALTHY, mismatches=("another md5",))) == (Level.ERROR, "another md5")
 
 
+def test_a_node_that_cannot_be_reached_is_a_warning() -> None:
+    info = UnreachableInfo(node="/odd", uri="http://nosuch:1/", problem="no such name", ago=20.0, withdrawn=True)
+    status = judged(Health(), msgspec.structs.replace(SNAPSHOT, unreachable=(info,)))["rmpa: node /odd"]
+    assert (status.level, status.message) == (Level.WARN, str(info))
+    assert status.values == {"unreachable for (s)": "20"}
+
+
 def test_our_topic_that_was_refused_elsewhere_is_an_error_here_too() -> None:
     outgoing = msgspec.structs.replace(HEALTHY, direction="out")
     for routes in ((), (outgoing,)):
@@ -117,6 +150,51 @@ def test_what_went_missing_is_told_when_it_does_and_only_then() -> None:
     assert judged(health, with_routes(more))[CMD].level is Level.OK
     again = msgspec.structs.replace(HEALTHY, lost=0)  # the route was opened anew
     assert judged(health, with_routes(again))[CMD].level is Level.OK
+
+
+def test_messages_that_are_too_long_are_told_at_both_ends_while_they_come() -> None:
+    to_it = msgspec.structs.replace(HEALTHY, direction="out", oversized=0)
+    name = "rmpa: to joystick: /cmd (/joy_node)"
+    health = Health()
+    before = msgspec.structs.replace(to_it, lost=0)
+    assert name not in judged(health, with_routes(before, msgspec.structs.replace(HEALTHY, oversized=0)))
+    for count in (1, 3):
+        found = judged(health, with_routes(*(msgspec.structs.replace(r, oversized=count) for r in (before, HEALTHY))))
+        for status in (found[name], found[CMD]):
+            assert status.level is Level.WARN
+            assert f"{max(1, count - 1)} left out, too long to cross" in status.message
+            assert status.values["too long, last (B)"] == "270000000"
+    again = judged(health, with_routes(*(msgspec.structs.replace(r, oversized=3) for r in (before, HEALTHY))))
+    assert (again[name].level, again[CMD].level) == (Level.OK, Level.OK)
+
+
+def test_a_reliable_route_whose_peer_is_away_is_told_at_the_sender() -> None:
+    away = msgspec.structs.replace(
+        HEALTHY, direction="out", state="away", problem="joystick is away for 12 s", lost=0, oversized=0, kept=7
+    )
+    name = "rmpa: to joystick: /cmd (/joy_node)"
+    health = Health()
+    status = judged(health, with_routes(away))[name]
+    assert (status.level, status.message) == (Level.OK, "joystick is away for 12 s")
+    assert status.values["waiting"] == "7"
+    lost = msgspec.structs.replace(away, lost=7046, kept=0)
+    status = judged(health, with_routes(lost))[name]
+    assert (status.level, status.message) == (Level.WARN, "joystick is away for 12 s; 7046 lost")
+    status = judged(health, with_routes(lost))[name]
+    assert (status.level, status.message) == (
+        Level.WARN,
+        "joystick is away for 12 s; 7046 messages lost to it until now",
+    )
+    back = msgspec.structs.replace(lost, state="open", problem="")
+    status = judged(health, with_routes(back))[name]
+    assert (status.level, status.message) == (Level.OK, "7046 messages lost to it until now")
+
+
+def test_a_loss_that_nobody_can_count_is_told() -> None:
+    health = Health()
+    judged(health, with_routes(HEALTHY))
+    status = judged(health, with_routes(msgspec.structs.replace(HEALTHY, events={"loss_unknown": 1})))[CMD]
+    assert (status.level, status.message) == (Level.WARN, "1 times an unknown number lost")
 
 
 def test_sources_of_one_topic_have_names_of_their_own() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rmpa.ros.definitions import SEPARATOR, DefinitionError, known_types
+from rmpa.ros.definitions import SEPARATOR, known_types
 from rmpa.ros.messages import MessageError, MessageType, Plain
 
 JOY: Plain = {
@@ -161,20 +161,6 @@ def test_bytes_that_are_no_message(raw: bytes) -> None:
 def test_an_object_that_is_no_message() -> None:
     with pytest.raises(MessageError, match="cannot serialize a sensor_msgs/Joy"):
         MessageType("sensor_msgs/Joy").serialize("joy")
-
-
-def test_types_from_headers() -> None:
-    known = MessageType("std_msgs/Empty")
-    fields = {"type": known.name, "md5sum": known.md5sum, "message_definition": ""}
-    assert MessageType.from_header(fields).serialize(MessageType.from_header(fields).make()) == b""
-    string = MessageType("std_msgs/String")
-    assert MessageType.from_header({"type": string.name, "md5sum": string.md5sum}).md5sum == string.md5sum
-    with pytest.raises(DefinitionError, match="another version of it"):
-        MessageType.from_header({"type": string.name, "md5sum": "0" * 32})
-    with pytest.raises(DefinitionError, match="its publisher says 0000"):
-        MessageType.from_header({"type": "a/B", "md5sum": "0" * 32, "message_definition": "int32 x"})
-    with pytest.raises(DefinitionError, match="is not one that comes with rmpa"):
-        MessageType("my_msgs/Nothing")
 
 
 def test_sums_are_those_of_rosbags() -> None:

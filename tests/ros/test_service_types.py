@@ -1,15 +1,9 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import pytest
 
 from rmpa.ros.definitions import DefinitionError
-from rmpa.ros.installed import find_message, find_service
 from rmpa.ros.service_types import ServiceType, known_services
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.mark.parametrize(
@@ -56,7 +50,7 @@ def test_a_request_in_bytes() -> None:
         ("int64 a", "has 0 lines '---' instead of one"),
         ("int64 a\n---\nint64 b\n---\n", "has 2 lines '---'"),
         ("int64\n---\n", "'int64' is neither a field nor a constant"),
-        ("Thing a\n---\n", "message type p/Thing: is not one that comes with rmpa"),
+        ("Thing a\n---\n", "message type p/Thing: is not known here, and p/TRequest embeds it"),
     ],
 )
 def test_what_is_refused(text: str, problem: str) -> None:
@@ -64,43 +58,6 @@ def test_what_is_refused(text: str, problem: str) -> None:
         ServiceType("p/T", text)
 
 
-def test_an_unknown_type_says_where_to_get_it() -> None:
-    with pytest.raises(DefinitionError, match=r"my_pkg/Do: .*ROS_PACKAGE_PATH"):
+def test_a_type_that_does_not_come_with_us_is_refused() -> None:
+    with pytest.raises(DefinitionError, match="service type my_pkg/Do: is not a service that comes with rmpa"):
         ServiceType("my_pkg/Do")
-
-
-def test_types_of_the_machine_are_found(tmp_path: Path) -> None:
-    package = tmp_path / "src" / "stack" / "my_pkg"
-    (package / "srv").mkdir(parents=True)
-    (package / "msg").mkdir()
-    (package / "package.xml").touch()
-    (package / "srv" / "Do.srv").write_text("Thing thing\nstd_msgs/Header header\n---\nmy_pkg/Thing[] things\n")
-    (package / "msg" / "Thing.msg").write_text("int32 a\n")
-    environ = {"ROS_PACKAGE_PATH": str(tmp_path)}
-    text = find_service("my_pkg/Do", environ)
-    assert text is not None
-    kind = ServiceType("my_pkg/Do", text, lambda name: find_message(name, environ))
-    assert kind.request.serialize(kind.request.make([[7], {}])) == b"\x07" + bytes(3) + bytes(16)
-    assert find_service("my_pkg/Other", environ) is None
-    assert find_service("../x", environ) is None
-    assert find_message("my_pkg/Thing", {"CMAKE_PREFIX_PATH": str(tmp_path)}) is None
-    (tmp_path / "share").symlink_to(package.parent)
-    assert find_message("my_pkg/Thing", {"CMAKE_PREFIX_PATH": str(tmp_path)}) == "int32 a\n"
-
-
-def test_what_genpy_made_is_read_and_not_run(tmp_path: Path) -> None:
-    folder = tmp_path / "my_pkg" / "srv"
-    folder.mkdir(parents=True)
-    separator = "=" * 80
-    (folder / "_Do.py").write_text(
-        "raise SystemExit\n"
-        "class DoRequest(genpy.Message):\n"
-        f'  _full_text = """Thing a\n{separator}\nMSG: my_pkg/Thing\nint8 x\n"""\n'
-        "class DoResponse(genpy.Message):\n"
-        '  _md5sum = "x"\n'
-        '  _full_text = """string s\n"""\n'
-    )
-    (folder / "_Bad.py").write_text("class (")
-    environ = {"PYTHONPATH": str(tmp_path)}
-    assert find_service("my_pkg/Do", environ) == "Thing a\n---\nstring s\n"
-    assert find_service("my_pkg/Bad", environ) is None

@@ -12,6 +12,7 @@ from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.ros.tcpros import (
     Description,
     MalformedHeader,
+    MalformedStream,
     check_publisher,
     check_request,
     check_subscriber,
@@ -152,6 +153,14 @@ def test_a_message_beyond_the_limit_is_refused_behind_those_before_it() -> None:
     assert (len(messages), consumed) == (1, 6)
     with pytest.raises(LimitExceeded, match="message of"):
         split_messages(memoryview(huge))
+
+
+@pytest.mark.parametrize("size", [limits.TCPROS_LENGTH_MAX + 1, (1 << 32) - 1])
+def test_what_cannot_be_a_length_is_told_from_a_message_that_is_too_long(size: int) -> None:
+    with pytest.raises(MalformedStream, match=f"{size} bytes cannot be.*corrupt"):
+        split_messages(memoryview(struct.pack("<I", size)))
+    with pytest.raises(LimitExceeded):
+        split_messages(memoryview(struct.pack("<I", limits.TCPROS_LENGTH_MAX)))
 
 
 SUBSCRIBER = subscriber_header("/t", "/s", type_name="std_msgs/String", md5sum=MD5)

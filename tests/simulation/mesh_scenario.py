@@ -58,6 +58,7 @@ class MeshScenario(Scenario):
         slower = _SLOWER if self.count > _MANY else 1
         with (
             mock.patch("rmpa.mesh.aio.mesh.unacknowledged", lambda sock: sock.in_flight),
+            mock.patch("rmpa.core.aio.acceptor.Acceptor._has_room", return_value=True),
             mock.patch.multiple(
                 limits,
                 LINK_LEASE=slower * limits.LINK_LEASE,

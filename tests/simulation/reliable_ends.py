@@ -111,6 +111,8 @@ class Exporter:
         self.network = network
         self.world = network.world
         self.published = 0
+        self.gave_up = False
+        """Whether it ever let go of what waited for too long."""
         self.starts: dict[int, int] = {}
         """Epoch to the number of its first message."""
         self.senders: dict[int, ReliableSender] = {}
@@ -172,7 +174,7 @@ class Exporter:
             self._park()
             old.end.close()
         self.wire = wire
-        self.sender = self.table.claim(IMPORTER, epoch, self.world.now)
+        self.sender = self.table.claim(IMPORTER, epoch)
         if self.sender is None:
             number = self.world.rng.getrandbits(32)
             first = self.world.rng.choice(FIRSTS)
@@ -185,7 +187,7 @@ class Exporter:
             assert after is not None
             self.sender.resume(after)
         self.world.note("exporter", f"opens epoch {self.sender.epoch} after {after}, keeps {self.sender.pending}")
-        wire.control(op="opened", epoch=self.sender.epoch, first=self.sender.first)
+        wire.control(op="opened", epoch=self.sender.epoch, first=self.sender.first, following=self.sender.following)
         self._pump()
 
     def _pump(self) -> None:
@@ -202,12 +204,13 @@ class Exporter:
 
     def _park(self) -> None:
         assert self.sender is not None
-        assert self.table.park(IMPORTER, self.sender, self.world.now) == []
+        assert self.table.park(IMPORTER, self.sender, self.world.now + limits.RESUME_WINDOW) == []
         self.wire = self.sender = None
 
     def _expire(self) -> None:
         for key in self.table.expire(self.world.now):
             self.world.note("exporter", f"gives {key} up")
+            self.gave_up = True
 
 
 @dataclass(frozen=True)
@@ -226,6 +229,8 @@ class Life:
     receiver: ReliableReceiver = field(default_factory=ReliableReceiver)
     received: list[Received] = field(default_factory=list)
     epochs: list[int] = field(default_factory=list)
+    unseen: dict[int, int] = field(default_factory=dict)
+    """By epoch: messages that are said to be lost behind the last one that came."""
 
 
 class Importer:
@@ -287,6 +292,10 @@ class Importer:
                 if not life.epochs or life.epochs[-1] != wire.epoch:
                     life.epochs.append(message["epoch"])
                 life.receiver.begin(message["epoch"], message["first"])
+                skipped = life.receiver.skip(message["following"])
+                life.unseen[message["epoch"]] = life.unseen.get(message["epoch"], 0) + skipped
+                if skipped:
+                    self.world.note("importer", f"< {skipped} are lost")
         elif wire.epoch is not None:
             self._data(wire, wire.epoch, frame, life)
         self._acknowledge()
@@ -306,8 +315,9 @@ class Importer:
             number, size = int.from_bytes(whole[:4], "big"), int.from_bytes(whole[4:8], "big")
             assert len(whole) == 8 + size, "a half message was delivered"
             assert frame.stamp_ns == number + 1
-            life.received.append(Received(epoch, number, verdict.gap))
-            self.world.note("importer", f"< {number} gap {verdict.gap}")
+            gap = verdict.gap + life.unseen.pop(epoch, 0)
+            life.received.append(Received(epoch, number, gap))
+            self.world.note("importer", f"< {number} gap {gap}")
 
     def _acknowledge(self) -> None:
         """What is due; only on a link whose sender has said which epoch it sends."""

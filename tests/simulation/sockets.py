@@ -85,6 +85,9 @@ class SimSocket:
     def setsockopt(self, *_: object) -> None:
         pass
 
+    def getsockopt(self, *_: object) -> bytes:
+        raise OSError(errno.ENOPROTOOPT, "this kernel does not tell")
+
     def sendmsg(self, parts: Sequence[Buffer]) -> int:
         if self._error is not None:
             raise self._error

@@ -94,18 +94,22 @@ def test_an_outage_longer_than_the_buffer_is_reported_with_its_exact_count() -> 
     assert life.receiver.gap_total == lost == 600
 
 
-def test_who_is_away_for_longer_than_the_window_begins_anew() -> None:
+@pytest.mark.parametrize("seconds", [limits.RESUME_WINDOW + 1, 600.0])
+@pytest.mark.parametrize("goes_on", [True, False])
+def test_an_outage_longer_than_the_window_is_counted_exactly(seconds: float, goes_on: bool) -> None:
     scenario = ReliableScenario(3, Bounds())
     scenario.world.run(scenario.world.now + 0.1)
     scenario.exporter.publish(4)
     scenario.world.run(scenario.world.now + 0.1)
-    scenario.outage(limits.RESUME_WINDOW + 1)
-    scenario.exporter.publish(4)
+    scenario.outage(seconds)
+    scenario.world.run(scenario.world.now + 0.1)
+    if goes_on:
+        scenario.exporter.publish(4)
     scenario.settle()
     life = scenario.importer.lives[0]
-    assert life.receiver.breaks == 1
-    assert life.receiver.gap_total == 0, "how many were lost is unknown, and not guessed"
-    assert scenario.exporter.table.given_up > 0
+    assert life.receiver.breaks == 0
+    assert life.receiver.gap_total == round(seconds * 20)
+    assert [got.gap for got in life.received] == [0, round(seconds * 20)][: 1 + goes_on]
 
 
 @pytest.mark.parametrize("seed", range(20))

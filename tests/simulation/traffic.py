@@ -10,8 +10,9 @@ import json
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.bridge.aio.flows import ExportFlow, ImportFlow, LinkTime
+from rmpa.bridge.aio.flows import ExportFlow, ImportFlow
 from rmpa.bridge.aio.legs import ReliableLeg
+from rmpa.bridge.aio.link_time import LinkTime
 from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.mesh.frames import Kind
 from tests.simulation.mesh_peer import MeshPeer

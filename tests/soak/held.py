@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import signal
+import time
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,15 +14,21 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 
-from rmpa.experiments.bed.processes import eventually
+from rmpa.core.errors import UnreachableError
+from rmpa.experiments.bed.processes import BedError, eventually
 from rmpa.monitor.aio.control_client import ControlClient
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rmpa.experiments.bed.agents import Agent
+    from rmpa.monitor.snapshot import Snapshot
 
 MB: Final = 1 << 20
+PATIENCE: Final = 60.0
+"""Seconds in which an agent answers, however busy the machine is."""
+OWN_FAULT: Final = 3.0
+"""Seconds by which a loop is later than a thread beside it: then it was busy, and not the machine."""
 FLOOR_SPAN: Final = 5
 """Samples of which the least counts: what a queue or a snapshot held for a moment is no growth."""
 GROWTH_MAX: Final = 3 * MB
@@ -66,9 +73,7 @@ def look(agent: Agent, at: float) -> Held:
     path.unlink(missing_ok=True)
     os.kill(agent.pid, signal.SIGUSR1)
     eventually(path.exists, what=f"what {agent.name} holds", every=0.01)
-    assert agent.runtime_dir
-    with ControlClient(agent.runtime_dir / f"{agent.name}.sock") as client:
-        snapshot = client.snapshot()
+    snapshot = ask(agent)
     routes = [route for topic in snapshot.topics for route in topic.routes if route.state == "open"]
     fds = _open_files(agent.pid)
     return Held(
@@ -81,6 +86,43 @@ def look(agent: Agent, at: float) -> Held:
         routes=len(routes),
         proxies=len({(route.peer, route.node) for topic in snapshot.topics for route in topic.routes}),
     )
+
+
+def ask(agent: Agent) -> Snapshot:
+    """An agent's snapshot by its control socket; no process is started for it, which takes seconds on a busy machine.
+
+    An answer that does not come in time is asked for again if the machine was late, and not the agent.
+
+    Raises:
+        BedError: The agent was late itself, or the machine for longer than ``PATIENCE``.
+    """
+    assert agent.runtime_dir
+    begin = time.monotonic()
+    while True:
+        began = time.monotonic()
+        try:
+            with ControlClient(agent.runtime_dir / f"{agent.name}.sock") as client:
+                return client.snapshot()
+        except UnreachableError as error:
+            late = lateness(agent)
+            text = (
+                f"{agent.name}: {error} (asked {time.monotonic() - began:.1f} s before; lately its loop was late by "
+                f"{late['loop']:.1f} s, a thread beside it by {late['thread']:.1f} s; load {os.getloadavg()[0]:.1f})"
+            )
+            ours = late["loop"] - late["thread"] > OWN_FAULT
+            if ours or time.monotonic() - begin > PATIENCE or agent.process.returncode is not None:
+                raise BedError(text) from None
+            print(f"         {text}: asked again", flush=True)
+            time.sleep(0.5)
+
+
+def lateness(agent: Agent) -> dict[str, float]:
+    """How late an agent's loop, and a thread beside it, have been lately, in seconds; see ``watched``."""
+    try:
+        found: dict[str, float] = json.loads(held_path(agent).with_suffix(".late").read_text(encoding="utf-8"))
+    except OSError:
+        found = {"loop": 0.0, "thread": 0.0}
+    return found
 
 
 def _open_files(pid: int) -> list[str]:

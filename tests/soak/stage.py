@@ -14,11 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
+import msgspec
+
 from rmpa.experiments.bed.agents import Agent
 from rmpa.experiments.bed.namespaces import Lab
 from tests.interop.modules import Module
 from tests.interop.ros import Ros
-from tests.soak.held import held_path
+from tests.soak.held import ask, held_path
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -51,6 +53,10 @@ class WatchedAgent(Agent):
     def env(self) -> dict[str, str]:
         """With the file for that."""
         return {**super().env, "SOAK_HELD": str(held_path(self))}
+
+    def peers(self) -> dict[str, dict[str, object]]:
+        """The same, by its control socket: see ``held.ask``."""
+        return {info.name: msgspec.to_builtins(info) for info in ask(self).peers}
 
     @property
     def argv(self) -> list[str]:

@@ -15,12 +15,14 @@ from typing import TYPE_CHECKING, Final
 from rmpa.agent.clocks import Clocks
 from rmpa.agent.core_choice import make_core
 from rmpa.agent.diagnostics import Diagnostics
+from rmpa.agent.nodes import NodeDesk
 from rmpa.agent.params import ParamOps
 from rmpa.agent.reload import Hangups, Reloader
 from rmpa.agent.station import Station
 from rmpa.agent.view import View
 from rmpa.agent.view_services import ServicesView
 from rmpa.agent.why import Why
+from rmpa.bridge.aio.bounds import Bounds
 from rmpa.bridge.aio.bridge import Bridge
 from rmpa.bridge.naming import Names
 from rmpa.bridge.params.aio.part import Params
@@ -30,13 +32,14 @@ from rmpa.bridge.services.rules import ServiceRules
 from rmpa.core import limits
 from rmpa.core.aio import realtime
 from rmpa.core.aio.collector import Collector
+from rmpa.core.aio.descriptors import is_shortage, raise_file_limit
 from rmpa.core.aio.loop import AgentLoop
 from rmpa.core.aio.notify import notify_service_manager
-from rmpa.core.aio.sockets import raise_file_limit
 from rmpa.core.config_values import did_you_mean
 from rmpa.core.contract import Contracts
 from rmpa.core.counters import Counters
-from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
+from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError, UnreachableError
+from rmpa.core.open_files import remedy
 from rmpa.monitor.aio.control_server import ControlServer
 from rmpa.monitor.aio.runtime_dir import runtime_dir
 from rmpa.monitor.snapshot import FollowedInfo, PingReply, Snapshot
@@ -87,6 +90,7 @@ class Agent:
                 "reload": self._reload,
                 "param": self._param,
                 "followed": self._followed,
+                "node": self._node,
             },
         )
         self.core: Core = make_core(settings)
@@ -97,6 +101,7 @@ class Agent:
             contracts=Contracts(settings.contracts),
             names=Names(settings.peers),
             relay=settings.relay,
+            most=settings.limits,
         )
         self.station: Station | None = None
         self._moving: asyncio.Task[None] | None = None
@@ -113,14 +118,18 @@ class Agent:
             started=time.time(),
             wishes=wishes,
         )
-        self.params = Params(self.core, self.bridge, settings.params, settings.time)
+        self.params = Params(self.core, self.bridge, settings.params, settings.time, settings.limits.params)
         self.bridge.add(self.params)
         rules = ServiceRules(
             settings.services, Policy(settings.policy, settings.peers, settings.time), Names(settings.peers)
         )
-        self.services = Services(self.core, self.bridge, rules)
+        self.services = Services(self.core, self.bridge, rules, settings.limits)
         self.bridge.add(self.services)
+        bounds = Bounds(self.bridge, self.services, settings.limits)
+        self.bridge.add(bounds)
+        self._view.watch(bounds)
         self._view.services = ServicesView(self.services)
+        self._nodes = NodeDesk(settings, self.core, self.bridge, self._attached)
         self._param_ops = ParamOps(self.params, self.bridge.asks, self._attached)
         self.reloader = Reloader(settings, load, self._take)
         self._view.parameters = self.params.notes
@@ -202,6 +211,7 @@ class Agent:
         self.bridge.reload(settings)
         self._view.reload(settings)
         self._whys.reload(settings)
+        self._nodes.reload(settings)
 
     # --- the control socket's handlers -------------------------------------------------------------------------
 
@@ -228,6 +238,9 @@ class Agent:
 
     async def _param(self, args: dict[str, object]) -> object:
         return await self._param_ops.ask(args)
+
+    async def _node(self, args: dict[str, object]) -> object:
+        return await self._nodes.ask(args)
 
     def _followed(self, args: dict[str, object]) -> tuple[FollowedInfo, ...]:
         return self._param_ops.followed(args)
@@ -283,6 +296,11 @@ def run(settings: Settings, load: Callable[[], Loaded] | None = None) -> int:
     raise_file_limit()
     sys.setswitchinterval(limits.THREAD_SWITCH)
     wishes = realtime.apply(settings.realtime)
-    with asyncio.Runner(loop_factory=AgentLoop) as runner:
-        runner.run(_serve(settings, wishes, load))
+    try:
+        with asyncio.Runner(loop_factory=AgentLoop) as runner:
+            runner.run(_serve(settings, wishes, load))
+    except OSError as error:
+        if is_shortage(error):
+            raise StartError(f"agent {settings.name}", "no file descriptors left", remedy()) from error
+        raise
     return 0

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from typing import TYPE_CHECKING
 
-from rmpa.bridge.policy import OWN_NODE
+from rmpa.bridge.policy import OWN_NODE, is_own
+from rmpa.core.aio.state_dir import core_file
 from rmpa.ros.aio.core import RosCore
 from rmpa.ros.aio.external_core import ExternalCore
 from rmpa.ros.aio.http_client import is_own_name
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
     from rmpa.core.config import Settings
     from rmpa.ros.aio.core_api import Core
 
+_log = logging.getLogger(__name__)
+
 
 def make_core(settings: Settings) -> Core:
     """The core that the settings ask for, not started.
@@ -24,7 +28,16 @@ def make_core(settings: Settings) -> Core:
         ConfigError: A ROS variable cannot be used.
     """
     if settings.core_mode == "embedded":
-        return RosCore(settings.core_host, settings.core_port)
+        state = core_file(os.environ, settings.core_port, settings.name, settings.state_dir)
+        if state is None and settings.core_port:
+            _log.warning("! the core keeps nothing over a restart: there is no home; set RMPA_STATE_DIR")
+        return RosCore(
+            settings.core_host,
+            settings.core_port,
+            state=state,
+            fresh=settings.core_fresh,
+            temporary=is_own,
+        )
     uri = settings.core_master or DEFAULT_MASTER_URI
     # The proxies are nodes like any other, and are where a node that was started here would be: where nobody asked
     # for an address, at loopback beside a master that is only there, and under the machine's name if the master is

@@ -22,10 +22,13 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-LIVE: Final = frozenset({"policy", "peers", "contracts", "services", "params", "time", "log_level"})
+LIVE: Final = frozenset(
+    {"policy", "peers", "contracts", "services", "nodes", "params", "time", "limits", "log_level"}
+)
 """The settings that a running agent takes; all others need a restart."""
 _KEYS: Final = {
     "core_mode": "core.mode",
+    "core_fresh": "core.fresh",
     "core_master": "core.master",
     "core_host": "core.host",
     "core_port": "core.port",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections import Counter
@@ -10,12 +11,14 @@ from typing import TYPE_CHECKING
 import psutil
 
 import rmpa
+from rmpa.agent.view_bounds import own_text
 from rmpa.agent.view_peers import PeersView
-from rmpa.agent.view_topics import TopicsView
+from rmpa.agent.view_topics import TopicsView, unreachable_infos
 from rmpa.core import limits
+from rmpa.core.aio.descriptors import DESCRIPTORS
 from rmpa.core.aio.loop import breathe
 from rmpa.core.aio.realtime import refused
-from rmpa.monitor.snapshot import AgentInfo, Snapshot
+from rmpa.monitor.snapshot import AgentInfo, FilesInfo, Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
@@ -23,6 +26,7 @@ if TYPE_CHECKING:
     from rmpa.agent.clocks import Clocks
     from rmpa.agent.station import Station
     from rmpa.agent.view_services import ServicesView
+    from rmpa.bridge.aio.bounds import Bounds
     from rmpa.bridge.aio.bridge import Bridge
     from rmpa.core.aio.realtime import Wish
     from rmpa.core.config import Settings
@@ -64,6 +68,7 @@ class View:
         self._cpu: float | None = None
         self._cpu_known = time.monotonic()
         self._peers = PeersView(bridge)
+        self._bounds: Bounds | None = None
         self._topics = TopicsView(settings, core, bridge, clocks)
         self.station: Station | None = None
         self.services: ServicesView | None = None
@@ -71,6 +76,10 @@ class View:
         """What the settings say and only a restart brings."""
         self.parameters: Callable[[], tuple[str, ...]] = tuple
         """What there is to know of followed parameters."""
+
+    def watch(self, bounds: Bounds) -> None:
+        """Show what is beyond the limits, from now on."""
+        self._bounds = self._peers.bounds = bounds
 
     def reload(self, settings: Settings) -> None:
         """Other settings hold from now on."""
@@ -83,7 +92,7 @@ class View:
         Args:
             topics: The only topics that are wanted, without services, or ``None`` for all.
         """
-        rooms = [self._bridge.counters, self._core.counters, *self._counters]
+        rooms = [self._bridge.counters, self._core.counters, DESCRIPTORS.counters, *self._counters]
         if self.station is not None:
             rooms += [self.station.mesh.counters, self.station.discovery.counters]
         counters: Counter[str] = Counter()
@@ -98,18 +107,23 @@ class View:
             services=self.services.infos() if self.services is not None and topics is None else (),
             counters=dict(sorted(counters.items())),
             notes=self._notes(),
+            unreachable=unreachable_infos(self._core, time.monotonic()),
         )
 
     def _notes(self) -> tuple[str, ...]:
         notes = tuple(self.station.discovery.notes()) if self.station is not None else ()
         notes += self._core.notes()
+        if DESCRIPTORS.shortage is not None:
+            notes += (DESCRIPTORS.shortage.problem,)
         notes += tuple(f"{key} waits for a restart" for key in self.waiting())
         notes += self.parameters()
+        notes += tuple(map(own_text, self._bounds.own())) if self._bounds is not None else ()
         missing = refused(self._wishes)
         return (*notes, missing) if missing else notes
 
     def _agent(self) -> AgentInfo:
         identity = self.station.identity if self.station is not None else None
+        proxies = sum(attached.inbound.count for attached in self._bridge.everyone())
         return AgentInfo(
             name=self._settings.name,
             guid=str(identity.guid) if identity else "",
@@ -121,16 +135,43 @@ class View:
             started=self._started,
             uptime=time.time() - self._started,
             cpu=self._cpu_share(),
-            rss=self._process.memory_info().rss,
+            rss=self._memory(),
             addresses=tuple(str(a) for a in (identity.guid.address, *identity.addresses)) if identity else (),
             interfaces=tuple(i.name for i in self.station.discovery.interfaces) if self.station else (),
             config_file=str(self._settings.config_file or ""),
             realtime=tuple(map(str, self._wishes)),
+            files=_files(),
+            proxies=proxies,
+            proxy_sockets=self._bridge.proxy_nodes.sockets(proxies),
+            proxy_listening=self._bridge.proxy_nodes.listening,
+            core_memory=self._core.remembered(),
         )
 
     def _cpu_share(self) -> float | None:
         """Looked at now and then: between two snapshots that follow each other there is nothing to see."""
         now = time.monotonic()
         if now - self._cpu_known >= limits.CPU_INTERVAL:
-            self._cpu, self._cpu_known = self._process.cpu_percent(), now
+            with contextlib.suppress(OSError):  # no file descriptor is left to read /proc
+                self._cpu, self._cpu_known = self._process.cpu_percent(), now
         return self._cpu
+
+    def _memory(self) -> int | None:
+        try:
+            rss: int = self._process.memory_info().rss
+        except OSError:
+            return None
+        return rss
+
+
+def _files() -> FilesInfo:
+    used, limit, reserved = DESCRIPTORS.open, DESCRIPTORS.limit, DESCRIPTORS.reserve
+    counts = DESCRIPTORS.counters.as_dict()
+    return FilesInfo(
+        open=used,
+        limit=limit,
+        hard=DESCRIPTORS.hard_limit,
+        reserved=reserved,
+        near=used >= limits.DESCRIPTORS_NEAR * (limit - reserved),
+        refused=sum(count for name, count in counts.items() if name.startswith("descriptors.refused.")),
+        problem=DESCRIPTORS.shortage.problem if DESCRIPTORS.shortage is not None else "",
+    )

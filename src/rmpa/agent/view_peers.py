@@ -6,18 +6,23 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from rmpa.agent.view_bounds import bound_here, bound_there
 from rmpa.core.aio.clock import SystemClock
 from rmpa.core.aio.loop import breathe
+from rmpa.monitor.shared_address import mark_shared_addresses
 from rmpa.monitor.snapshot import LinkInfo, PeerInfo
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rmpa.agent.station import Station
+    from rmpa.bridge.aio.bounds import Bounds
     from rmpa.bridge.aio.bridge import Attached, Bridge
     from rmpa.discovery.events import PeerView
     from rmpa.mesh.aio.link import MeshLink
+    from rmpa.mesh.aio.paths import PathMonitor
     from rmpa.mesh.peering import PeerStatus
+    from rmpa.monitor.snapshot import BoundInfo
 
 
 class PeersView:
@@ -29,6 +34,8 @@ class PeersView:
 
     def __init__(self, bridge: Bridge) -> None:
         self._bridge = bridge
+        self.bounds: Bounds | None = None
+        """What is beyond the limits; told once it is known."""
         self._clock = SystemClock()
 
     def infos(self, station: Station) -> tuple[PeerInfo, ...]:
@@ -45,14 +52,24 @@ class PeersView:
             attached = links.get(guid)
             info = self._peer(roster.get(guid), statuses.get(guid), attached, now)
             if attached is not None:
+                info = msgspec.structs.replace(info, link=self._link(attached.link, station.mesh.paths, now))
                 theirs = len(self._bridge.imports.offered_by(attached.peer))
                 ours = self._bridge.exports.topics_for(attached.peer)
                 breathe()
-                info = msgspec.structs.replace(info, topics_in=theirs, topics_out=ours)
+                beyond = self._beyond(attached)
+                info = msgspec.structs.replace(info, topics_in=theirs, topics_out=ours, beyond=beyond)
             infos.append(info)
         relayed = self._relayed({info.instance: info for info in infos})
         infos = [info for info in infos if info.instance not in {one.instance for one in relayed}]
-        return tuple(sorted((*infos, *relayed), key=lambda info: (info.name, info.guid)))
+        own = {str(address) for address in (station.identity.guid.address, *station.identity.addresses)}
+        return mark_shared_addresses(sorted((*infos, *relayed), key=lambda info: (info.name, info.guid)), own)
+
+    def _beyond(self, attached: Attached) -> tuple[BoundInfo, ...]:
+        if self.bounds is None:
+            return ()
+        name, peer = attached.link.name, attached.peer
+        here = [bound_here(name, one) for one in self.bounds.here(peer)]
+        return (*here, *(bound_there(name, one) for one in self.bounds.there(peer)))
 
     def _relayed(self, known: Mapping[str, PeerInfo]) -> list[PeerInfo]:
         """Modules without a link whose topics a relay passes on; their beacons may be heard all the same."""
@@ -89,15 +106,15 @@ class PeersView:
             found_ago=now - view.since if view else None,
             beacon_ago=now - view.heard if view else None,
             source=view.found_by.value if view else "link",
-            link=self._link(attached.link, now) if attached is not None else None,
             last_error=status.last_error if status is not None else "",
             next_attempt=max(0.0, next_attempt - now) if next_attempt is not None else None,
             conflicts=conflicts,
         )
 
     @staticmethod
-    def _link(link: MeshLink, now: float) -> LinkInfo:
+    def _link(link: MeshLink, paths: PathMonitor, now: float) -> LinkInfo:
         host, port = link.remote_endpoint
+        problem = paths.problem(link)
         return LinkInfo(
             remote=f"{host}:{port}",
             dialled=link.dialled,
@@ -110,4 +127,7 @@ class PeersView:
             queued=link.queue_bytes,
             dropped=link.dropped,
             heard_ago=now - link.heard_at,
+            packet=paths.packet_bytes(link),
+            path_problem=problem.text if problem is not None else "",
+            path_remedy=problem.remedy if problem is not None else "",
         )

@@ -135,6 +135,11 @@ class Why:
             return Diagnosis(name=topic, peer=here, to="", flows=False, stages=(stage,))
         state = self._core.state()
         near = await asyncio.to_thread(did_you_mean, topic, {*state.publishers, *state.subscribers})
+        if awaited := self._topics.awaited(topic):
+            text = f"{', '.join(awaited)} published {topic} before this agent was restarted, and does not answer"
+            remedy = "it is asked again by itself; is that program stopped or stuck? Else start it again"
+            stage = Stage("publisher", Verdict.FAIL, text, remedy)
+            return Diagnosis(name=topic, peer=here, to="", flows=False, stages=(stage,))
         text = f"neither {here} nor a linked peer ({', '.join(linked) or 'there is none'}) publishes {topic}"
         remedy = f"did you mean {near}?" if near else "`rmpa topic list` shows what there is, `rmpa peer list` who"
         stage = Stage("publisher", Verdict.FAIL, text, remedy)

@@ -106,6 +106,10 @@ class ServiceFacts:
         for service in self._bridge.names.of(peer).locals_of(wire):
             server = seen.get(service)
             if server is None:
+                for node in self._core.state().services.get(service, {}):
+                    if (found := self._core.unreachable().get(node)) is not None:
+                        refusal = f"it cannot be reached at {found.api} ({found.problem})"
+                        return FarService(node=node, service=service, refusal=refusal)
                 continue
             decision = self._rules.judge(service, server.node if server.origin is None else server.origin.node)
             if decision.allowed:

@@ -11,6 +11,7 @@ from rmpa.bridge.proxy_names import proxy_name
 from rmpa.core import limits
 from rmpa.core.aio.loop import breathing
 from rmpa.core.config_values import did_you_mean
+from rmpa.core.contract import Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.names import is_global_name
 from rmpa.monitor.diagnosis import FarSource, FarTopic, Near, Reader
@@ -47,6 +48,10 @@ class TopicFacts:
     def own(self, topic: str) -> dict[str, str]:
         """The module's own publishers of a topic, and their addresses."""
         return {node: uri for node, uri in self._core.publishers(topic).items() if not is_own(node)}
+
+    def awaited(self, topic: str) -> list[str]:
+        """Nodes that published a topic before this agent was restarted, each with its address."""
+        return [f"{node} at {uri}" for node, uri in self._core.awaited(topic).items()]
 
     def there(self, peer: str, topic: str) -> tuple[str, str]:
         """A topic of a peer, as a user names it: its name here, and over there.
@@ -128,16 +133,23 @@ class TopicFacts:
         state = self._core.state()
         sources: list[FarSource] = []
         subscribers: list[str] = []
+        awaited: list[str] = []
         for topic in names.locals_of(wire):
             kind = self._core.type_of(topic)
             nodes = self._relayed(topic, instance) if instance else list(self.own(topic))
             if names.wire_name(topic, kind) == wire:
                 sources += [self._far(attached, Source(topic, node), wire) for node in nodes]
                 subscribers += [node for node in state.subscribers.get(topic, {}) if not is_own(node)]
+                awaited += self.awaited(topic)
+        station = self._view.station
+        problem = station.mesh.paths.problem(attached.link) if station is not None else None
         return FarTopic(
+            path_problem=problem.text if problem is not None else "",
+            path_remedy=problem.remedy if problem is not None else "",
             sources=tuple(sources[: limits.WHY_SOURCES_MAX]),
             subscribers=tuple(subscribers[: limits.WHY_SOURCES_MAX]),
             near="" if sources else await self._nearest(attached.link.name, wire),
+            awaited=tuple(awaited[: limits.WHY_SOURCES_MAX]),
         )
 
     async def _nearest(self, asker: str, wire: str) -> str:
@@ -173,7 +185,8 @@ class TopicFacts:
             special = self._policy.judge_for(attached.link.name, source.topic, kind, wire)
             decision = special if special.rule else decision
         flow = self._bridge.outbound.flows.get(source)
-        opening = exports.contract(source, attached.peer) is not None
+        contract = exports.contract(source, attached.peer)
+        reliable = contract is not None and contract.reliability is Reliability.RELIABLE
         return FarSource(
             node=source.node,
             topic=source.topic,
@@ -181,10 +194,19 @@ class TopicFacts:
             crosses=decision.allowed,
             rule=decision.rule,
             offered=exports.offer(attached.peer, source) is not None,
-            route="open" if attached.peer in exports.flowing(source) else "opening" if opening else "",
+            route="open" if attached.peer in exports.flowing(source) else "opening" if contract is not None else "",
             messages=flow.messages if flow is not None else 0,
-            dropped=flow.dropped if flow is not None else 0,
+            dropped=flow.dropped if flow is not None and not reliable else 0,
+            lost=self._bridge.outbound.lost(source, attached.peer),
+            oversized=flow.oversized if flow is not None else 0,
+            oversized_bytes=flow.oversized_bytes if flow is not None else 0,
+            beyond=exports.beyond.limit if exports.is_beyond(source) else 0,
+            unreachable="" if flow is not None and flow.messages else self._unreachable(source.node),
         )
+
+    def _unreachable(self, node: str) -> str:
+        found = self._core.unreachable().get(node)
+        return f"{found.api}: {found.problem}" if found is not None else ""
 
 
 def name_in(args: dict[str, Any], key: str) -> str:

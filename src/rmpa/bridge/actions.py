@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from rmpa.core import limits
+
 if TYPE_CHECKING:
     from rmpa.bridge.messages import Description, Message, Origin, Source
     from rmpa.core.contract import Contract
@@ -65,19 +67,36 @@ class AddRoute:
 
 @dataclass(frozen=True, slots=True)
 class RemoveRoute:
-    """Send a source's messages to a peer no longer, and drop what waits."""
+    """Send a source's messages to a peer no longer, and drop what waits.
+
+    Args:
+        source: Which.
+        peer: To whom no longer.
+        route: The route's id; 0: one that was suspended.
+        wished: Whether the peer wants no more of it; else it may ask what it missed.
+        over: Whether nothing more is published that it could miss until it asks again.
+    """
 
     source: Source
     peer: int
     route: int
+    wished: bool = False
+    over: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class SuspendRoute:
-    """The peer's link is gone; keep what it has not acknowledged, and what comes, until it is back or given up."""
+    """The peer's link is gone; keep what it has not acknowledged, and what comes, until it is back.
+
+    Args:
+        source: Which.
+        peer: To whom.
+        outage: Seconds for which it is kept; after them it is only counted.
+    """
 
     source: Source
     peer: int
+    outage: float = limits.RESUME_WINDOW
 
 
 # --- inbound: from a peer to the local graph -------------------------------------------------------------------
@@ -112,7 +131,20 @@ class Retract:
 
 @dataclass(frozen=True, slots=True)
 class Describe:
-    """Tell the waiting local subscribers what the messages are; from now on data comes on ``route``."""
+    """Tell the waiting local subscribers what the messages are; from now on data comes on ``route``.
+
+    Args:
+        peer: Whose.
+        source: Which.
+        route: The route's id.
+        description: What the messages are.
+        contract: What holds for the route.
+        epoch: Names the numbering of a reliable route.
+        first: Its first sequence.
+        following: The next message's sequence, where a numbering goes on; ``None``: the peer did not say.
+        lost: Messages of earlier numberings that never came, where one begins anew; ``None``: the peer does not know.
+        at_least: Whether more may be lost than that.
+    """
 
     peer: int
     source: Source
@@ -121,6 +153,9 @@ class Describe:
     contract: Contract
     epoch: int = 0
     first: int = 1
+    following: int | None = None
+    lost: int | None = None
+    at_least: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,12 +167,14 @@ class Detach:
         source: Which.
         route: The route's id.
         keep: The link is gone, and a new one will go on behind the last message that came.
+        missed: Somebody listens all the same: what is not received until a route is open again counts as lost.
     """
 
     peer: int
     source: Source
     route: int
     keep: bool = False
+    missed: bool = False
 
 
 @dataclass(frozen=True, slots=True)

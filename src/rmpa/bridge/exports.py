@@ -21,6 +21,7 @@ told a bounded number of sources at a time.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Final
@@ -28,6 +29,8 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, SuspendRoute, Warn
+from rmpa.bridge.bounds import Beyond
+from rmpa.bridge.losses import NOTHING_KEPT, beginning_anew, going_on
 from rmpa.bridge.messages import (
     Advertise,
     Close,
@@ -43,11 +46,13 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.naming import Names, PeerNames
 from rmpa.bridge.relay import may_have
 from rmpa.core import limits
+from rmpa.core.config import LimitSettings
 from rmpa.core.contract import Contract, Contracts, Durability, Reliability, combine
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Callable, Collection, Mapping
 
+    from rmpa.bridge.losses import Kept
     from rmpa.bridge.messages import Origin
     from rmpa.bridge.policy import Policy
 
@@ -71,6 +76,7 @@ class _Route:
         live: Whether data goes there yet.
         epoch: Of a reliable route, else 0.
         after: Where a suspended one goes on.
+        named: The last numbering that the peer has a part of, and its last message; (0, 0) if it has none.
     """
 
     contract: Contract
@@ -78,6 +84,7 @@ class _Route:
     live: bool = False
     epoch: int = 0
     after: int | None = None
+    named: tuple[int, int] = (0, 0)
 
 
 @dataclass(slots=True)
@@ -142,6 +149,11 @@ class _Peer:
 
 _NOTHING: Final = _Topic({})
 _NO_NAMES: Final = Names()
+_DEFAULT_LIMITS: Final = LimitSettings()
+
+
+def _always(_peer: int) -> bool:
+    return True
 
 
 class Exports:
@@ -151,17 +163,28 @@ class Exports:
         policy: What may cross.
         contracts: What our side promises.
         names: How our names read at the peers.
+        most: How much is offered.
+        kept: Who keeps the messages of reliable routes.
     """
 
-    def __init__(self, policy: Policy, contracts: Contracts | None = None, names: Names = _NO_NAMES) -> None:
+    def __init__(
+        self,
+        policy: Policy,
+        contracts: Contracts | None = None,
+        names: Names = _NO_NAMES,
+        most: LimitSettings = _DEFAULT_LIMITS,
+        kept: Kept = NOTHING_KEPT,
+    ) -> None:
+        self._kept = kept
         self._policy = policy
+        self._most = most
         self._contracts = contracts if contracts is not None else Contracts()
         self._names = names
         self._rules = 0
         self._epochs = 0
         self._topics: dict[str, _Topic] = {}
         self._local: dict[Source, LocalSource] = {}
-        self._too_many: dict[Source, LocalSource] = {}
+        self._too_many: OrderedDict[Source, LocalSource] = OrderedDict()
         self._peers: dict[int, _Peer] = {}
         self._flows: dict[Source, _Flow] = {}
 
@@ -169,6 +192,15 @@ class Exports:
     def offered(self) -> Mapping[Source, LocalSource]:
         """What peers are told of."""
         return self._local
+
+    @property
+    def beyond(self) -> Beyond:
+        """What is offered to no peer because there is too much (``limits.topics``)."""
+        return Beyond("topics", self._most.topics, len(self._too_many))
+
+    def is_beyond(self, source: Source) -> bool:
+        """Whether a source is one of these."""
+        return source in self._too_many
 
     def offer(self, peer: int, source: Source) -> Offer | None:
         """What a peer was told of a source, by the name that it has over there."""
@@ -219,12 +251,18 @@ class Exports:
         """Whether there is something to ``tell``."""
         return any(peer.news for peer in self._peers.values())
 
-    def rules(self, policy: Policy, contracts: Contracts, names: Names) -> list[Action]:
+    def beginning(self, peer: int) -> bool:
+        """Whether a peer has not been told everything once since its link is up."""
+        return known.beginning if (known := self._peers.get(peer)) is not None else False
+
+    def rules(
+        self, policy: Policy, contracts: Contracts, names: Names, most: LimitSettings = _DEFAULT_LIMITS
+    ) -> list[Action]:
         """Other rules hold from now on; what they leave as it is goes on untouched.
 
         The topics are judged by them when ``graph`` tells of each next, and the peers hear of it by ``tell``.
         """
-        self._policy, self._contracts, self._names = policy, contracts, names
+        self._policy, self._contracts, self._names, self._most = policy, contracts, names, most
         self._rules += 1
         for peer in self._peers.values():
             before = peer.ruled
@@ -271,9 +309,12 @@ class Exports:
     def _came(self, source: Source, local: LocalSource) -> list[Action]:
         """A source is there: new, as it was, with another type, or at another address."""
         before = self._local.get(source)
-        if before is None and len(self._local) >= limits.TOPICS_PER_PEER_MAX:
+        if before is None and len(self._local) >= self._most.topics:
             self._too_many[source] = local
-            text = f"more than {limits.TOPICS_PER_PEER_MAX} sources would cross; the rest stays home: deny some"
+            text = (
+                f"this module has more topics than limits.topics = {self._most.topics}; the rest is offered to no "
+                "peer: raise it in rmpa.toml and `rmpa reload`, or deny some"
+            )
             return [Warn("sources.too_many", "local", text)]
         self._too_many.pop(source, None)
         self._local[source] = local
@@ -291,16 +332,15 @@ class Exports:
         self._note(source)
         actions = self._end(source, "the node has gone")
         if self._too_many:
-            source = next(iter(self._too_many))
-            actions += self._came(source, self._too_many.pop(source))
+            actions += self._came(*self._too_many.popitem(last=False))
         return actions
 
     def _note(self, source: Source) -> None:
         for peer in self._peers.values():
             peer.news.setdefault(source)
 
-    def tell(self) -> list[Action]:
-        """One message for each peer that has not heard everything; call again while ``untold``.
+    def tell(self, ready: Callable[[int], bool] = _always) -> list[Action]:
+        """One message for each peer that has not heard everything and is ready; call again while ``untold``.
 
         Of those that have rules of their own only one is told at a time, in turn: each source is judged for it.
         """
@@ -308,7 +348,7 @@ class Exports:
         judged = False
         for number, peer in list(self._peers.items()):
             begins = peer.beginning
-            if not peer.news or (peer.ruled and judged):
+            if not peer.news or (peer.ruled and judged) or not ready(number):
                 continue
             if peer.ruled:
                 judged = True
@@ -377,13 +417,13 @@ class Exports:
         names = self._names.of(name)
         return names, not names.plain or self._policy.has_rules_for(name)
 
-    def link_down(self, peer: int) -> list[Action]:
-        """A peer is gone for good, and all its routes, suspended ones too."""
+    def link_down(self, peer: int, *, counting: bool = False) -> list[Action]:
+        """A peer is gone, and all its routes; ``counting``: suspended ones stay, for what it misses is counted."""
         actions: list[Action] = []
         gone = self._peers.pop(peer, None)
         for route, source in gone.routes.items() if gone is not None else ():
             actions += self._remove(source, peer, route)
-        return actions + self.unclaimed(peer)
+        return actions if counting else actions + self.unclaimed(peer)
 
     def unclaimed(self, peer: int) -> list[Action]:
         """A peer does not go on with its suspended routes."""
@@ -399,7 +439,9 @@ class Exports:
         Returns:
             What to do, and whether a reliable route waits for the peer: if none does, ``link_down`` it.
         """
-        actions: list[Action] = []
+        # What the peer had not asked for again yet waits anew.
+        again = [(one, flow.away[peer].contract) for one, flow in self._flows.items() if peer in flow.away]
+        actions: list[Action] = [SuspendRoute(one, peer, contract.outage) for one, contract in again]
         gone = self._peers.pop(peer, None)
         for number, source in gone.routes.items() if gone is not None else ():
             flow = self._flows.get(source)
@@ -409,11 +451,11 @@ class Exports:
                 continue
             del flow.routes[peer, number]
             flow.away[peer] = route
-            actions.append(SuspendRoute(source, peer))
+            actions.append(SuspendRoute(source, peer, route.contract.outage))
         return actions, self.waits_for(peer)
 
     def given_up(self, source: Source, peer: int) -> list[Action]:
-        """Nothing is kept any more of a suspended route."""
+        """A suspended route is not even counted any more."""
         flow = self._flows.get(source)
         if flow is None or flow.away.pop(peer, None) is None:
             return []
@@ -423,6 +465,22 @@ class Exports:
         """Whether a reliable route waits for a peer without a link."""
         return any(peer in flow.away for flow in self._flows.values())
 
+    def inherit(self, old: int, new: int) -> None:
+        """A module has another run: what the old one's routes carried is counted until the new one asks for them."""
+        for flow in self._flows.values():
+            if (route := flow.away.pop(old, None)) is not None:
+                flow.away[new] = route
+
+    def outage(self, peer: int) -> float:
+        """For how many seconds messages are kept for a peer without a link."""
+        return max(
+            (flow.away[peer].contract.outage for flow in self._flows.values() if peer in flow.away), default=0.0
+        )
+
+    def absent(self, source: Source) -> dict[int, Contract]:
+        """The peers whose suspended routes a source has, with what holds for each."""
+        return {p: route.contract for p, route in flow.away.items()} if (flow := self._flows.get(source)) else {}
+
     def opened(self, peer: int, message: Open) -> list[Action]:
         """A peer asks for a source."""
         routes = self._peers[peer].routes
@@ -430,8 +488,9 @@ class Exports:
             return [
                 Warn("route.doubled", str(peer), f"a peer opens route {message.route} twice; the second is ignored")
             ]
-        if len(routes) >= limits.ROUTES_PER_LINK_MAX:
-            return [Send(peer, Closed(message.route, f"more than {limits.ROUTES_PER_LINK_MAX} routes on one link"))]
+        if len(routes) >= self._most.topics:
+            text = f"more topics are open on one link than limits.topics = {self._most.topics} over there"
+            return [Send(peer, Closed(message.route, text))]
         source = self.local(peer, message.source)
         if source is None:
             text = f"{message.source}: not published here, or policy keeps it home"
@@ -442,7 +501,8 @@ class Exports:
             # One copy a peer: more would let it multiply what we send at will.
             return [Send(peer, Closed(message.route, f"{source} is open on another route of this link"))]
         routes[message.route] = source
-        route = self._route(message, source.topic, local, flow.away.pop(peer, None) if flow is not None else None)
+        away = flow.away.pop(peer, None) if flow is not None else None
+        route = self._route(message, source.topic, local, away)
         if flow is None:
             flow = self._flows[source] = _Flow(local.uri)
             flow.routes[peer, message.route] = route
@@ -454,19 +514,19 @@ class Exports:
 
     def _route(self, message: Open, topic: str, local: LocalSource, away: _Route | None) -> _Route:
         """The wish of a peer; it goes on where a suspended one was if it names that one's epoch."""
-        asked = message.contract
+        asked, named = message.contract, (message.epoch, message.after)
         contract = combine(self._contracts.of(topic, local.type), asked)
         if contract.reliability is not Reliability.RELIABLE:
-            return _Route(contract, asked)
+            return _Route(contract, asked, named=named)
         if away is not None and away.epoch == message.epoch and away.contract == contract:
             return _Route(contract, asked, epoch=away.epoch, after=message.after)
         self._epochs += 1
-        return _Route(contract, asked, epoch=self._epochs)
+        return _Route(contract, asked, epoch=self._epochs, named=named)
 
     def closed(self, peer: int, message: Close) -> list[Action]:
         """A peer wants no more of a route; one that is not open is none of our worry (it crossed ours)."""
         source = self._peers[peer].routes.pop(message.route, None)
-        return self._remove(source, peer, message.route) if source is not None else []
+        return self._remove(source, peer, message.route, wished=True) if source is not None else []
 
     def described(self, source: Source, description: Description) -> list[Action]:
         """The local publisher has answered with its header."""
@@ -490,17 +550,23 @@ class Exports:
             if route.contract.durability is Durability.TRANSIENT_LOCAL and not about.latching:
                 about = msgspec.structs.replace(about, latching=True)
             actions += [
-                Send(peer, Opened(number, about, route.contract, route.epoch)),
+                Send(peer, self._told(Opened(number, about, route.contract, route.epoch), source, peer, route)),
                 AddRoute(source, peer, number, route.contract, route.epoch, route.after),
             ]
         return actions
 
-    def _remove(self, source: Source, peer: int, route: int) -> list[Action]:
+    def _told(self, opened: Opened, source: Source, peer: int, route: _Route) -> Opened:
+        if route.after is not None:
+            return going_on(opened, self._kept.following(source, peer, route.after))
+        return beginning_anew(opened, self._kept.settle(source, peer, *route.named))
+
+    def _remove(self, source: Source, peer: int, route: int, *, wished: bool = False) -> list[Action]:
         flow = self._flows.get(source)
         if flow is None:
             return []
         gone = flow.routes.pop((peer, route), None)
-        actions: list[Action] = [RemoveRoute(source, peer, route)] if gone is not None and gone.live else []
+        live = gone is not None and gone.live
+        actions: list[Action] = [RemoveRoute(source, peer, route, wished=wished)] if live else []
         return actions + self._disconnect(source, flow)
 
     def _disconnect(self, source: Source, flow: _Flow) -> list[Action]:
@@ -528,11 +594,11 @@ class Exports:
         if flow is None:
             return []
         actions: list[Action] = []
-        actions += [RemoveRoute(source, peer, 0) for peer in flow.away]
+        actions += [RemoveRoute(source, peer, 0, over=True) for peer in flow.away]
         for (peer, number), route in flow.routes.items():
             self._peers[peer].routes.pop(number, None)
             if route.live:
-                actions.append(RemoveRoute(source, peer, number))
+                actions.append(RemoveRoute(source, peer, number, over=True))
             actions.append(Send(peer, Closed(number, reason)))
         if connected:
             actions.append(Disconnect(source))

@@ -18,18 +18,22 @@ A source is known by its wire name, as its peer has it; under which topic it sta
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field
 from enum import Enum, auto
 from heapq import heappop, heappush
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Final
 
+from msgspec import UnsetType
+
+from rmpa.bridge import bounds
 from rmpa.bridge.actions import Action, Describe, Detach, Publish, Retract, Send, Warn
 from rmpa.bridge.messages import Advertise, Close, Closed, Mismatch, Offer, Open, Opened, Source, is_crossing_name
 from rmpa.bridge.naming import Names, PeerNames
 from rmpa.bridge.relay import Linked, Ways
 from rmpa.core import limits
 from rmpa.core.backoff import Backoff
+from rmpa.core.config import LimitSettings
 from rmpa.core.config_param import CLOCK
 from rmpa.core.contract import Contract, Contracts, Reliability
 from rmpa.core.errors import LocalProtocolError
@@ -88,6 +92,7 @@ class Import:
         asked: What was last asked for.
         serial: Of the timer.
         origin: Whose it is, if its peer only passes it on.
+        crowded: Whether it is hidden because its node has no place here (``limits.nodes``).
     """
 
     type: str
@@ -106,6 +111,7 @@ class Import:
     asked: Contract | None = None
     serial: int = 0
     origin: Origin | None = None
+    crowded: bool = False
 
 
 def _nothing(_peer: int, _source: Source) -> None:
@@ -113,6 +119,7 @@ def _nothing(_peer: int, _source: Source) -> None:
 
 
 _NO_NAMES: Final = Names()
+_DEFAULT_LIMITS: Final = LimitSettings()
 _LISTENED: Final = frozenset({RouteState.OPENING, RouteState.OPEN, RouteState.WAITING})
 
 
@@ -123,12 +130,13 @@ class _Peer:
     Args:
         name: The peer's.
         names: How its names read here.
+        nodes: Which of its nodes stand here, and what waits for a place.
+        surplus: What it offers beyond ``limits.topics``.
         sources: What it offers.
         topics: The same by the topic here (dicts, for their order).
         places: What is in the local graph, by its topic and node there.
         routes: Those that were asked for or are open.
         next_route: The next one's id.
-        nodes: How many sources each of its nodes has.
         away: Whether it has no link, and may come back.
         silent: Whether its link fell silent before, for nobody closed it.
         doubtful: What it offered over its last link and has not offered again since.
@@ -137,12 +145,13 @@ class _Peer:
 
     name: str
     names: PeerNames
+    nodes: bounds.NodePlaces[Source]
+    surplus: bounds.Surplus[Offer]
     sources: dict[Source, Import] = field(default_factory=dict)
     topics: dict[str, dict[Source, None]] = field(default_factory=dict)
     places: dict[tuple[str, str], Source] = field(default_factory=dict)
     routes: dict[int, Source] = field(default_factory=dict)
     next_route: int = 1
-    nodes: Counter[str] = field(default_factory=Counter)
     away: bool = False
     silent: bool = False
     doubtful: set[Source] = field(default_factory=set)
@@ -158,6 +167,7 @@ class Imports:
         contracts: What our side asks for.
         position: ``(peer, source)``: epoch and last message of a reliable route that outlived its link, or ``None``.
         names: How the peers' names read here.
+        most: How much of one peer is taken.
     """
 
     def __init__(
@@ -167,8 +177,10 @@ class Imports:
         contracts: Contracts | None = None,
         position: Callable[[int, Source], tuple[int, int] | None] = _nothing,
         names: Names = _NO_NAMES,
+        most: LimitSettings = _DEFAULT_LIMITS,
     ) -> None:
         self._policy = policy
+        self._most = most
         self._names = names
         self._rng = rng
         self._contracts = contracts if contracts is not None else Contracts()
@@ -235,16 +247,44 @@ class Imports:
                     actions.append(Send(peer, Mismatch(source.topic, source.node, "", "")))
         return actions
 
-    def rules(self, policy: Policy, contracts: Contracts, names: Names, now: float) -> Iterator[list[Action]]:
+    def beyond(self, peer: int) -> bounds.Beyond:
+        """What a peer offers beyond ``limits.topics``."""
+        known = self._peers.get(peer)
+        return bounds.Beyond("topics", self._most.topics, len(known.surplus) if known is not None else 0)
+
+    def crowded(self, peer: int) -> Mapping[str, Collection[Source]]:
+        """The nodes of a peer that have no place here (``limits.nodes``), and their sources."""
+        return known.nodes.waiting if (known := self._peers.get(peer)) is not None else {}
+
+    def left_out(self) -> Iterator[tuple[int, str, Offer]]:
+        """What is beyond ``limits.topics``, as far as it is remembered: its peer, its topic here, and what it is."""
+        for peer, known in list(self._peers.items()):
+            for offer in list(known.surplus):
+                yield peer, self._names_of(known, offer.origin).local_name(offer.topic, offer.type), offer
+
+    def rules(
+        self, policy: Policy, contracts: Contracts, names: Names, now: float, most: LimitSettings = _DEFAULT_LIMITS
+    ) -> Iterator[list[Action]]:
         """Other rules hold from now on; what they leave as it is goes on untouched.
 
         Returns:
             What to do, source by source, as it is taken.
         """
-        self._policy, self._contracts, self._names = policy, contracts, names
+        self._policy, self._contracts, self._names, self._most = policy, contracts, names, most
         for known in self._peers.values():
             known.names = names.of(known.name)
-        return (self._rejudge(peer, source, now) for peer, source, _ in self)
+            known.nodes.bound(most.nodes)
+        return chain(
+            (self._rejudge(peer, source, now) for peer, source, _ in self),
+            (actions for peer in list(self._peers) for actions in self._admit(peer, now)),
+        )
+
+    def _admit(self, peer: int, now: float) -> Iterator[list[Action]]:
+        """Take in what was beyond ``limits.topics`` while there is room, one after the other."""
+        while (known := self._peers.get(peer)) is not None and len(known.sources) < self._most.topics:
+            if (offer := known.surplus.pop()) is None:
+                return
+            yield self._learn(peer, offer, now)
 
     def _rejudge(self, peer: int, source: Source, now: float) -> list[Action]:
         entry = self.get(peer, source)
@@ -260,7 +300,7 @@ class Imports:
             known.topics.setdefault(topic, {})[source] = None
         actions += self._show_or_hide(peer, source, entry)
         if entry.route and entry.asked != self._contracts.of(entry.topic, entry.type):
-            actions += self._close(peer, source, entry)
+            actions += self._close(peer, source, entry, missed=entry.wanted)
             actions += self._open(peer, source, entry, now) if entry.wanted else []
         return actions
 
@@ -272,7 +312,9 @@ class Imports:
             name: The peer's name, which its rules go by.
             who: Whose link it is: what relays offer of that module is not needed any more.
         """
-        known = self._peers.setdefault(peer, _Peer(name, self._names.of(name)))
+        places: bounds.NodePlaces[Source] = bounds.NodePlaces(self._most.nodes)
+        new = _Peer(name, self._names.of(name), places, bounds.Surplus(limits.SURPLUS_MAX))
+        known = self._peers.setdefault(peer, new)
         known.away = known.silent = False
         known.routes = {}
         known.next_route = 1
@@ -294,12 +336,16 @@ class Imports:
         known.away = True
         known.silent = known.silent or briefly
         known.routes = {}
+        if not briefly:
+            known.nodes.give_up()
+            known.surplus.clear()
         for source, entry in list(known.sources.items()):
             keep = briefly or _outlives(entry, silent=known.silent)
             if entry.route:
                 # Where nobody listens any more, nothing is to go on.
                 goes_on = keep and entry.state is not RouteState.LINGERING
-                actions.append(Detach(peer, source, entry.route, keep=goes_on))
+                missed = entry.wanted and entry.state is not RouteState.LINGERING
+                actions.append(Detach(peer, source, entry.route, keep=goes_on, missed=missed and not goes_on))
             entry.route = 0
             if keep:
                 self._suspend(peer, source, entry)
@@ -312,12 +358,21 @@ class Imports:
         known = self._peers[peer]
         return any(_outlives(entry, silent=known.silent) for entry in known.sources.values())
 
+    def outages(self, peer: int) -> set[float]:
+        """For how many seconds each source waits that stays when its peer is away."""
+        return {_outage(entry) for entry in self._peers[peer].sources.values()}
+
+    def outlasted(self, peer: int, seconds: float) -> list[Action]:
+        """A peer has been away for so long: what does not wait for longer leaves the local graph."""
+        gone = [one for one in self._peers[peer].sources.items() if _outage(one[1]) <= seconds]
+        return [action for source, entry in gone for action in self._drop(peer, source, entry)]
+
     def detached(self, peer: int) -> list[Action]:
         """A link is gone, and nothing waits for its peer: ``link_down`` follows. Costs what was open."""
         known = self._peers[peer]
         gone = [(source, entry) for source in known.routes.values() if (entry := known.sources[source]).route]
         known.routes = {}
-        return [Detach(peer, source, entry.route) for source, entry in gone]
+        return [Detach(peer, source, entry.route, missed=entry.wanted) for source, entry in gone]
 
     def _suspend(self, peer: int, source: Source, entry: Import) -> None:
         """Bring an entry into a state without a link."""
@@ -366,6 +421,7 @@ class Imports:
         removed = message.removed
         if message.full:
             known.doubtful = set(known.sources)
+            known.surplus.clear()
         known.doubtful.difference_update(offer.source for offer in message.added)
         if known.doubtful and not message.more:
             removed += tuple(sorted(known.doubtful))
@@ -382,12 +438,16 @@ class Imports:
         if message.full:
             offered = {offer.source for offer in message.added}
             removed += [source for source in known if source not in offered]
+            self._peers[peer].surplus.clear()
         actions: list[Action] = []
         for source in removed:
+            if source not in known:
+                self._peers[peer].surplus.discard(source)
             actions += self._forget(peer, source)
         for offer in message.added:
             actions += self._learn(peer, offer, now)
-        return actions
+        admitted = islice(self._admit(peer, now), limits.LEARNT_AT_ONCE)
+        return actions + [action for one in admitted for action in one]
 
     def opened(self, peer: int, message: Opened, now: float) -> list[Action]:
         """A route that we asked for is open; one that we closed meanwhile is ignored."""
@@ -406,7 +466,9 @@ class Imports:
         entry.description = message.description
         entry.contract = message.contract
         terms = (message.contract, message.epoch, message.first)
-        return [Describe(peer, source, message.route, message.description, *terms)]
+        following, lost = (None if isinstance(n, UnsetType) else n for n in (message.following, message.lost))
+        at_least = message.at_least is True
+        return [Describe(peer, source, message.route, message.description, *terms, following, lost, at_least)]
 
     def closed(self, peer: int, message: Closed, now: float) -> list[Action]:
         """The other side has no such route, or no longer."""
@@ -483,21 +545,10 @@ class Imports:
                 waits = entry.state is RouteState.WAITING and entry.timer is None
                 return self._open(peer, source, entry, now) if waits else []
             actions += self._forget(peer, source)
-        elif len(known) >= limits.TOPICS_PER_PEER_MAX:
-            return [
-                Warn("topics.too_many", str(peer), f"a peer offers more than {limits.TOPICS_PER_PEER_MAX} topics")
-            ]
-        nodes = self._peers[peer].nodes
-        if source.node not in nodes and len(nodes) >= limits.NODES_PER_PEER_MAX:
-            return [
-                Warn(
-                    "nodes.too_many",
-                    str(peer),
-                    f"a peer offers topics of more than {limits.NODES_PER_PEER_MAX} nodes; the rest stays hidden: "
-                    "deny some by bridge.deny over there",
-                )
-            ]
-        nodes[source.node] += 1
+        elif len(known) >= self._most.topics:
+            name = self._peers[peer].name
+            self._peers[peer].surplus.add(source, offer)
+            return [Warn("topics.too_many", name, bounds.warning(name, "topics", self._most.topics))]
         backoff = Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng)
         topic = self._names_of(self._peers[peer], offer.origin).local_name(source.topic, offer.type)
         entry = known[source] = Import(offer.type, topic, backoff, origin=offer.origin)
@@ -507,15 +558,26 @@ class Imports:
             if self.ways.learn(peer, offer.origin):
                 actions += self._ways_changed({offer.origin.instance})
         actions += self._show_or_hide(peer, source, entry)
+        if entry.crowded:
+            name = self._peers[peer].name
+            actions.append(Warn("nodes.too_many", name, bounds.warning(name, "nodes", self._most.nodes)))
         return actions + self._report_conflict(peer, source, entry)
 
     def _show_or_hide(self, peer: int, source: Source, entry: Import) -> list[Action]:
+        nodes = self._peers[peer].nodes
         entry.hidden, entry.conflict = self._why_hidden(peer, source, entry)
+        entry.crowded = not entry.hidden and not nodes.free(source.node)
+        if entry.crowded:
+            entry.hidden = f"{self._peers[peer].name} has more nodes than limits.nodes = {nodes.limit} of this module"
+            nodes.wait(source.node, source)
+        else:
+            nodes.leave(source.node, source)
         if entry.shown is not bool(entry.hidden):
             return []
         if entry.hidden:
             return self._hide(peer, source, entry)
         entry.shown = True
+        nodes.show(source.node)
         self._peers[peer].places[entry.topic, source.node] = source
         topic = entry.topic if entry.topic != source.topic else ""
         return [Publish(peer, source, entry.type, topic, entry.origin)]
@@ -529,6 +591,15 @@ class Imports:
         """A source has left the local graph: another one may have stood behind it."""
         known = self._peers[peer]
         del known.places[entry.topic, source.node]
+        known.nodes.hide(source.node)
+        actions = self._behind(peer, source, entry)
+        for sources in known.nodes.next_in():
+            actions += [a for s in sources for a in self._show_or_hide(peer, s, known.sources[s])]
+        return actions
+
+    def _behind(self, peer: int, source: Source, entry: Import) -> list[Action]:
+        """What may stand where a source stood."""
+        known = self._peers[peer]
         if entry.topic == CLOCK:
             entry.shown = False
             waiting = [(p, s) for p, k in self._peers.items() for s in k.topics.get(CLOCK, ()) if s != source]
@@ -600,14 +671,12 @@ class Imports:
     def _drop(self, peer: int, source: Source, entry: Import) -> list[Action]:
         known = self._peers[peer]
         actions: list[Action] = []
+        known.nodes.leave(source.node, source)
         if entry.shown:
             actions += [Retract(peer, source), *self._yield_place(peer, source, entry)]
         del known.sources[source]
         known.doubtful.discard(source)
         self._unlist(known, source, entry)
-        known.nodes[source.node] -= 1
-        if not known.nodes[source.node]:
-            del known.nodes[source.node]
         if entry.origin is not None:
             instance = entry.origin.instance
             del known.relayed[instance][source]
@@ -643,12 +712,12 @@ class Imports:
         epoch, after = self._position(peer, source) or (0, 0)
         return [Send(peer, Open(route, source.topic, source.node, contract, epoch, after))]
 
-    def _close(self, peer: int, source: Source, entry: Import) -> list[Action]:
+    def _close(self, peer: int, source: Source, entry: Import, *, missed: bool = False) -> list[Action]:
         """Leave a source alone, whatever its state."""
         actions: list[Action] = []
         if entry.route:
             self._peers[peer].routes.pop(entry.route, None)
-            actions += [Send(peer, Close(entry.route)), Detach(peer, source, entry.route)]
+            actions += [Send(peer, Close(entry.route)), Detach(peer, source, entry.route, missed=missed)]
         elif entry.state is RouteState.WAITING and entry.timer is None:
             actions.append(Detach(peer, source, 0))  # what waited for a new link to go on
         entry.route = 0
@@ -660,7 +729,8 @@ class Imports:
         return actions
 
     def _fail(self, peer: int, source: Source, entry: Import, reason: str, now: float) -> list[Action]:
-        actions: list[Action] = [Detach(peer, source, entry.route)]
+        missed = entry.wanted and entry.state is not RouteState.LINGERING
+        actions: list[Action] = [Detach(peer, source, entry.route, missed=missed)]
         entry.route = 0
         entry.problem = reason
         if entry.state is RouteState.LINGERING:
@@ -682,6 +752,13 @@ def _outlives(entry: Import, *, silent: bool) -> bool:
     if silent and entry.description is not None and entry.description.latching:
         return True
     return entry.contract is not None and entry.contract.reliability is Reliability.RELIABLE
+
+
+def _outage(entry: Import) -> float:
+    """For how many seconds a source stays that outlives its link: latched ones wait as by default."""
+    if entry.contract is not None and entry.contract.reliability is Reliability.RELIABLE:
+        return entry.contract.outage
+    return limits.RESUME_WINDOW
 
 
 def _gone(peer: int, sources: dict[Source, Import]) -> Iterator[Action]:

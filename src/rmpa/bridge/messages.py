@@ -153,6 +153,10 @@ class Opened(msgspec.Struct, frozen=True, tag_field="op", tag="opened"):
         contract: What holds for the route: the stronger of both sides' words.
         epoch: Names the numbering of a reliable route, else 0.
         first: The numbering's first sequence.
+        following: Where a reliable route goes on: the sequence of the next message that will come.
+        lost: Where it begins anew: messages of the numberings before this one that the receiver never got and does
+            not know of; left out where that is not known.
+        at_least: Whether more than these may be lost; left out: no.
     """
 
     route: int
@@ -160,6 +164,9 @@ class Opened(msgspec.Struct, frozen=True, tag_field="op", tag="opened"):
     contract: Contract = Contract()
     epoch: int = 0
     first: int = 1
+    following: int | msgspec.UnsetType = msgspec.UNSET
+    lost: int | msgspec.UnsetType = msgspec.UNSET
+    at_least: bool | msgspec.UnsetType = msgspec.UNSET
 
 
 class Close(msgspec.Struct, frozen=True, tag_field="op", tag="close"):
@@ -376,8 +383,8 @@ def _validate(message: Message) -> None:
 
 
 def _validate_advertise(message: Advertise) -> None:
-    if len(message.added) > limits.TOPICS_PER_PEER_MAX:
-        raise LimitExceeded("advertisement (in topics)", len(message.added), limits.TOPICS_PER_PEER_MAX)
+    if len(message.added) > limits.ADVERTISED_MAX:
+        raise LimitExceeded("advertisement (in topics)", len(message.added), limits.ADVERTISED_MAX)
     for offer in message.added:
         _check_names(offer.topic, offer.node)
         if not is_crossing_type(offer.type):
@@ -424,8 +431,8 @@ def _validate_route(message: RouteMessage) -> None:
 
 def _validate_service(message: ServiceMessage) -> None:
     if isinstance(message, AdvertiseServices):
-        if len(message.added) > limits.SERVICES_PER_PEER_MAX:
-            raise LimitExceeded("advertisement (in services)", len(message.added), limits.SERVICES_PER_PEER_MAX)
+        if len(message.added) > limits.ADVERTISED_MAX:
+            raise LimitExceeded("advertisement (in services)", len(message.added), limits.ADVERTISED_MAX)
         for offer in message.added:
             _check_names(offer.service, offer.node)
             if offer.origin is not None:
@@ -466,7 +473,9 @@ def _validate_agent(message: AgentMessage) -> None:
 def _check_terms(message: Open | Opened) -> None:
     """A contract that a peer sends must be one that our own file could have."""
     contract = message.contract
-    numbers = (message.epoch, message.after if isinstance(message, Open) else message.first)
+    numbers = [message.epoch, message.after if isinstance(message, Open) else message.first]
+    if isinstance(message, Opened):
+        numbers += [n for n in (message.following, message.lost) if not isinstance(n, msgspec.UnsetType)]
     times = (contract.deadline, contract.lifespan, contract.liveliness_lease)
     lowest, highest = limits.CONTRACT_TIME_MIN, limits.CONTRACT_TIME_MAX
     lowest_rate = limits.CONTRACT_RATE_MIN
@@ -476,6 +485,8 @@ def _check_terms(message: Open | Opened) -> None:
         problem = f"times of {times} seconds"
     elif contract.max_rate is not None and not lowest_rate <= contract.max_rate <= limits.CONTRACT_RATE_MAX:
         problem = f"a rate of {contract.max_rate}"
+    elif not limits.OUTAGE_MIN <= contract.outage <= limits.OUTAGE_MAX:
+        problem = f"an outage of {contract.outage} seconds"
     elif any(not 0 <= number <= _ROUTE_MAX for number in numbers):
         problem = f"the numbers {numbers}"
     else:

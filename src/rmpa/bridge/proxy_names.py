@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from rmpa.bridge.policy import OWN_NODE
 
@@ -10,10 +10,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
     from rmpa.core.identity import Identity
-
-
-LOOPBACK: Final = "127.0.0.1"
-"""Where proxies listen: only nodes of this module may reach them."""
 
 
 def proxy_prefix(peer: Identity, taken: Collection[str]) -> str:

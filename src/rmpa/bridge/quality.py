@@ -1,6 +1,8 @@
 """How well one remote source arrives: periods, one-way latency and sizes, from rings of fixed size.
 
-The data path only notes three numbers a message; everything else is worked out when somebody asks.
+The data path only notes three numbers a message; everything else is worked out when somebody asks. At thousands of
+messages a second the ring holds some milliseconds, which tell the rate of one burst and not of the source; so each
+turn of the ring leaves a mark (time, messages, bytes), and rate and bandwidth are counted from a mark a second ago.
 """
 
 from __future__ import annotations
@@ -8,9 +10,10 @@ from __future__ import annotations
 import math
 from array import array
 from bisect import bisect_left, bisect_right
+from collections import deque
 from dataclasses import dataclass
 from operator import sub
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from rmpa.core import limits
 from rmpa.core.stats import Summary
@@ -19,7 +22,17 @@ if TYPE_CHECKING:
     from rmpa.bridge.peer_clock import PeerClock
 
 _NS: Final = 1e-9
+_MARKS: Final = 16
+"""Marks in the time that a rate is counted over."""
 _Number = TypeVar("_Number", int, float)
+
+
+class _Mark(NamedTuple):
+    """When a message came, and how many messages and bytes had come with it."""
+
+    time: float
+    messages: int
+    bytes: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +46,8 @@ class QualitySummary:
         latency_error: The true latencies lie within ± this.
         period: Between messages.
         jitter: The period's 99th percentile less its median; ``nan`` before the third message.
-        rate: Messages a second; a silence longer than every period counts, so the rate of a dead source falls.
+        rate: Messages a second, over what the ring holds and at least over the last second; a silence longer than
+            every period counts, so the rate of a dead source falls.
         bandwidth: Bytes a second, over the same time.
         age: Since the last message; ``None`` if none came.
         messages: Ever.
@@ -62,19 +76,25 @@ class Quality:
         ValueError: ``window`` is not one.
     """
 
-    __slots__ = ("_delays", "_mask", "_sizes", "_times", "bytes", "messages")
+    __slots__ = ("_before", "_delays", "_marks", "_sizes", "_slot", "_times", "bytes")
 
     def __init__(self, window: int = limits.QUALITY_WINDOW) -> None:
         if window < 2 or window & (window - 1):
             raise ValueError(f"the window must be a power of two from 2 on, not {window}")
-        self._mask = window - 1  # a bit mask is the cheapest way round a ring
+        self._slot = 0
+        self._before = 0  # messages of all turns of the ring before this one
+        # Where turns began, oldest first, at most one in a part of the span that they are for.
+        self._marks: deque[_Mark] = deque(maxlen=_MARKS + 2)
         self._times = array("d", bytes(8 * window))
         self._delays = array("d", bytes(8 * window))
         self._sizes = array("I", bytes(4 * window))
-        self.messages = 0
-        """Ever arrived."""
         self.bytes = 0
-        """In all of them."""
+        """In all messages that ever arrived."""
+
+    @property
+    def messages(self) -> int:
+        """Ever arrived."""
+        return self._before + self._slot
 
     def arrived(self, now: float, wall_ns: int, stamp_ns: int, size: int) -> None:
         """Note one message.
@@ -85,18 +105,33 @@ class Quality:
             stamp_ns: The other agent's wall clock when the message came from its publisher.
             size: Bytes, below 4 GiB.
         """
-        number = self.messages
-        slot = number & self._mask
-        self._times[slot] = now
+        slot = self._slot
+        try:
+            self._times[slot] = now
+        except IndexError:  # costs nothing until it happens, once a turn
+            slot = self._turn(now)
         self._delays[slot] = wall_ns - stamp_ns
         self._sizes[slot] = size
-        self.messages = number + 1
+        self._slot = slot + 1
         self.bytes += size
+
+    def _turn(self, now: float) -> int:
+        """Go round: note where the count stands, and begin at the first slot again."""
+        window = len(self._times)
+        if not self._marks:
+            self._marks.append(_Mark(self._times[0], 1, self._sizes[0]))  # the very first message
+        self._before += window
+        if now - self._marks[-1].time >= limits.QUALITY_RATE_SPAN / _MARKS:
+            # Of the last message of the turn, whose size is in the count.
+            self._marks.append(_Mark(self._times[-1], self._before, self.bytes))
+        self._times[0] = now
+        self._slot = 0
+        return 0
 
     @property
     def last(self) -> float | None:
         """When the last message came, in monotonic seconds; ``None`` if none did."""
-        return self._times[self.messages - 1 & self._mask] if self.messages else None
+        return self._times[self._slot - 1] if self.messages else None
 
     def summary(self, clock: PeerClock | None, now: float, *, latching: bool = False) -> QualitySummary:
         """What the messages of the last ``limits.QUALITY_SPAN`` say, as far as the ring remembers them.
@@ -110,10 +145,9 @@ class Quality:
         periods = list(map(sub, times[1:], times))
         period = Summary.of(periods)
         silence = now - times[-1] if times else 0.0
-        elapsed = times[-1] - times[0] if len(times) > 1 else 0.0
-        if periods and silence > period.maximum:
+        count, size, elapsed = self._counted(times, now)
+        if periods and silence > max(period.maximum, limits.QUALITY_SILENCE):
             elapsed += silence
-        sizes = self._latest(self._sizes, len(periods))
         latencies, error = self._latencies(times, clock, latching=latching) if clock is not None else ([], 0.0)
         return QualitySummary(
             latency=Summary.of(latencies) if latencies else None,
@@ -121,12 +155,24 @@ class Quality:
             latency_error=error if latencies else None,
             period=period,
             jitter=period.p99 - period.p50 if period.count > 1 else math.nan,
-            rate=len(periods) / elapsed if elapsed > 0 else math.nan,
-            bandwidth=sum(sizes) / elapsed if elapsed > 0 else math.nan,
+            rate=count / elapsed if elapsed > 0 else math.nan,
+            bandwidth=size / elapsed if elapsed > 0 else math.nan,
             age=silence if times else None,
             messages=self.messages,
             bytes=self.bytes,
         )
+
+    def _counted(self, times: array[float], now: float) -> tuple[int, int, float]:
+        """Messages, bytes and seconds that rate and bandwidth are made of; the first message begins the time."""
+        if len(times) < 2:
+            return 0, 0, 0.0
+        last, span = times[-1], limits.QUALITY_RATE_SPAN
+        if last - times[0] < span and now - last < span:
+            near = [mark for mark in self._marks if last - 2 * span <= mark.time < times[0]]
+            mark = next((mark for mark in reversed(near) if mark.time <= last - span), near[0] if near else None)
+            if mark is not None:
+                return self.messages - mark.messages, self.bytes - mark.bytes, last - mark.time
+        return len(times) - 1, sum(self._latest(self._sizes, len(times) - 1)), last - times[0]
 
     def _recent(self, now: float) -> array[float]:
         """When the messages of the span came, oldest first; the last one in any case."""
@@ -163,7 +209,7 @@ class Quality:
     def _latest(self, ring: array[_Number], count: int) -> array[_Number]:
         """The last ``count`` samples of a ring, oldest first."""
         count = min(count, self.messages, len(ring))
-        end = self.messages & self._mask
+        end = self._slot
         if count <= end:
             return ring[end - count : end]
         return ring[end - count :] + ring[:end]

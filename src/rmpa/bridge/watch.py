@@ -29,6 +29,7 @@ class Kind(StrEnum):
     LIVELINESS_LOST = "liveliness_lost"
     LIVELINESS_RESTORED = "liveliness_restored"
     MESSAGES_LOST = "messages_lost"
+    LOSS_UNKNOWN = "loss_unknown"
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,10 +98,14 @@ class Watch:
         """``count`` messages (at least one) never came, as the gap in their numbers shows."""
         return self._happened(Kind.MESSAGES_LOST, count, lambda sum_: f"{_messages(sum_)} lost", now)
 
+    def lost_unknown(self, why: str, now: float) -> Occurred:
+        """Messages may have been lost, and no agent knows how many."""
+        return self._happened(Kind.LOSS_UNKNOWN, 1, lambda _: f"messages may be lost, not counted: {why}", now)
+
     def expired(self, count: int, now: float) -> Occurred:
         """``count`` messages (at least one) were dropped beyond their lifespan."""
         lifespan = self._contract.lifespan
-        beyond = "beyond the lifespan" + ("" if lifespan is None else f" of {_shown(lifespan)}")
+        beyond = "beyond the lifespan" + ("" if lifespan is None else f" of {shown_seconds(lifespan)}")
         return self._happened(Kind.LIFESPAN_EXPIRED, count, lambda sum_: f"{_messages(sum_)} {beyond}", now)
 
     def link_down(self, now: float) -> None:
@@ -153,7 +158,7 @@ class Watch:
         self._due = self._seen + (self._missed + 1) * deadline
         if self._due <= now:  # rounded down above: a timer in the past would be handled for ever
             self._due = math.nextafter(now, math.inf)
-        text = f"no message for {_shown(now - self._seen)}; deadline {_shown(deadline)}"
+        text = f"no message for {shown_seconds(now - self._seen)}; deadline {shown_seconds(deadline)}"
         return self._happened(Kind.DEADLINE_MISSED, count, lambda _: text, now, goes_on=goes_on)
 
     def _silent_since(self) -> float | None:
@@ -181,13 +186,13 @@ class Watch:
                 return None
             self._lost_since, self._silent_at_loss = now, silent
             sign = "message" if self._contract.liveliness is Liveliness.MANUAL_BY_TOPIC else "link"
-            text = f"no {sign} for {_shown(now - silent)}; lease {_shown(lease)}"
+            text = f"no {sign} for {shown_seconds(now - silent)}; lease {shown_seconds(lease)}"
             return self._happened(Kind.LIVELINESS_LOST, 1, lambda _: text, now)
         if silent_too_long:
             self._silent_at_loss = silent
         if silent == self._silent_at_loss:
             return None
-        text = f"alive again after {_shown(now - self._lost_since)}"
+        text = f"alive again after {shown_seconds(now - self._lost_since)}"
         self._lost_since = None
         return self._happened(Kind.LIVELINESS_RESTORED, 1, lambda _: text, now)
 
@@ -212,7 +217,8 @@ def _messages(count: int) -> str:
     return "1 message" if count == 1 else f"{count} messages"
 
 
-def _shown(seconds: float) -> str:
+def shown_seconds(seconds: float) -> str:
+    """A duration to read: ``200 ms``, ``12.5 s``."""
     if seconds < 1:
         return f"{round(seconds * 1e3, 1):g} ms"
     return f"{round(seconds, 2):.10g} s"

@@ -20,6 +20,7 @@ from rmpa.cli.stream import run_stream, with_node
 from rmpa.core.errors import RmpaError
 from rmpa.resource.descriptor import TOPIC
 from rmpa.ros.diagnostic_array import ARRAY_TYPE, Level
+from rmpa.ros.messages import MessageType
 
 if TYPE_CHECKING:
     from rmpa.cli.master import Master
@@ -130,7 +131,7 @@ async def _keep_looking(node: Node, master: Master, printer: _Printer) -> None:
                 )
                 if resource and (printer.only is None or path == printer.only.path):
                     known.add(topic)
-                    await node.subscribe(topic, ARRAY_TYPE, functools.partial(printer.take, path))
+                    await node.subscribe(topic, MessageType(ARRAY_TYPE), functools.partial(printer.take, path))
         if not known and not printer.told:
             printer.told = True
             click.echo("! there is no resource yet; waiting", err=True)

@@ -37,29 +37,47 @@ def _default_port() -> int:
     "--host", default="127.0.0.1", show_default=True, help="Address to listen at; 0.0.0.0 opens it to the network."
 )
 @click.option("--advertise", default="", metavar="NAME", help="Host name or address to tell nodes, if not --host.")
+@click.option(
+    "--fresh",
+    is_flag=True,
+    help="Begin empty, as roscore does, without nodes and parameters of the run before.",
+)
 @click.option("-v", "--verbose", is_flag=True, help="Log every registration.")
 @click.option("--debug", is_flag=True, help="Log every call.")
-def core(port: int | None, host: str, advertise: str, verbose: bool, debug: bool) -> None:
+def core(port: int | None, host: str, advertise: str, fresh: bool, verbose: bool, debug: bool) -> None:
     """Run a ROS core: master, parameter server and /rosout, as roscore does."""
+    from rmpa.core.aio.descriptors import raise_file_limit
+
     level = logging.DEBUG if debug else logging.INFO if verbose else logging.WARNING
     logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(name)s %(message)s")
-    asyncio.run(_run(host, _default_port() if port is None else port, advertise))
+    raise_file_limit()
+    asyncio.run(_run(host, _default_port() if port is None else port, advertise, fresh=fresh))
 
 
-async def _run(host: str, port: int, advertise: str) -> None:
+async def _run(host: str, port: int, advertise: str, *, fresh: bool) -> None:
     from rmpa import __version__
+    from rmpa.core.aio.state_dir import core_file
     from rmpa.ros.aio.core import ROS_VERSION, RosCore
 
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, ended.set)
-    core = RosCore(host, port, advertised_host=advertise, on_shutdown=lambda _: ended.set())
+    core = RosCore(
+        host,
+        port,
+        advertised_host=advertise,
+        on_shutdown=lambda _: ended.set(),
+        state=core_file(os.environ, port),
+        fresh=fresh,
+    )
     await core.start()
     click.echo(f"rmpa core {__version__}, in place of ros_comm {ROS_VERSION.strip()}")
     click.echo(f"ROS_MASTER_URI={core.uri}")
     click.echo(f"setting /run_id to {core.call('getParam', '/rmpa_core', '/run_id').value}")
     click.echo("started core service [/rosout]")
+    if core.memory is not None and (text := core.memory.beginning()):
+        click.echo(text)
     sys.stdout.flush()
     await ended.wait()
     click.echo("shutting down")

@@ -2,12 +2,16 @@
 
 Exit codes: 0 done; 1 it could not be done, and why is on stderr; 2 it was asked in a way that cannot be
 (a flag, a variable, a line of ``rmpa.toml``); 130 and 141 as shells have them for Ctrl-C and a closed pipe.
+
+With ``--json`` an error is also one JSON object on stdout, ``{"error": text}``, so that a program that reads stdout
+never finds it empty.
 """
 
 from __future__ import annotations
 
 import os
 import sys
+from itertools import takewhile
 from typing import TYPE_CHECKING
 
 import click
@@ -26,6 +30,7 @@ COMMANDS = {
     "peer": ("rmpa.cli.peer", "See the peers that the agent knows."),
     "topic": ("rmpa.cli.topic", "See topics, listen to them, publish on them."),
     "service": ("rmpa.cli.service", "See services, and call them."),
+    "node": ("rmpa.cli.node", "See nodes, here and in other modules; ping and end them."),
     "param": ("rmpa.cli.param", "See and set parameters, here or at a peer."),
     "resource": ("rmpa.cli.resource", "See Smart Resources, here or at a peer."),
     "profile": ("rmpa.cli.profile", "See and choose the System Profile of a resource."),
@@ -81,16 +86,28 @@ def _run(arguments: Sequence[str] | None) -> int:
         code = cli.main(args=arguments, prog_name="rmpa", standalone_mode=False)
     except click.ClickException as error:
         error.show()
-        return error.exit_code
+        return _failed(arguments, error.format_message(), error.exit_code)
     except (click.Abort, KeyboardInterrupt):
         return 130
-    except ConfigError as error:
-        click.echo(f"rmpa: {error}", err=True)
-        return 2
     except RmpaError as error:
         click.echo(f"rmpa: {error}", err=True)
-        return 1
+        return _failed(arguments, str(error), 2 if isinstance(error, ConfigError) else 1)
     return code if isinstance(code, int) else 0
+
+
+def _failed(arguments: Sequence[str] | None, text: str, code: int) -> int:
+    """Say an error in JSON too, where JSON was asked for; return the exit code."""
+    if wants_json(sys.argv[1:] if arguments is None else arguments):
+        from rmpa.cli.output import print_json  # it brings msgspec, which --help does without
+
+        print_json({"error": text}, flush=True)
+    return code
+
+
+def wants_json(arguments: Sequence[str]) -> bool:
+    """Whether a command line has ``--json``: it may have failed before click had read it."""
+    options = takewhile(lambda argument: argument != "--", arguments)
+    return "--json" in options
 
 
 if __name__ == "__main__":

@@ -53,8 +53,9 @@ def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]], *, col
     if sys.stdout.isatty():
         _print_rich(columns, rows, colours)
         return
+    width = widths(columns, rows)  # once: a peer may have ten thousand topics
     for row in ([column.title for column in columns], *rows):
-        sys.stdout.write(align(columns, row, widths(columns, rows)) + "\n")
+        sys.stdout.write(align(columns, row, width) + "\n")
 
 
 def widths(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> list[int]:

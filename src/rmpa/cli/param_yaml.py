@@ -1,70 +1,25 @@
-"""Parameters as YAML, read and written as rosparam does: YAML 1.1 by PyYAML's rules, with angles and binary data."""
+"""Parameters as YAML, read and written by PyYAML as rosparam does, with its angles; errors name the place."""
 
 from __future__ import annotations
 
 import ast
-import io
 import math
 import operator
 import re
 from datetime import date, datetime
 from typing import TYPE_CHECKING, Any, Final
 
-from ruamel.yaml import YAML
-from ruamel.yaml.constructor import SafeConstructor
-from ruamel.yaml.emitter import Emitter
-from ruamel.yaml.error import YAMLError
-from ruamel.yaml.representer import SafeRepresenter
-from ruamel.yaml.resolver import VersionedResolver
+import yaml
 
 from rmpa.core import limits
 from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterator
 
     from rmpa.ros.xmlrpc import XmlRpcValue
 
 _INT_MAX: Final = (1 << 31) - 1
-_CORE: Final = "tag:yaml.org,2002:"
-# PyYAML's own rules (yaml/resolver.py) and rosparam's for angles: by the first characters, then by the whole.
-_RULES: Final = (
-    (
-        f"{_CORE}bool",
-        "yYnNtTfFoO",
-        r"(?:yes|Yes|YES|no|No|NO|true|True|TRUE|false|False|FALSE|on|On|ON|off|Off|OFF)",
-    ),
-    (
-        f"{_CORE}float",
-        "-+0123456789.",
-        (
-            r"(?:[-+]?(?:[0-9][0-9_]*)\.[0-9_]*(?:[eE][-+][0-9]+)?|\.[0-9][0-9_]*(?:[eE][-+][0-9]+)?"
-            r"|[-+]?[0-9][0-9_]*(?::[0-5]?[0-9])+\.[0-9_]*|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))"
-        ),
-    ),
-    (
-        f"{_CORE}int",
-        "-+0123456789",
-        (
-            r"(?:[-+]?0b[0-1_]+|[-+]?0[0-7_]+|[-+]?(?:0|[1-9][0-9_]*)|[-+]?0x[0-9a-fA-F_]+"
-            r"|[-+]?[1-9][0-9_]*(?::[0-5]?[0-9])+)"
-        ),
-    ),
-    (f"{_CORE}merge", "<", r"<<"),
-    (f"{_CORE}null", "~nN\0", r"(?:~|null|Null|NULL|)"),
-    (
-        f"{_CORE}timestamp",
-        "0123456789",
-        (
-            r"(?:[0-9]{4}-[0-9]{2}-[0-9]{2}|[0-9]{4}-[0-9]{1,2}-[0-9]{1,2}(?:[Tt]|[ \t]+)[0-9]{1,2}:[0-9]{2}:[0-9]{2}"
-            r"(?:\.[0-9]*)?(?:[ \t]*(?:Z|[-+][0-9]{1,2}(?::[0-9]{2})?))?)"
-        ),
-    ),
-    ("!degrees", "d", r"deg\([^)]*\)"),
-    ("!radians", "r", r"rad\([^)]*\)"),
-)
-_SAFE: Final = r"[ !#-\[\]-~]"
-"""What stands between double quotes as it is."""
 _OPERATORS: Final[dict[type[ast.AST], Callable[..., float]]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
@@ -75,50 +30,61 @@ _OPERATORS: Final[dict[type[ast.AST], Callable[..., float]]] = {
 }
 
 
-_Table = dict[str | None, list[tuple[str, re.Pattern[str]]]]
+class _Loader(yaml.SafeLoader):
+    """PyYAML's safe loader with rosparam's angles: ``deg(90)``, ``rad(pi/2)``, ``!degrees 90``, ``!radians pi/2``.
+
+    A key that stands twice in one mapping is an error: PyYAML would drop the first value without a word.
+    """
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """The mapping's values by key.
+
+        Raises:
+            yaml.constructor.ConstructorError: A key stands twice; with its place.
+        """
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
+                if key.value in seen:
+                    problem = f"found duplicate key {key.value!r}"
+                    raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
 
 
-def _table(rules: Iterable[tuple[str, str, str]]) -> _Table:
-    found: _Table = {}
-    for tag, firsts, pattern in rules:
-        for first in firsts:
-            found.setdefault("" if first == "\0" else first, []).append((tag, re.compile(rf"{pattern}\Z")))
-    return found
+class _Dumper(yaml.SafeDumper):
+    """Writes no anchors: two equal lists are two lists in the parameter server."""
+
+    def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002 - PyYAML's signature
+        """Whether each value is written in full."""
+        return True
 
 
-class _Resolver(VersionedResolver):
-    """Finds the type of what stands without quotes as PyYAML does, whatever the version."""
-
-    rules = _table(_RULES)
-
-    @property
-    def versioned_resolver(self) -> _Table:
-        """The types by the first character."""
-        return self.rules
+def _construct_value(loader: _Loader, node: yaml.ScalarNode) -> str:
+    """A lone ``=``, for which PyYAML has a type and no value: the text."""
+    return str(loader.construct_scalar(node))
 
 
-class _WritingResolver(_Resolver):
-    """With what a reader other than ours would not take for a string."""
+def _construct_angle(loader: _Loader, node: yaml.ScalarNode) -> float:
+    """The angle in radians.
 
-    rules = _table((*_RULES, (f"{_CORE}value", "=", "=")))
-
-
-class _Constructor(SafeConstructor):
-    """With rosparam's angles."""
-
-    def construct_angle(self, node: Any) -> float:
-        """``deg(90)``, ``rad(pi/2)``, ``!degrees 90`` or ``!radians pi/2`` in radians."""
-        text = str(self.construct_scalar(node)).strip()
-        inner = re.sub(r"^(?:deg|rad)\((.*)\)$", r"\1", text)
-        try:
-            angle = _calculate(ast.parse(inner.strip(), mode="eval").body)
-        except (SyntaxError, ValueError, ZeroDivisionError, OverflowError, RecursionError, MemoryError):
-            raise YAMLError(f"{text!r} is not an angle: one looks like deg(90) or rad(pi/2)") from None
-        return math.radians(angle) if node.tag == "!degrees" else angle
+    Raises:
+        yaml.constructor.ConstructorError: The text is no angle; with its place.
+    """
+    text = str(loader.construct_scalar(node)).strip()
+    inner = re.sub(r"^(?:deg|rad)\((.*)\)$", r"\1", text)
+    try:
+        angle = _calculate(ast.parse(inner.strip(), mode="eval").body)
+    except (SyntaxError, ValueError, ZeroDivisionError, OverflowError, RecursionError, MemoryError):
+        problem = f"{text!r} is not an angle: one looks like deg(90) or rad(pi/2)"
+        raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
+    return math.radians(angle) if node.tag == "!degrees" else angle
 
 
-_Constructor.add_constructor("!degrees", _Constructor.construct_angle)
-_Constructor.add_constructor("!radians", _Constructor.construct_angle)
+_Loader.add_constructor("tag:yaml.org,2002:value", _construct_value)
+for _tag, _first, _pattern in (("!degrees", "d", r"^deg\([^)]*\)$"), ("!radians", "r", r"^rad\([^)]*\)$")):
+    _Loader.add_constructor(_tag, _construct_angle)
+    _Loader.add_implicit_resolver(_tag, re.compile(_pattern), [_first])
 
 
 def _calculate(node: ast.AST) -> float:
@@ -133,111 +99,6 @@ def _calculate(node: ast.AST) -> float:
         case ast.BinOp(left=left, op=sign, right=right) if type(sign) in _OPERATORS:
             return _OPERATORS[type(sign)](_calculate(left), _calculate(right))
     raise ValueError("not a number")
-
-
-class _Representer(SafeRepresenter):
-    """Writes no anchors: two lists that are equal are two lists."""
-
-    def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002 - ruamel's signature
-        """Whether each is written in full."""
-        return True
-
-    def represent_float(self, data: Any) -> Any:
-        """YAML 1.1 wants a point before the exponent."""
-        text = repr(data).lower()
-        if "e" not in text or "." in text:
-            return super().represent_float(data)
-        return self.represent_scalar(f"{_CORE}float", text.replace("e", ".0e"))
-
-
-_Representer.add_representer(float, _Representer.represent_float)
-
-
-def _safe(character: str) -> bool:
-    return re.fullmatch(_SAFE, character) is not None
-
-
-def _escape(character: str) -> str:
-    """As PyYAML writes it between double quotes."""
-    short = Emitter.ESCAPE_REPLACEMENTS.get(character)
-    if short is not None:
-        return f"\\{short}"
-    code = ord(character)
-    return f"\\x{code:02X}" if code < 0x100 else f"\\u{code:04X}" if code < 0x10000 else f"\\U{code:08X}"
-
-
-class _Emitter(Emitter):
-    """Chooses quotes and indents as PyYAML does."""
-
-    def increase_indent(self, flow: bool = False, sequence: bool | None = None, indentless: bool = False) -> None:
-        """Lines of a lone string are indented too."""
-        top = self.indent is None
-        super().increase_indent(flow, sequence, indentless)
-        if top and flow:
-            self.indent = self.best_map_indent
-
-    def write_plain(self, text: Any, split: Any = True) -> None:
-        """Broken at a single space, once the line is long enough."""
-        if self.root_context:
-            self.open_ended = True
-        if text and not self.whitespace:
-            self._put(" ")
-        self.whitespace = self.indention = False
-        for piece in re.split("( +)", text):
-            if piece == " " and self.column > self.best_width and split:
-                self.write_indent()
-                self.whitespace = self.indention = False
-            else:
-                self._put(piece)
-
-    def write_double_quoted(self, text: Any, split: Any = True) -> None:
-        """Broken before a space or behind what is escaped; ruamel's own breaks would bring spaces in."""
-        self.write_indicator('"', True)
-        last = len(text) - 1
-        for piece in re.finditer(rf"{_SAFE}+|(.)", text, re.DOTALL):
-            if piece[1]:
-                self._put(_escape(piece[1]))
-                rest = piece.end()
-                far = self.column - self.best_width
-                if split and ((far > 1 and 1 < rest <= last) or (far > 0 and rest < last and _safe(text[rest]))):
-                    self._break(text, rest)
-                continue
-            begin = piece.start()
-            for space in re.finditer(" ", piece[0]):
-                at = piece.start() + space.start()
-                if split and 0 < at < last and self.column + at - begin > self.best_width:
-                    self._put(text[begin:at])
-                    self._break(text, at)
-                    begin = at
-            self._put(text[begin : piece.end()])
-        self.write_indicator('"', False)
-
-    def _break(self, text: str, rest: int) -> None:
-        self._put("\\")
-        self.write_indent()
-        self.whitespace = self.indention = False
-        if text[rest] == " ":
-            self._put("\\")
-
-    def _put(self, data: str) -> None:
-        self.column += len(data)
-        self.stream.write(data.encode(self.encoding) if self.encoding else data)
-
-    def choose_scalar_style(self) -> Any:
-        """Without quotes where possible, then single ones, then double ones."""
-        event, about = self.event, self.analysis or self.analyze_scalar(self.event.value)
-        self.analysis = about
-        if event.style == '"':
-            return '"'
-        plain = about.allow_flow_plain if self.flow_level else about.allow_block_plain
-        lone_key = self.simple_key_context and (about.empty or about.multiline)
-        if not event.style and event.implicit[0] and plain and not lone_key:
-            return ""
-        if event.style == "|" and not self.flow_level and not self.simple_key_context and about.allow_block:
-            return "|"
-        if about.allow_single_quoted and not (self.simple_key_context and about.multiline):
-            return "'"
-        return '"'
 
 
 def read_yaml(text: str, where: str) -> XmlRpcValue:
@@ -255,13 +116,12 @@ def read_documents(text: str, where: str) -> list[XmlRpcValue]:
     Raises:
         RmpaError: As for ``read_yaml``.
     """
-    if len(text) > limits.PARAM_TEXT_MAX:
-        raise RmpaError(f"{where}: {len(text)} characters; a parameter may have {limits.PARAM_TEXT_MAX}")
-    yaml = YAML(typ="safe", pure=True)
-    yaml.Resolver, yaml.Constructor, yaml.version = _Resolver, _Constructor, (1, 1)
+    if len(text) > limits.HTTP_BODY_MAX:
+        bound = f"{limits.HTTP_BODY_MAX} ({limits.HTTP_BODY_MAX >> 20} MiB)"
+        raise RmpaError(f"{where}: {len(text)} characters, above the {bound} that a core takes at once; split it")
     try:
-        documents = list(yaml.load_all(text))
-    except (YAMLError, ValueError, RecursionError) as error:
+        documents = list(yaml.load_all(text, _Loader))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise RmpaError(f"{where}{_place(error)}: not YAML: {_problem(error)}") from None
     for document in documents:
         for key, problem in _unsayable(document):
@@ -312,23 +172,9 @@ def _plain(value: Any) -> Any:
 
 def write_yaml(value: XmlRpcValue) -> str:
     """A value as ``rosparam dump`` writes it, keys in order."""
-    yaml = YAML(typ="safe", pure=True)
-    yaml.Resolver, yaml.Representer, yaml.Emitter = _WritingResolver, _Representer, _Emitter
-    yaml.default_flow_style = False
-    yaml.allow_unicode = False
-    stream = io.StringIO()
-    yaml.dump(_sorted(value), stream)
-    return stream.getvalue()
+    return yaml.dump(value, Dumper=_Dumper, default_flow_style=False)
 
 
 def show_yaml(value: XmlRpcValue) -> str:
     """A value as ``rosparam get`` prints it: without the mark that ends a document of one scalar."""
     return write_yaml(value).removesuffix("...\n").rstrip("\n") + "\n"
-
-
-def _sorted(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _sorted(value[name]) for name in sorted(value)}
-    if isinstance(value, list):
-        return [_sorted(member) for member in value]
-    return value

@@ -116,6 +116,9 @@ def _troubles(snapshot: Snapshot) -> list[str]:
     found = list(snapshot.notes)
     for info in snapshot.peers:
         found += [f"{info.name}: {conflict}" for conflict in info.conflicts]
+        found += [bound.text for bound in info.beyond]
+        if info.link is not None and info.link.path_problem:
+            found.append(f"{info.name}: {info.link.path_problem}; {info.link.path_remedy}")
         if info.last_error and info.state not in {"linked", "relayed"}:
             again = "" if info.next_attempt is None else f"; next attempt in {duration(info.next_attempt)}"
             found.append(f"{info.name}: {info.last_error}{again}")
@@ -202,10 +205,15 @@ def _facts(info: PeerInfo) -> list[tuple[str, str]]:
             ("Traffic", f"{size(link.bytes_in)} in, {size(link.bytes_out)} out, {size(link.queued)} queued"),
             ("Drops", f"{link.dropped} messages"),
         ]
+        if link.packet is not None:
+            facts.append(("Packets", f"of at most {link.packet} bytes to it"))
+        if link.path_problem:
+            facts += [("Path", link.path_problem), ("What to do", link.path_remedy)]
     if info.last_error:
         facts.append(("Last error", info.last_error))
     if info.next_attempt is not None:
         facts.append(("Next attempt", f"in {duration(info.next_attempt)}"))
+    facts += [("Limit", bound.text) for bound in info.beyond]
     return facts + [("Conflict", conflict) for conflict in info.conflicts]
 
 

@@ -62,7 +62,7 @@ Examples:
 @click.option(
     "--state", metavar="DIR", help="Where it remembers. [env: RMPA_STATE_DIR; default: ~/.local/state/rmpa]"
 )
-@click.option("--no-state", is_flag=True, help="Remember nothing over a restart, and take up nothing.")
+@click.option("--no-state", is_flag=True, help="The resources remember nothing; for the core say -- --fresh.")
 @click.option("--log-level", default="info", type=click.Choice(["debug", "info", "warning", "error"]))
 @click.argument("options", nargs=-1, type=click.UNPROCESSED, metavar="[-- OPTIONS OF rmpa up]")
 def run(
@@ -113,8 +113,10 @@ def prepared(path: Path, given: Sequence[str] = ()) -> list[Resource]:
     for text in given:
         _set(resources, text)
     for resource in resources:
-        for kind in [topic.type for topics in (resource.outputs, resource.inputs) for topic in topics.values()]:
-            kind.deserialize(kind.serialize(kind.make()))
+        kinds = [topic.kind.known for topics in (resource.outputs, resource.inputs) for topic in topics.values()]
+        for kind in kinds:
+            if kind is not None:
+                kind.deserialize(kind.serialize(kind.make()))
     return resources
 
 
@@ -310,8 +312,10 @@ def _stores(module: str, state: str | None) -> Path | None:
 
 
 async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None, stores: Path | None = None) -> int:
+    from rmpa.core.aio.descriptors import raise_file_limit
     from rmpa.resource.aio.member import run_all
 
+    raise_file_limit()
     sys.setswitchinterval(limits.THREAD_SWITCH)  # a task that is due does not wait for what the loop does just then
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -12,13 +11,13 @@ from rmpa.core import limits
 from rmpa.core.config_values import did_you_mean
 from rmpa.core.errors import RmpaError, UnreachableError
 from rmpa.ros.aio.http_client import call_api
-from rmpa.ros.installed import find_message, find_service
-from rmpa.ros.service_types import ServiceType, known_services
+from rmpa.ros.find_types import find_service_type
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from rmpa.cli.master import Graph, Master, TopicName
+    from rmpa.ros.service_types import ServiceType
     from rmpa.ros.services import ServiceDescription
 
 CALLER_ID: Final = "/rmpa_service"
@@ -112,22 +111,6 @@ def known_type(description: ServiceDescription) -> ServiceType:
     """The type that a server names, as this machine's packages or we ourselves know it.
 
     Raises:
-        DefinitionError: Nobody here knows it.
-        RmpaError: It is known here in another version.
+        DefinitionError: It is not known here, or in another version.
     """
-    name = description.type
-    found: list[ServiceType] = []
-    if name in known_services():
-        found.append(ServiceType(name))
-    text = find_service(name, os.environ)
-    if text is not None:
-        found.append(ServiceType(name, text, lambda message: find_message(message, os.environ)))
-    if not found:
-        return ServiceType(name)  # which says what to do
-    for kind in found:
-        if kind.md5sum == description.md5sum:
-            return kind
-    raise RmpaError(
-        f"{name} has another definition at the server (md5 {description.md5sum}) than here ({found[-1].md5sum}); "
-        "source the workspace that the server was built in"
-    )
+    return find_service_type(description.type, description.md5sum)

@@ -49,6 +49,7 @@ class Watch:
 
 def run_stream(body: Callable[[], Coroutine[object, object, None]]) -> None:
     """Run until the body ends; Ctrl-C and SIGTERM end it too, behind its own cleaning up."""
+    from rmpa.core.aio.descriptors import raise_file_limit
 
     async def run() -> None:
         task = asyncio.current_task()
@@ -57,6 +58,7 @@ def run_stream(body: Callable[[], Coroutine[object, object, None]]) -> None:
         await body()
 
     with contextlib.suppress(KeyboardInterrupt, asyncio.CancelledError):
+        raise_file_limit()
         asyncio.run(run())
 
 

@@ -6,6 +6,7 @@ import contextlib
 from typing import TYPE_CHECKING
 
 from rmpa.cli.output import duration, printable, size
+from rmpa.core import limits
 from rmpa.core.errors import RmpaError
 from rmpa.monitor.aio.control_client import ControlClient
 from rmpa.monitor.snapshot import Snapshot
@@ -71,9 +72,16 @@ def bandwidth_text(route: RouteInfo) -> str:
 def losses_text(route: RouteInfo) -> str:
     """What did not arrive, by its reason."""
     ours = f"{route.dropped} dropped here"
-    return (
-        f"{route.lost} lost, {route.late} late, {route.expired} expired, {ours}" if route.direction == "in" else ours
-    )
+    if route.direction == "in":
+        return f"{route.lost} lost, {route.late} late, {route.expired} expired, {ours}"
+    return f"{route.lost} lost to {route.peer}" if route.contract.get("reliability") == "reliable" else ours
+
+
+def oversized_text(route: RouteInfo) -> str:
+    """What cannot cross because it is too long."""
+    where = f"by the agent of {route.peer}" if route.direction == "in" else "here"
+    last, most = size(route.oversized_bytes), size(limits.TCPROS_MESSAGE_MAX)
+    return f"{route.oversized} left out {where}, the last of {last}; at most {most} cross: send parts"
 
 
 def facts(route: RouteInfo) -> Iterator[tuple[str, str]]:
@@ -86,8 +94,12 @@ def facts(route: RouteInfo) -> Iterator[tuple[str, str]]:
         yield "rate", rate_text(route)
         yield "latency", latency_text(route.latency)
         yield "bandwidth", bandwidth_text(route)
-    if route.messages:
+    if route.messages or route.lost:
         yield "missing", losses_text(route)
+    if route.kept:
+        yield "waiting", f"{route.kept} messages for {route.peer}"
+    if route.oversized:
+        yield "too long", oversized_text(route)
     if route.contract:
         yield "contract", ", ".join(f"{key} {_value(key, value)}" for key, value in route.contract.items())
     if route.events:
@@ -97,6 +109,9 @@ def facts(route: RouteInfo) -> Iterator[tuple[str, str]]:
 
 
 def _value(key: str, value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:g} Hz" if key == "max_rate" else duration(value)
-    return str(value)
+    """A contract's value with its unit; JSON does not tell whole numbers from durations, the key does."""
+    if not isinstance(value, int | float):
+        return str(value)
+    if key == "depth":
+        return f"{value:.0f}"
+    return f"{value:g} Hz" if key == "max_rate" else duration(value)

@@ -159,8 +159,8 @@ def _print_crossing(crossing: TopicInfo, wanted: TopicName) -> None:
             click.echo(printable(f"     {label:<10} {text}"))
         if route.problem:
             warn(printable(f"{route.peer} {route.node}: {route.problem}"))
-    for mismatch in crossing.mismatches:
-        warn(printable(mismatch))
+    for trouble in (*crossing.mismatches, *crossing.unreachable):
+        warn(printable(trouble))
 
 
 @click.command("type", epilog="\b\nExamples:\n  rmpa topic type /cmd\n")

@@ -11,9 +11,9 @@ import click
 
 from rmpa.cli.master import Master, choose_master, read_topic
 from rmpa.cli.options import agent_option, json_option, master_option
-from rmpa.cli.output import print_json, print_line
+from rmpa.cli.output import print_json, print_line, printable, warn
 from rmpa.cli.stream import run_stream, with_node
-from rmpa.core.errors import ConfigError
+from rmpa.core.errors import ConfigError, UnreachableError
 
 if TYPE_CHECKING:
     from rmpa.ros.aio.node import Node, Publisher
@@ -69,6 +69,8 @@ def fill_stamps(values: Plain, now_ns: int) -> Plain:
 \b
 Without -r one message is published and kept for late subscribers until Ctrl-C; -1 ends after 3 seconds.
 A header may be written auto, and a stamp now.
+The TYPE is one that comes with rmpa, or of this machine's ROS packages (ROS_PACKAGE_PATH, CMAKE_PREFIX_PATH,
+PYTHONPATH); else it is learnt from a node that publishes it, here or at a peer.
 
 \b
 Examples:
@@ -98,25 +100,42 @@ def pub(
     master: str | None,
 ) -> None:
     """Publish VALUES, in YAML or JSON, as messages of a TYPE on a TOPIC."""
-    from rmpa.ros.messages import MessageType
+    from rmpa.ros.definitions import UnknownTypeError
+    from rmpa.ros.find_types import find_message_type
 
     wanted = read_topic(topic)
     if wanted.peer is not None:
         raise ConfigError("TOPIC", f"{topic!r} names a peer", f"publish on {wanted.topic}: it crosses to every peer")
     if once and rate is not None:
         raise ConfigError("--once", "does not go with --rate", "choose one of them")
-    message_type = MessageType(kind)
     plain = read_values(values)
-    message_type.make(fill_stamps(plain, 0))  # a mistake is told before anything is registered
+    found: MessageType | None = None
+    unknown: UnknownTypeError | None = None
+    try:
+        found = find_message_type(kind)
+    except UnknownTypeError as error:
+        if not error.learnable:
+            raise
+        unknown = error
+    if found is not None and not found.source:
+        found.make(fill_stamps(plain, 0))  # a mistake is told before anything is asked
     chosen = choose_master(master, agent, os.environ)
     latch = latch or rate is None
-    run_stream(lambda: _pub(chosen, wanted.topic, message_type, plain, rate, once=once, latch=latch, as_json=as_json))
+    try:
+        run_stream(
+            lambda: _pub(chosen, wanted.topic, found or kind, plain, rate, once=once, latch=latch, as_json=as_json)
+        )
+    except UnreachableError as error:
+        if unknown is None:
+            raise
+        unknown.problem += f"; {error}"  # whose publishers might know it
+        raise unknown from None
 
 
 async def _pub(
     master: Master,
     topic: str,
-    kind: MessageType,
+    type_: MessageType | str,
     plain: Plain,
     rate: float | None,
     *,
@@ -125,6 +144,8 @@ async def _pub(
     as_json: bool,
 ) -> None:
     async def publish(node: Node) -> None:
+        kind = await _version(node, topic, type_)
+        kind.make(fill_stamps(plain, 0))  # a mistake is told before anything is registered
         publisher = await node.advertise(topic, kind, latch=latch)
         if rate is not None:
             if not as_json:
@@ -138,6 +159,29 @@ async def _pub(
         await _wait(node, _ONCE_SECONDS if once else None)
 
     await with_node(master, "rmpa_pub", publish)
+
+
+async def _version(node: Node, topic: str, found: MessageType | str) -> MessageType:
+    """The type, learnt if it was not found here; of a user's own type the version that the topic has already.
+
+    Raises:
+        DefinitionError: It is not known here, and no publisher tells it.
+    """
+    from rmpa.ros.aio.learn import find_or_learn, learn_type
+
+    if isinstance(found, str):
+        return await find_or_learn(node.master_uri, node.name, found, topic)
+    if found.source:
+        there = await learn_type(node.master_uri, node.name, found.name, topic=topic, elsewhere=False)
+        if there is not None and there.kind.md5sum != found.md5sum:
+            warn(
+                printable(
+                    f"{there.node} publishes {topic} with another version of {found.name} (md5 {there.kind.md5sum}) "
+                    f"than {found.source} has ({found.md5sum}); that of {there.node} is used"
+                )
+            )
+            return there.kind
+    return found
 
 
 def _one(publisher: Publisher, kind: MessageType, plain: Plain, number: int, *, as_json: bool) -> None:

@@ -28,6 +28,7 @@ Examples:
   rmpa up --name base --interface wlan0   on one interface only
   rmpa up --seed 10.8.0.5:40001           greet an agent that multicast does not reach
   rmpa up --name b2 --core-port 11312     a second agent on this machine
+  rmpa up --fresh                         forget what the core kept of the run before
   rmpa up --core external                 join the graph of a roscore that runs already
   rmpa up --realtime                      punctual on a busy machine; the log says what was not granted
 """
@@ -46,6 +47,12 @@ Examples:
     help="embedded: run the ROS core; external: use the roscore of ROS_MASTER_URI. [default: embedded]",
 )
 @click.option("--master", "core_master", metavar="URI", help="The external core, if not ROS_MASTER_URI's.")
+@click.option(
+    "--fresh",
+    is_flag=True,
+    default=None,
+    help="Begin with an empty core, as roscore does; else nodes and parameters of the run before are taken up.",
+)
 @click.option("--port", metavar="PORT", help="The mesh's port, TCP and UDP. [default: 0, any]")
 @click.option("--domain", metavar="N", help="Only agents of one domain join, 0 to 232. [default: 0]")
 @click.option("--interface", "interfaces", metavar="NAME", multiple=True, help="Use only this interface; repeatable.")
@@ -67,6 +74,7 @@ def up(
     core_host: str | None,
     core_mode: str | None,
     core_master: str | None,
+    fresh: bool | None,
     port: str | None,
     domain: str | None,
     interfaces: tuple[str, ...],
@@ -93,6 +101,7 @@ def up(
         log_level,
         log_json,
         realtime,
+        fresh,
     )
     load = partial(load_settings, flags, dict(os.environ), host_name=socket.gethostname())
     loaded = load()

@@ -156,6 +156,17 @@ class ServiceSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class NodeSettings:
+    """What peers may do with this module's nodes.
+
+    Args:
+        kill: Globs over the nodes that they may ask to end (``rosnode kill``, ``rmpa node kill``).
+    """
+
+    kill: tuple[str, ...] = ("/**",)
+
+
+@dataclass(frozen=True, slots=True)
 class LaneSettings:
     """How the packets of each lane are marked.
 
@@ -192,6 +203,23 @@ class RealtimeSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class LimitSettings:
+    """How much of one peer is taken, and how much peers are told; what is beyond stays hidden, and is told as such.
+
+    Args:
+        nodes: Nodes of one peer that stand in the local graph.
+        topics: (topic, node) pairs of one peer, and those that this module offers.
+        services: Services of one peer, and those that this module offers.
+        params: Parameters that this module follows, and that one peer may follow here.
+    """
+
+    nodes: int = limits.NODES_PER_PEER_MAX
+    topics: int = limits.TOPICS_PER_PEER_MAX
+    services: int = limits.SERVICES_PER_PEER_MAX
+    params: int = limits.FOLLOWED_MAX
+
+
+@dataclass(frozen=True, slots=True)
 class Settings:
     """All settings of one agent.
 
@@ -202,6 +230,7 @@ class Settings:
         core_port: Its port.
         core_mode: ``embedded``: the agent runs the core; ``external``: a roscore that runs already is used.
         core_master: The external core's URI; empty: ROS's own default.
+        core_fresh: Whether the embedded core begins empty, whatever it has kept of the run before.
         port: The mesh's port (TCP links, UDP unicast beacons); 0 lets the system choose.
         interfaces: Names of the interfaces to use; empty means all usable ones.
         seeds: Agents to greet by unicast, across sub-networks; port 0 means the domain's discovery port.
@@ -213,7 +242,9 @@ class Settings:
         contracts: What the topics need, in the order of the file (``core.contract.Contracts``).
         services: What crosses of the services, and how long a call may take.
         params: What crosses of the parameters.
+        nodes: What peers may do with this module's nodes.
         time: Whose simulated time holds.
+        limits: How much of one peer is taken.
         lanes: How the lanes are marked.
         realtime: What is asked of the kernel.
         relay: Whether what comes from one peer is offered to others that do not reach it themselves.
@@ -221,6 +252,7 @@ class Settings:
         log_json: One JSON object a line instead of text.
         config_file: Where the file's part came from, if there was a file.
         runtime_dir: Where control sockets live; empty means the usual place of this user.
+        state_dir: Where is kept what survives the agent's end; likewise.
     """
 
     name: str = ""
@@ -229,6 +261,7 @@ class Settings:
     core_port: int = 11311
     core_mode: str = "embedded"
     core_master: str = ""
+    core_fresh: bool = False
     port: int = 0
     interfaces: tuple[str, ...] = ()
     seeds: tuple[HostPort, ...] = ()
@@ -240,7 +273,9 @@ class Settings:
     contracts: tuple[Rule, ...] = ()
     services: ServiceSettings = field(default_factory=ServiceSettings)
     params: ParamSettings = field(default_factory=ParamSettings)
+    nodes: NodeSettings = field(default_factory=NodeSettings)
     time: TimeSettings = field(default_factory=TimeSettings)
+    limits: LimitSettings = field(default_factory=LimitSettings)
     lanes: LaneSettings = field(default_factory=LaneSettings)
     realtime: RealtimeSettings = field(default_factory=RealtimeSettings)
     relay: bool = False
@@ -248,6 +283,7 @@ class Settings:
     log_json: bool = False
     config_file: Path | None = None
     runtime_dir: str = ""
+    state_dir: str = ""
 
     @property
     def discovery_port(self) -> int:

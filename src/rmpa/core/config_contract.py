@@ -36,18 +36,33 @@ def read_duration(raw: object, what: str = "a duration") -> float | None:
     Raises:
         BadValue: It is not a duration, or no sensible one.
     """
+    return _bounded(raw, _seconds(raw, what), what)
+
+
+def _seconds(raw: object, what: str) -> float:
+    """A duration as it is written, whatever its size."""
     example = f'{what} is seconds as a number, or a text such as "100 ms"'
-    if isinstance(raw, str):
-        text = raw.strip().lower()
-        if text == _INFINITE:
-            return None
-        number, unit = _quantity(text)
-        if number and unit == "hz":
-            raise BadValue(f"{raw!r} is a rate, not a duration", better=f"{1000 / number:g} ms")
-        if number is None or unit not in _SECONDS:
-            raise BadValue(f"{raw!r} is not a duration", f"{example}; units are {', '.join(_SECONDS)}")
-        return _bounded(raw, number / _SECONDS[unit], what)
-    return _bounded(raw, _number(raw, "a duration", example), what)
+    if not isinstance(raw, str):
+        return _number(raw, "a duration", example)
+    text = raw.strip().lower()
+    if text == _INFINITE:
+        return math.inf
+    number, unit = _quantity(text)
+    if number and unit == "hz":
+        raise BadValue(f"{raw!r} is a rate, not a duration", better=f"{1000 / number:g} ms")
+    if number is None or unit not in _SECONDS:
+        raise BadValue(f"{raw!r} is not a duration", f"{example}; units are {', '.join(_SECONDS)}")
+    return number / _SECONDS[unit]
+
+
+def _read_outage(raw: object) -> float:
+    """How long messages are kept for a peer that is away; unlike other durations it has an end."""
+    seconds = _seconds(raw, "an outage")
+    shortest, longest = limits.OUTAGE_MIN, limits.OUTAGE_MAX
+    if not shortest <= seconds <= longest:
+        bounds = f"an outage is between {shortest:g} and {longest:.0f} s: messages are not kept for ever"
+        raise BadValue(f"{_written(raw)} is out of range", bounds)
+    return seconds
 
 
 def _bounded(raw: object, seconds: float, what: str) -> float | None:
@@ -132,6 +147,7 @@ _READERS: Final[Mapping[str, tuple[str, Callable[[object], object]]]] = {
     "liveliness_lease_duration": ("liveliness_lease", lambda raw: read_duration(raw, "a lease")),
     "priority": ("priority", _word(Priority, "a priority")),
     "max_rate": ("max_rate", read_rate),
+    "outage": ("outage", _read_outage),
 }
 """By the file's key: the contract's field, and the reader of its value."""
 
@@ -211,6 +227,7 @@ def _at_key(key: str, read: Callable[[object], _Value], raw: object) -> _Value:
 
 def _doubts(rules: Sequence[Rule]) -> Iterator[Doubt]:
     leased = any(rule.values.get("liveliness_lease") is not None for rule in rules)
+    reliable = any(rule.values.get("reliability") == Reliability.RELIABLE for rule in rules)
     for index, rule in enumerate(rules):
         values = rule.values
         if not values:
@@ -219,6 +236,8 @@ def _doubts(rules: Sequence[Rule]) -> Iterator[Doubt]:
             yield Doubt((index, "depth"), "has no effect beside history keep_all")
         if values.get("liveliness") == Liveliness.MANUAL_BY_TOPIC and not leased:
             yield Doubt((index, "liveliness"), "has no effect without a liveliness_lease_duration")
+        if "outage" in values and not reliable:
+            yield Doubt((index, "outage"), 'has no effect without reliability = "reliable"')
         deadline, rate = values.get("deadline"), values.get("max_rate")
         if isinstance(deadline, float) and isinstance(rate, float) and deadline * rate < 1:
             text = f"{rate:g} messages a second miss the deadline of {deadline:g} s every time"

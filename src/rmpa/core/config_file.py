@@ -42,6 +42,7 @@ class CoreTable(_Table, kw_only=True):
 
     mode: str | UnsetType = UNSET
     master: str | UnsetType = UNSET
+    fresh: bool | UnsetType = UNSET
     host: str | UnsetType = UNSET
     port: int | UnsetType = UNSET
 
@@ -84,6 +85,7 @@ class ContractTable(_Table, kw_only=True):
     liveliness_lease_duration: object | UnsetType = UNSET
     priority: str | UnsetType = UNSET
     max_rate: object | UnsetType = UNSET
+    outage: object | UnsetType = UNSET
 
 
 class PeerTable(_Table, kw_only=True):
@@ -116,6 +118,12 @@ class ServiceTable(_Table, kw_only=True):
     timeout: object | UnsetType = UNSET
 
 
+class NodesTable(_Table, kw_only=True):
+    """``[nodes]``: what peers may do with this module's nodes."""
+
+    kill: list[str] | UnsetType = UNSET
+
+
 class ParamsTable(_Table, kw_only=True):
     """``[params]``: what peers may do with this module's parameters."""
 
@@ -136,6 +144,15 @@ class TimeTable(_Table, kw_only=True):
 
     follow: str | UnsetType = UNSET
     share: bool | UnsetType = UNSET
+
+
+class LimitsTable(_Table, kw_only=True):
+    """``[limits]``: how much of one peer is taken."""
+
+    nodes: int | UnsetType = UNSET
+    topics: int | UnsetType = UNSET
+    services: int | UnsetType = UNSET
+    params: int | UnsetType = UNSET
 
 
 class LanesTable(_Table, kw_only=True):
@@ -183,9 +200,11 @@ class ConfigFile(_Table, kw_only=True):
     peer: list[PeerTable] | UnsetType = UNSET
     services: ServicesTable = msgspec.field(default_factory=ServicesTable)
     service: list[ServiceTable] | UnsetType = UNSET
+    nodes: NodesTable = msgspec.field(default_factory=NodesTable)
     params: ParamsTable = msgspec.field(default_factory=ParamsTable)
     param: list[ParamTable] | UnsetType = UNSET
     time: TimeTable = msgspec.field(default_factory=TimeTable)
+    limits: LimitsTable = msgspec.field(default_factory=LimitsTable)
     lanes: LanesTable = msgspec.field(default_factory=LanesTable)
     realtime: RealtimeTable = msgspec.field(default_factory=RealtimeTable)
     relay: RelayTable = msgspec.field(default_factory=RelayTable)

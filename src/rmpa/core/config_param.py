@@ -75,8 +75,8 @@ def read_follow_rules(raw: object) -> tuple[FollowRule, ...]:
     """
     if not isinstance(raw, list | tuple):
         raise BadValue(f"{raw!r} is not a list")
-    if len(raw) > limits.FOLLOWED_MAX:
-        raise BadValue(f"{len(raw)} rules", f"at most {limits.FOLLOWED_MAX}; follow a namespace as a whole")
+    if len(raw) > limits.FOLLOW_RULES_MAX:
+        raise BadValue(f"{len(raw)} rules", f"at most {limits.FOLLOW_RULES_MAX}; follow a namespace as a whole")
     rules: list[FollowRule] = []
     for index, table in enumerate(raw):
         try:

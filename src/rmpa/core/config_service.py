@@ -22,6 +22,15 @@ def read_service_glob(raw: object) -> str:
         raise BadValue(problem, remedy, error.better) from None
 
 
+def read_node_glob(raw: object) -> str:
+    """A glob over nodes, as ``core.names.matches`` reads it."""
+    try:
+        return read_topic_glob(raw)
+    except BadValue as error:
+        problem, remedy = (text.replace("topic", "node") for text in (error.problem, error.remedy))
+        raise BadValue(problem, remedy, error.better) from None
+
+
 def read_timeout(raw: object) -> float:
     """Seconds that a call may take, as a number or a text such as ``"500 ms"``; there is always an end."""
     seconds = read_duration(raw, "a timeout")

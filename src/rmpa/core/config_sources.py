@@ -19,6 +19,8 @@ from urllib.parse import urlsplit
 from rmpa.core import config_values as values
 from rmpa.core.config import (
     LaneSettings,
+    LimitSettings,
+    NodeSettings,
     ParamSettings,
     PolicySettings,
     RealtimeSettings,
@@ -30,7 +32,7 @@ from rmpa.core.config_contract import ContractRules, read_contracts
 from rmpa.core.config_file import Key, Place, dotted, line_of, parse_config
 from rmpa.core.config_param import problems, read_follow_rules, read_key_glob
 from rmpa.core.config_peer import PeerRules, read_peers
-from rmpa.core.config_service import read_service_glob, read_service_rules, read_timeout
+from rmpa.core.config_service import read_node_glob, read_service_glob, read_service_rules, read_timeout
 from rmpa.core.config_values import BadValue, Multicast
 from rmpa.core.errors import ConfigError
 from rmpa.core.identity import peer_name_from
@@ -59,6 +61,7 @@ class Flags:
     log_level: str | None = None
     log_json: bool | None = None
     realtime: bool | None = None
+    core_fresh: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +94,7 @@ _OPTIONS: Final[Mapping[str, _Option]] = {
     "core_port": _Option(values.read_port, ("core", "port"), "RMPA_CORE_PORT", "--core-port", "core_port"),
     "core_mode": _Option(values.read_core_mode, ("core", "mode"), "RMPA_CORE", "--core", "core_mode"),
     "core_master": _Option(values.read_master_uri, ("core", "master"), "RMPA_MASTER", "--master", "core_master"),
+    "core_fresh": _Option(values.read_bool, ("core", "fresh"), "RMPA_FRESH", "--fresh", "core_fresh"),
     "port": _Option(values.read_port_or_any, ("mesh", "port"), "RMPA_PORT", "--port", "port"),
     "interfaces": _Option(
         _list_of(values.read_interface), ("discovery", "interfaces"), "RMPA_INTERFACES", "--interface", "interfaces"
@@ -110,11 +114,16 @@ _OPTIONS: Final[Mapping[str, _Option]] = {
     "service_loggers": _Option(values.read_bool, ("services", "loggers"), "RMPA_SERVICE_LOGGERS"),
     "service_timeout": _Option(read_timeout, ("services", "timeout"), "RMPA_SERVICE_TIMEOUT"),
     "service_rules": _Option(read_service_rules, ("service",)),
+    "node_kill": _Option(_list_of(read_node_glob), ("nodes", "kill"), "RMPA_NODE_KILL"),
     "remote_get": _Option(_list_of(read_key_glob), ("params", "remote_get"), "RMPA_REMOTE_GET"),
     "remote_set": _Option(_list_of(read_key_glob), ("params", "remote_set"), "RMPA_REMOTE_SET"),
     "follow": _Option(read_follow_rules, ("param",)),
     "time_follow": _Option(values.read_name_or_none, ("time", "follow"), "RMPA_TIME_FOLLOW"),
     "time_share": _Option(values.read_bool, ("time", "share"), "RMPA_TIME_SHARE"),
+    "limit_nodes": _Option(values.read_bound, ("limits", "nodes"), "RMPA_LIMIT_NODES"),
+    "limit_topics": _Option(values.read_bound, ("limits", "topics"), "RMPA_LIMIT_TOPICS"),
+    "limit_services": _Option(values.read_bound, ("limits", "services"), "RMPA_LIMIT_SERVICES"),
+    "limit_params": _Option(values.read_bound, ("limits", "params"), "RMPA_LIMIT_PARAMS"),
     "express_dscp": _Option(values.read_dscp, ("lanes", "express_dscp"), "RMPA_EXPRESS_DSCP"),
     "express_priority": _Option(values.read_packet_priority, ("lanes", "express_priority"), "RMPA_EXPRESS_PRIORITY"),
     "bulk_dscp": _Option(values.read_dscp, ("lanes", "bulk_dscp"), "RMPA_BULK_DSCP"),
@@ -128,6 +137,7 @@ _OPTIONS: Final[Mapping[str, _Option]] = {
     "log_level": _Option(values.read_level, ("log", "level"), "RMPA_LOG_LEVEL", "--log-level", "log_level"),
     "log_json": _Option(values.read_bool, ("log", "json"), "RMPA_LOG_JSON", "--log-json", "log_json"),
     "runtime_dir": _Option(values.read_text, variable="RMPA_RUNTIME_DIR"),
+    "state_dir": _Option(values.read_text, variable="RMPA_STATE_DIR"),
 }
 VARIABLES: Final = ("RMPA_CONFIG", "RMPA_AGENT", *(o.variable for o in _OPTIONS.values() if o.variable))
 """Every variable of ours."""
@@ -211,6 +221,9 @@ def load_settings(
         source = strongest["multicast"].source if "multicast" in strongest else "domain"
         problem = f"port {settings.group_port} plus domain {settings.domain} is beyond 65535"
         raise ConfigError(source, problem, "choose a lower port")
+    if (count := len(settings.params.follow)) > settings.limits.params:
+        problem = f"{count} rules, more than limits.params = {settings.limits.params}"
+        raise strongest["follow"].error(problem, "raise that, or follow a namespace as a whole", ())
     for name, at, problem in problems(settings.params.follow, settings.time.follow, settings.name):
         raise strongest[name].error(problem, "name another module", at)
     return Loaded(settings, tuple(notes))
@@ -264,7 +277,9 @@ _GROUPS: Final[Mapping[str, tuple[Callable[..., object], Mapping[str, str]]]] = 
         ServiceSettings,
         {f"service_{key}": key for key in ("allow", "deny", "loggers", "timeout", "rules")},
     ),
+    "nodes": (NodeSettings, {"node_kill": "kill"}),
     "params": (ParamSettings, {key: key for key in ("remote_get", "remote_set", "follow")}),
+    "limits": (LimitSettings, {f"limit_{key}": key for key in ("nodes", "topics", "services", "params")}),
     "time": (TimeSettings, {"time_follow": "follow", "time_share": "share"}),
     "lanes": (
         LaneSettings,
@@ -343,7 +358,8 @@ def _check_core(strongest: _Layer, notes: list[str], *, external: bool) -> None:
         raise strongest["core_master"].error(
             "is of no use with the embedded core", "say also that the core is external (--core external)", ()
         )
-    given_here = [strongest[name] for name in ("core_host", "core_port") if external and name in strongest]
+    embedded_only = ("core_host", "core_port", "core_fresh")
+    given_here = [strongest[name] for name in embedded_only if external and name in strongest]
     useless = [given for given in given_here if given.path is None]  # a file may be written for both
     notes += [str(given.error("is of no use with an external core", "", ())) for given in useless]
 

@@ -147,6 +147,11 @@ def read_cpu(raw: object) -> int:
     return read_whole(raw, 0, limits.CPU_MAX, "the number of a CPU")
 
 
+def read_bound(raw: object) -> int:
+    """How many of something one peer may have."""
+    return read_whole(raw, 1, limits.BOUND_MAX, "a limit")
+
+
 def read_level(raw: object) -> str:
     """A log level."""
     text = str(raw).strip().lower()

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
 _Word = TypeVar("_Word", bound=StrEnum)
+_Number = TypeVar("_Number", int, float)
 
 
 class Reliability(StrEnum):
@@ -69,6 +70,7 @@ class Contract:
         liveliness_lease: Seconds without a sign of life after which it does not; ``None``: for ever.
         priority: The lane.
         max_rate: Messages a second at the most, of which the newest are kept; ``None``: as they come.
+        outage: Seconds for which a reliable route keeps its messages when its link is gone.
     """
 
     reliability: Reliability = Reliability.BEST_EFFORT
@@ -81,6 +83,7 @@ class Contract:
     liveliness_lease: float | None = None
     priority: Priority = Priority.NORMAL
     max_rate: float | None = None
+    outage: float = limits.RESUME_WINDOW
 
     @property
     def kept(self) -> int:
@@ -108,20 +111,20 @@ def combine(offered: Contract, requested: Contract) -> Contract:
         reliability=_either(offered.reliability, requested.reliability, Reliability.RELIABLE),
         durability=_either(offered.durability, requested.durability, Durability.TRANSIENT_LOCAL),
         history=_either(offered.history, requested.history, History.KEEP_ALL),
-        depth=_depth(offered.depth, requested.depth),
+        depth=_larger(offered.depth, requested.depth, limits.ROUTE_QUEUE_MESSAGES),
         deadline=offered.deadline if requested.deadline is None else requested.deadline,
         lifespan=_smaller(offered.lifespan, requested.lifespan),
         liveliness=watched.liveliness,
         liveliness_lease=watched.liveliness_lease,
         priority=max(offered.priority, requested.priority, key=_URGENCY.__getitem__),
         max_rate=_smaller(offered.max_rate, requested.max_rate),
+        outage=_larger(offered.outage, requested.outage, limits.RESUME_WINDOW),
     )
 
 
-def _depth(one: int, other: int) -> int:
+def _larger(one: _Number, other: _Number, default: _Number) -> _Number:
     """The larger one, but the default says nothing."""
-    said = [depth for depth in (one, other) if depth != limits.ROUTE_QUEUE_MESSAGES]
-    return max(said, default=limits.ROUTE_QUEUE_MESSAGES)
+    return max((value for value in (one, other) if value != default), default=default)
 
 
 def _either(one: _Word, other: _Word, stronger: _Word) -> _Word:

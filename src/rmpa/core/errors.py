@@ -10,6 +10,7 @@
     │   └── LimitExceeded      … by claiming more than ``core.limits`` allows
     ├── PeerRefused            a peer said no, with its reason
     └── UnreachableError       nobody answers where somebody should
+        └── OutOfDescriptors   … or may well, but this process has no file descriptor left to ask
 
 Errors hold fields and build their text in ``__str__``. A text says what happened, where, and what to do.
 """
@@ -111,6 +112,17 @@ class UnreachableError(RmpaError):
     def __str__(self) -> str:
         """Say what was looked for, where, and what to do."""
         return _advised(f"no {self.what} answers at {self.where}", self.remedy)
+
+
+@dataclass(eq=False)
+class OutOfDescriptors(UnreachableError):  # noqa: N818 - the name says what happened
+    """This process has no file descriptor left for a connection; of the other side nothing is known."""
+
+    def __str__(self) -> str:
+        """Say what could not be reached, why, and what to do."""
+        return _advised(
+            f"no file descriptor is left for a connection to the {self.what} at {self.where}", self.remedy
+        )
 
 
 def _advised(text: str, remedy: str) -> str:

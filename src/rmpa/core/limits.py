@@ -11,8 +11,28 @@ KIB: Final = 1024
 MIB: Final = 1024 * KIB
 
 # --- process --------------------------------------------------------------------------------------------------
-OPEN_FILES: Final = 65_536
-"""File descriptors that an agent asks for, as far as the hard limit allows: the usual 1024 are 500 proxies."""
+OPEN_FILES: Final = 1_048_576
+"""File descriptors that a process which runs on asks for: as many as the hard limit allows, up to the kernel's own
+default (fs.nr_open). Containers have hard limits of 10^9, and an old program that it starts closes each number."""
+OPEN_FILES_ADVICE: Final = 65_536
+"""What a user is advised to allow: some ten thousand nodes."""
+DESCRIPTORS_RESERVED: Final = 64
+"""Descriptors that data leaves to the core (half of them), the links and the control socket: 16 peers that come back
+take 32."""
+DESCRIPTORS_RESERVED_PART: Final = 4
+"""The reserve is no more than this part of all: of 64 descriptors 16."""
+DESCRIPTORS_QUIET: Final = 2.0
+"""Without a refusal, and with room, before a shortage of descriptors is over."""
+DESCRIPTORS_TELL: Final = 60.0
+"""Between two lines of the log about shortages of one kind, for those that come and go."""
+DESCRIPTORS_NEAR: Final = 0.8
+"""The share of those that are not in the reserve from which on a user is warned."""
+DESCRIPTORS_COUNT_SHARE: Final = 100
+"""Times as long as a count of all open descriptors took, before the next one."""
+ACCEPTS: Final = 16
+"""Connections that one listening socket accepts before the loop does something else, 15 microseconds each."""
+ACCEPT_PAUSE: Final = 0.5
+"""Before a server that has no descriptor for a connection looks again; a look costs some 10 microseconds."""
 THREAD_SWITCH: Final = 1e-4
 """Seconds that a thread keeps the interpreter from one that waits for it. Beside a thread that parses XML the loop is
 3 ms late (p50) with Python's own 5 ms, and 0.16 ms with this."""
@@ -60,7 +80,12 @@ CONTRACT_RATE_MIN: Final = 0.001
 CONTRACT_RATE_MAX: Final = 1_000_000.0
 """Highest ``max_rate`` in messages a second: more than any topic reaches."""
 FOLLOWED_MAX: Final = 256
-"""Parameters that one module follows: a namespace counts as one."""
+"""Default of ``limits.params``: parameters that one module follows, and that one peer may follow here; a namespace
+counts as one."""
+FOLLOW_RULES_MAX: Final = 2048
+"""Tables ``[[param]]`` in a file, whatever ``limits.params`` says: each is held against each other one."""
+BOUND_MAX: Final = 1_000_000
+"""Highest value of a setting in ``[limits]``: such a graph takes some gigabytes."""
 CPU_MAX: Final = 1023
 """Highest number of a CPU that an affinity can name: CPU_SETSIZE less one."""
 
@@ -89,6 +114,10 @@ ROSTER_PEERS_MAX: Final = 512
 """Peers in a roster: a hostile sender of invented GUIDs cannot fill the memory."""
 CONFLICT_AFTER: Final = 2.0
 """A replaced instance that still speaks after this long is not a late packet: two live peers share one GUID."""
+ADDRESS_SHARED_AFTER: Final = 5.0
+"""Seconds without a link, though its beacons come, until a peer with another's address is shown as in conflict."""
+ADDRESS_SHARED_MARGIN: Final = 1.0
+"""Seconds after its link fell in which a beacon may still be one from before."""
 ANSWER_INTERVAL: Final = 0.2
 """At most one unicast answer to one address in this time."""
 INTERFACE_SETTLE: Final = 0.2
@@ -261,6 +290,30 @@ FORGET_UNANNOUNCED: Final = ROSTER_LEASE
 LINK_UNACKED: Final = 2.0
 """Sent bytes that nobody acknowledged for this long end a connection (TCP_USER_TIMEOUT): two leases, so that the
 lease, which can say why, is the first to speak."""
+SEGMENT_BYTES: Final = (1200, 512)
+"""Payload of one packet on a path that drops larger ones, in the order in which they are tried: with TCP_HEADERS 1252
+bytes, below the MTU of every usual tunnel (1280 is IPv6's least), then 564, below IPv4's least of 576."""
+TCP_HEADERS: Final = 52
+"""Bytes of a packet around its payload: IPv4 (20), TCP (20), time stamps (12)."""
+EXPRESS_SEGMENT: Final = 1220
+"""Payload of one packet of an express lane that leaves this machine (TCP_MAXSEG), 1272 bytes with TCP_HEADERS:
+commands, keepalives and the graph fit through usual tunnels from the first packet on."""
+STALL_LOOK: Final = 0.1
+"""Between two looks at a connection whose data is repeated."""
+STALL_SUSPECTED: Final = 0.3
+"""Seconds without progress, with something repeated, before a small packet tries the way; TCP repeats after 0.2."""
+STALL_ANSWER: Final = 0.08
+"""Seconds for the acknowledgement of what was repeated behind the small packet's answer, or 1.5 round trips if that
+is more; then the path is taken for a black hole. On a LAN 0.8 s after the stall began, within the express lease."""
+PATH_REMEMBERED: Final = 600.0
+"""A black hole is remembered for an address this long; the next connection then tries large packets again. RFC 4821's
+own value."""
+PATH_NO_HELP: Final = 60.0
+"""Where smaller packets did not help, they are not tried again for this long."""
+PATH_PROVEN_SEGMENTS: Final = 2
+"""Full segments of the smaller size that were acknowledged: then the size was what it took."""
+PATHS_MAX: Final = 512
+"""Addresses remembered as black holes, as many as there are links; the oldest is forgotten first."""
 LINK_UNSENT_BYTES: Final = 64 * KIB
 """Bytes that the kernel keeps for one link before they can leave (TCP_NOTSENT_LOWAT): what waits there is overtaken
 by no control frame and dropped by no rule. A pong on 5 Mbit/s came 1.2 s late without, 0.3 s with it."""
@@ -283,8 +336,6 @@ MESH_PORT_ATTEMPTS: Final = 32
 """Tries to find a number that is free for TCP and UDP both; the first nearly always is."""
 JOIN_RETRY: Final = 1.0
 """Before an agent whose addresses have changed tries again to take a new place."""
-ACCEPT_PAUSE: Final = 0.5
-"""Before accepting again when the process has no file descriptors left."""
 ACK_MESSAGES: Final = 32
 """Messages of a reliable route that one acknowledgement covers: it costs as much as a message of 64 bytes."""
 ACK_BYTES: Final = 1 * MIB
@@ -292,21 +343,45 @@ ACK_BYTES: Final = 1 * MIB
 ACK_DELAY: Final = 0.010
 """After the first message that was not acknowledged: what a route of few messages keeps in memory for longer."""
 RESUME_WINDOW: Final = 30.0
-"""How long a reliable route's messages are kept after its link fell: a robot drives through a shadow, an access point
-restarts. Whoever is away for longer begins anew."""
+"""How long a reliable route's messages are kept after its link fell, unless its contract says another ``outage``: a
+robot drives through a shadow, an access point restarts. More is for the contract to ask for: a module that is off
+seems to publish for as long, and afterwards its subscribers get all of the old messages. Latched topics of a peer
+that fell silent stay as long, too."""
+OUTAGE_MIN: Final = 1.0
+"""Shortest ``outage`` of a contract: a link that fell silent is noticed no sooner."""
+OUTAGE_MAX: Final = 86_400.0
+"""Longest ``outage`` of a contract, a day; as the other times of a contract."""
+OUTAGE_COUNTED: Final = 86_400.0
+"""Messages of a reliable route are counted for this long after its link fell, though they are not kept any more: the
+publisher's agent stays connected to it for that. After it "more may be lost" is said."""
 RESUME_CLAIM: Final = 10.0
-"""From a peer's new link to its asking for a route that waited: its advertisement has been read by then. What it has
-not asked for has no listener any more."""
+"""Seconds from a peer's having been told of all topics over its new link to its asking for a route that waited: the
+last advertisement has been read by then. What it has not asked for has no listener any more."""
+RESUME_CLAIM_MAX: Final = 300.0
+"""Seconds from its new link to the same, where it has not even been told everything: 32,768 topics take 51 s on a
+lane that is never free (TELL_PATIENCE), and a link that carries nothing ends long before."""
 RESUMES_MAX: Final = 1024
-"""Reliable routes that wait for their links: all of one peer with a thousand topics."""
+"""Reliable routes that wait for their links with messages: all of one peer with a thousand topics."""
 RESUME_BYTES_MAX: Final = 256 * MIB
-"""Messages kept for them, over all; the route that waited longest is given up first."""
+"""Messages kept for them, over all; those of the route that waited longest are given up first, and only counted."""
+RESUMES_COUNTED_MAX: Final = 4096
+"""Reliable routes without a link whose messages are only counted, 3 KB each."""
+LOST_TOLD_MAX: Final = (1 << 32) - 1
+"""Lost messages that one ``opened`` tells of; more were never counted."""
+LOSSES_REMEMBERED: Final = 8192
+"""(peer, source) pairs of reliable routes that are not open, of which it is remembered what was lost."""
+ABSENT_PEERS_MAX: Final = 128
+"""Peers that have been away for longer than their routes wait, of which it is remembered what they miss, and what is
+missed of theirs; the one away for longest is forgotten first."""
 
 # --- ROS ------------------------------------------------------------------------------------------------------
 TCPROS_HEADER_MAX: Final = 4 * MIB
 """A connection header: the longest message definitions are some 100 KB; roscpp would accept 1 GB."""
 TCPROS_MESSAGE_MAX: Final = MESSAGE_MAX - 4
 """One message, so that it still fits a frame with its length."""
+TCPROS_LENGTH_MAX: Final = 1_000_000_000
+"""A longer message's length is no length: the stream is out of step, and the connection is closed. It is roscpp's own
+bound. A message between both is read and left out."""
 TCPROS_HANDSHAKE_TIMEOUT: Final = 10.0
 """For the other side's header; rospy and roscpp wait for ever, and hang for ever."""
 TCPROS_CONNECT_TIMEOUT: Final = 3.0
@@ -317,12 +392,19 @@ TCPROS_HANDSHAKES_MAX: Final = 128
 """Of these, connections whose header has not come yet (port scanners, stuck nodes)."""
 TCPROS_BACKLOG: Final = 128
 """Connections that the kernel holds until we accept them: all subscribers of a restarted node come at once."""
-TCPROS_ACCEPT_PAUSE: Final = 0.2
-"""Without accepting, when the process has run out of file descriptors."""
 TCPROS_RETRY_FIRST: Final = 0.1
 """Before the second attempt to reach a publisher; roscpp's own value."""
 TCPROS_RETRY_MAX: Final = 2.0
 """Between attempts at the most, as long as the graph lists the publisher."""
+SHARED_BACKLOG: Final = 4096
+"""Connections that the kernel holds for the one socket of all proxies: all subscribers of a restarted agent come at
+once. The kernel lowers it to its own bound (``net.core.somaxconn``)."""
+SHARED_PROBE_TIMEOUT: Final = 1.0
+"""For the trial whether addresses of 127/8 other than 127.0.0.1 work here; it takes a millisecond where they do."""
+LOOPBACK_REST: Final = 60.0
+"""Before a freed loopback address is given again: three times the 20 s for which roscpp dials an old one at most."""
+LOOPBACK_RESTING_MAX: Final = 16_384
+"""Freed addresses that are remembered: all nodes of some large modules that come and go within that minute."""
 TCP_KEEPALIVE_IDLE: Final = 60
 """Seconds of silence before the kernel asks whether the other side lives; with the next two roscpp's own values."""
 TCP_KEEPALIVE_INTERVAL: Final = 10
@@ -351,6 +433,29 @@ DEFINITION_DEPTH_MAX: Final = 32
 """Types within types; ROS's own go five deep."""
 LEARNT_TYPES_MAX: Final = 256
 """Message types learnt from publishers that a process remembers; the one unused for longest is forgotten."""
+PACKAGE_DEPTH_MAX: Final = 32
+"""Folders within folders below an entry of ROS_PACKAGE_PATH that are searched for packages; usual are four."""
+PACKAGE_FOLDERS_MAX: Final = 20_000
+"""Folders below one entry that are searched, up to 3 s; a workspace has a thousand, 40 ms. Nearer ones come first."""
+PACKAGE_ENTRIES_MAX: Final = 200_000
+"""Entries of all these folders: one folder of recordings must not take minutes."""
+PACKAGE_FILE_MAX: Final = 256 * KIB
+"""A package.xml; usual ones have 2 KB."""
+TYPES_FOUND_MAX: Final = 256
+"""Types that were found on this machine and that a process remembers; the one unused for longest is forgotten."""
+TYPE_MISSING: Final = 10.0
+"""Seconds that a type which a publisher's header names and nobody knows here is not looked for again: each message
+asks for it, and a look goes through the whole workspace, some 50 ms."""
+TYPES_MISSING_MAX: Final = 64
+"""Such types that a process remembers; the one looked for longest ago is forgotten."""
+SEARCHED_SHOWN: Final = 4
+"""Entries of one variable that the text of an error shows."""
+ASKED_FOR_TYPE_MAX: Final = 8
+"""Publishers of a type that are asked for its definition, one behind the other."""
+ASKED_FOR_TYPE_TIMEOUT: Final = 3.0
+"""For the header of one of them: that of a peer's comes when its route is open."""
+TYPE_LOOK: Final = 1.0
+"""Between two looks of a resource whether a publisher of a type that it needs has come."""
 NODE_MASTER_CHECK: Final = 0.5
 """Between a node's looks whether its master still knows it: a restarted core has its nodes back within a second."""
 NODE_UNREGISTER_TIMEOUT: Final = 3.0
@@ -359,8 +464,17 @@ NODE_UNREGISTER_AT_ONCE: Final = 16
 """Of these calls at a time: a connection each."""
 RECEIVED_QUEUE: Final = 1000
 """Messages that wait for an ``async for``; the oldest is dropped beyond it."""
-HTTP_BODY_MAX: Final = 8 * MIB
-"""An XML-RPC call: parameters with maps and URDFs reach a few MB."""
+HTTP_BODY_MAX: Final = 64 * MIB
+"""An XML-RPC call, or an answer that we asked for: URDFs and maps reach some 10 MB, and roslaunch sets all parameters
+of a launch file in one call."""
+HTTP_BODIES_MAX: Final = 256 * MIB
+"""All large calls that one server has under way: four of the largest."""
+HTTP_DISCARDED_MAX: Final = 1024 * MIB
+"""A call that is too large is read to its end, for its caller to read the answer; above this it is only cut off."""
+HTTP_PACE_MIN: Final = 64 * KIB
+"""Bytes a second: a call that comes more slowly gives way to others where room is short; loopback carries 1 GB/s."""
+HTTP_SLOW_AFTER: Final = 1.0
+"""Before a call is called slow."""
 HTTP_BODY_INLINE: Final = 64 * KIB
 """Bodies above this are read and written over several turns of the loop: 8 MiB of numbers would hold up keepalives
 for seconds. Shorter ones take some 5 ms, in which only data goes first."""
@@ -370,18 +484,22 @@ HTTP_ACCEPTS: Final = 4
 """Connections that are accepted without a pause, 40 microseconds each."""
 HTTP_HEADERS_MAX: Final = 64 * KIB
 """A request's headers, all together."""
-HTTP_BACKLOG: Final = 128
-"""Connections that the kernel holds until we accept them: all nodes of a robot register at once."""
+HTTP_BACKLOG: Final = 1024
+"""Connections that the kernel holds until we accept them: all nodes of a robot register at once. One that finds no
+place comes again after a second."""
 HTTP_CONNECTIONS_MAX: Final = 512
-"""Open connections to one XML-RPC server: rospy keeps one per thread alive."""
+"""Open connections to one XML-RPC server: rospy keeps one per thread alive. A new one takes the place of the one that
+is idle for longest, else of the slowest."""
 HTTP_IDLE_TIMEOUT: Final = 60.0
 """A kept-alive connection without a call; rospy and roscpp reconnect without a word."""
+HTTP_IDLE_MIN: Final = 0.25
+"""Without a call, before a kept-alive connection is closed for one that waits for a file descriptor."""
 HTTP_REQUEST_TIMEOUT: Final = 10.0
 """From a request's first byte to its last."""
 XMLRPC_DEPTH_MAX: Final = 256
 """XML elements inside each other: some eighty arrays in arrays; nobody's parameters come near."""
-XMLRPC_ELEMENTS_MAX: Final = 1_000_000
-"""XML elements in one body: what 8 MiB of short numbers have, at some hundred bytes of memory each."""
+XMLRPC_ELEMENTS_MAX: Final = 4_000_000
+"""XML elements in one body, two for each number: at some hundred bytes of memory each."""
 PARAM_DEPTH_MAX: Final = 64
 """Namespaces inside each other in one parameter's name; more is an attack on the recursion."""
 SLAVE_CALL_TIMEOUT: Final = 3.0
@@ -413,6 +531,11 @@ NODE_CHECK_INTERVAL: Final = 5.0
 """How often the core looks whether a registered node still listens."""
 NODE_RECHECK_DELAY: Final = 0.2
 """Between the two refused connects that make a node dead: it may be restarting its server."""
+NODE_UNREACHABLE_AFTER: Final = 15.0
+"""Seconds without one connection to a registered node until peers are not offered it any more: a cable that is pulled
+and put back, or an access point that is changed, takes less."""
+NODE_UNREACHABLE_CHECKS: Final = 4
+"""Unreachable nodes that are tried at once: each attempt may hold a thread of the resolver for seconds."""
 NOTIFY_QUEUE_MAX: Final = 4096
 """Topics and parameters that wait to be told to one slow node; of one topic only the latest waits."""
 NOTIFY_COALESCE: Final = 64
@@ -423,16 +546,63 @@ NOTIFY_RETRY_MAX: Final = 3.0
 """Between attempts at the most, for as long as the node is registered."""
 ROSOUT_QUEUE: Final = 1000
 """Log messages waiting for a slow reader of /rosout_agg."""
+ROSOUT_RESPAWN: Final = 0.5
+"""Seconds from the end of /rosout (`rosnode kill`) to its next start; roscore takes about as long."""
+ROSOUT_LOOK: Final = 1.0
+"""Seconds between two looks whether the name /rosout is free again, and between attempts to start."""
+
+CORE_STATE_BYTES: Final = 64 * MIB
+"""What a core keeps over its end, over all rows: a robot's parameters with its description are some MB."""
+CORE_STATE_NAME_MAX: Final = 4096
+"""Characters of a name that is taken from such a file: rosmaster has no limit, and the longest seen have 200."""
+CORE_STATE_GATHER: Final = 0.3
+"""Changes of the graph are gathered this long before they are kept: what a kill -9 loses, with the write itself half
+a second at the most. Nodes that start register a dozen things each."""
+CORE_STATE_RETRY: Final = 5.0
+"""Before a file that could not be written is tried again: the disk is full, or not there yet."""
+CORE_STATE_LOCKED: Final = 1.0
+"""For the file's lock: the process before may still be ending."""
+CORE_STATE_OPEN: Final = 3.0
+"""For reading the file at the start; a disk that hangs must not keep the core from its start."""
+CORE_STATE_WRITE: Final = 10.0
+"""For one write; then the disk is said not to answer. The first one after a start may be 64 MiB on a slow card."""
+CORE_STATE_CLOSE: Final = 3.0
+"""For the last write of a core that ends; a disk that hangs is left behind."""
+CORE_STATE_UNFIT_SHOWN: Final = 3
+"""Names of what did not fit that a text for the user has."""
+TAKE_UP_AT_ONCE: Final = 32
+"""Nodes of the run before that are asked at the same time: a connection each, and who asks the core meanwhile comes
+behind that many."""
+TAKE_UP_PROMPT: Final = 0.25
+"""A node that has not answered after this long does not count among these: who hangs delays nobody else."""
+TAKE_UP_RETRY_FIRST: Final = 0.5
+"""Before a node that did not answer is asked again."""
+TAKE_UP_RETRY_MAX: Final = 10.0
+"""Between two questions at the most."""
+TAKE_UP_PATIENCE: Final = 600.0
+"""A node that did not answer for this long is given up: one that a debugger stopped may be on again by then."""
+TAKE_UP_LISTS: Final = 8
+"""Nodes that are asked at the same time what they publish and subscribe to, once all have been asked who they are."""
+TAKE_UP_COMPARED: Final = 3
+"""Times that a node is asked so; one that registers something each time is busy, and tells everything itself."""
+TAKE_UP_ANNOUNCE: Final = 3.0
+"""What was taken up is told to subscribers when all have answered or hang, or after this long: to ask 500 nodes takes
+a second, and what follows from each (connections to it, the aggregator's among them) would come between."""
 
 # --- bridge ---------------------------------------------------------------------------------------------------
 ROUTE_OPEN_TIMEOUT: Final = 5.0
 """From asking a peer for a topic to its answer; then the route is asked for again."""
 ROUTE_LINGER: Final = 1.0
 """A route stays open this long after its last local subscriber left: reconnecting nodes flap."""
-ROUTES_PER_LINK_MAX: Final = 8192
-"""Open routes that one peer may hold with us."""
 ADVERTISED_AT_ONCE: Final = 64
 """Sources in one advertisement of ours; more follow in the next turn of the loop."""
+TELL_BACKLOG: Final = 8 * KIB
+"""Bytes under way to a peer above which the next portion of a graph waits: a portion has some 6 KB, and data does not
+wait for more than 12 ms behind both on 10 Mbit/s. All of 10,000 topics at once were 0.8 s."""
+TELL_PAUSE: Final = 0.005
+"""Before it is looked again."""
+TELL_PATIENCE: Final = 0.1
+"""A portion waits no longer than this: on a lane that is never empty the graph must get on too, by 0.5 Mbit/s."""
 ADVERTISEMENT_MAX: Final = 1 * MIB
 """One advertisement, which is read in one piece: ours are 200 KB with the longest names, and 5 KB with usual ones."""
 ADVERTISED_WAITING_BYTES: Final = 4 * MIB
@@ -441,20 +611,26 @@ LEARNT_AT_ONCE: Final = 16
 """Sources of an advertisement that are dealt with at once, some 100 microseconds; then data goes first."""
 RESCANNED_AT_ONCE: Final = 16
 """Topics of the local graph that are looked at in one turn of the loop, after a change or to reconcile."""
-TOPICS_PER_PEER_MAX: Final = 16384
-"""(topic, node) pairs that one peer may advertise."""
-NODES_PER_PEER_MAX: Final = 256
-"""Nodes of one peer that get a proxy here: each takes two listening sockets; large robots have some 100 nodes."""
+TOPICS_PER_PEER_MAX: Final = 32_768
+"""Default of ``limits.topics``: (topic, node) pairs of one peer that are known here, those that this module offers,
+and open routes of one peer. Each takes some 5 KB."""
+NODES_PER_PEER_MAX: Final = 4096
+"""Default of ``limits.nodes``: nodes of one peer that get a proxy here. Each takes some 15 KB; large robots have some
+hundred, fleets behind a relay a few thousand."""
+SURPLUS_MAX: Final = 32_768
+"""Topics, and services, of one peer beyond ``[limits]`` that are remembered, some 400 B each: they are shown as soon
+as there is room. Further ones are counted, and come with the peer's next link."""
+ADVERTISED_MAX: Final = 16_384
+"""Topics or services in one advertisement of a peer; ours have ``ADVERTISED_AT_ONCE``."""
 MISMATCHES_MAX: Final = 16
 """Refused subscribers of one source that are remembered for the user."""
 RELAY_HOPS_MAX: Final = 4
 """Relays between two modules: five networks in a row; each adds a hop's delay, and longer rows are a mistake."""
 SERVICE_ROUTES: Final = 1 << 31
 """Routes from here on are those of services: topics' are counted from 1."""
-SERVICES_PER_PEER_MAX: Final = 8192
-"""Services that one peer may advertise; a large robot's nodes have some 500, loggers left out."""
-SERVICE_SESSIONS_MAX: Final = 8192
-"""Services that one peer may have open with us at once."""
+SERVICES_PER_PEER_MAX: Final = 16_384
+"""Default of ``limits.services``: services of one peer that are known here, those that this module offers, and those
+that one peer has open at once. A large robot's nodes have some 500, loggers left out."""
 SERVICE_TIMEOUT_MAX: Final = 3600.0
 """Longest time that a call may be given: a caller of a server that hangs is told so within the hour."""
 SERVICE_GRACE: Final = 1.0
@@ -496,8 +672,9 @@ WHY_SOURCES_MAX: Final = 64
 PARAM_PORTION: Final = 16 * KIB
 """Characters of a parameter that cross at once: a millisecond of a 100 Mbit/s link, and the next portion is asked for
 when this one is there, so commands do not wait behind megabytes."""
-PARAM_TEXT_MAX: Final = HTTP_BODY_MAX
-"""Characters of a parameter as XML-RPC text: what a core itself takes in one call."""
+PARAM_TEXT_MAX: Final = 16 * MIB
+"""Characters of a parameter as XML-RPC text that crosses between modules; within one module ``HTTP_BODY_MAX`` holds.
+A peer may read and write ``PARAM_TRANSFERS`` of these at a time: 128 MiB."""
 PARAM_TRANSFERS: Final = 4
 """Parameters that one peer reads or writes at a time; the one that was begun first gives way."""
 PARAM_TRANSFER_IDLE: Final = 30.0
@@ -512,14 +689,23 @@ PARAM_GATHER: Final = 0.05
 PARAM_SMALL: Final = 64 * KIB
 """Followed parameters up to this size are compared each RECONCILE_INTERVAL; larger ones are trusted to the core's own
 notifications, and compared when the core was restarted."""
-FOLLOWERS_KEYS_MAX: Final = FOLLOWED_MAX
-"""Parameters that one peer may follow here."""
 FOLLOWED_BYTES_MAX: Final = 64 * MIB
 """All followed parameters as they are remembered here, to be put back."""
 CROSSING_NAME_MAX: Final = 1024
 """Characters of a topic's, node's or type's name that crosses the mesh; the longest seen have some 200."""
 CONTROL_TEXT_MAX: Final = 16 * KIB
 """Characters of a text for people in a control message."""
+NODE_KILL_WAIT: Final = 3.0
+"""Seconds that a node has to end after it was asked to; a node with much to put away takes a second or two."""
+NODE_KILL_LOOK: Final = 0.2
+"""Seconds between two looks whether it has ended."""
+NODE_KILL_TIMEOUT: Final = 10.0
+"""For a peer's agent to end a node: its answer to the call, and the wait."""
+NODE_KILLS_AT_ONCE: Final = 16
+"""Nodes of peers whose end is asked for at one time; further ones are refused."""
+NODE_KILL_ALL: Final = 2.0
+"""Seconds in which the caller that asked the agent's own node to end ends no node of another module, counted anew
+from each such call: `rosnode kill -a` asks all nodes of the graph, one after the other."""
 CALL_BACK_DELAYS: Final = (0.05, 1.0)
 """When a proxy is registered again whose subscribers were hung up on: at once, and for those that noticed late."""
 RECONCILE_INTERVAL: Final = 5.0
@@ -533,6 +719,10 @@ WATCH_RUN: Final = 1.0
 QUALITY_WINDOW: Final = 512
 """Messages of a remote source that its figures are made of, a power of two: 10 KB a route, and a 99th percentile that
 five of them exceed."""
+QUALITY_RATE_SPAN: Final = 1.0
+"""Seconds that a rate is counted over where the window above is shorter: at 47 kHz that holds one burst of 11 ms."""
+QUALITY_SILENCE: Final = 0.1
+"""A shorter silence is our own pause between two reads, not the source's, and counts for no rate."""
 QUALITY_SPAN: Final = 60.0
 """Older messages tell nothing of how a source is now."""
 QUALITY_CLOCKS: Final = 128
@@ -580,7 +770,8 @@ DOCTOR_NAME: Final = 5.0
 DOCTOR_OUTPUT_MAX: Final = 4 * MIB
 """Of such a program; the rules of a Kubernetes node have some 100 KB."""
 DOCTOR_FILES_LOW: Final = 4096
-"""Open files below which an agent of a large graph runs out: a proxy takes two, and each subscriber one."""
+"""Open files below which an agent of a large graph runs out: each subscriber takes one, and a proxy two where proxies
+cannot share their sockets."""
 DOCTOR_CLOCK_LOOK: Final = 0.3
 """Between two looks at both clocks, to see one being set."""
 DOCTOR_CLOCK_STEP: Final = 0.005

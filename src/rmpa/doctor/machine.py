@@ -69,13 +69,14 @@ class Rights:
         fifo: Why SCHED_FIFO is refused, or empty.
         memlock: Bytes that may be locked; ``None`` for any number.
         wanted: Whether the settings ask for real time.
-        files: Open files that a process may have at the most.
+        files: Open files that a program started here may have at the most; ``None`` where agents run, which tell
+            theirs.
     """
 
     fifo: str
     memlock: int | None
     wanted: bool
-    files: int
+    files: int | None
 
 
 def judge_rights(rights: Rights) -> list[Finding]:
@@ -95,10 +96,12 @@ def judge_rights(rights: Rights) -> list[Finding]:
         level = Level.WARN if rights.wanted else Level.OK
         asked = "" if rights.wanted else "; nobody asks for it (rmpa up --realtime)"
         found = [Finding("realtime", "", level, "; ".join(missing) + asked, remedy if rights.wanted else "")]
+    if rights.files is None:
+        return found
     if rights.files < limits.DOCTOR_FILES_LOW:
-        text = f"a process may have {rights.files} open: a graph of some hundred nodes takes more"
+        text = f"an agent started here may have {rights.files} open: a graph of some hundred nodes takes more"
         remedy = "systemd: LimitNOFILE=65536; a log-in: 'USER - nofile 65536' in /etc/security/limits.d/rmpa.conf"
         found.append(Finding("files", "", Level.WARN, text, remedy))
     else:
-        found.append(Finding("files", "", Level.OK, f"a process may have {rights.files} open"))
+        found.append(Finding("files", "", Level.OK, f"an agent started here may have {rights.files} open"))
     return found

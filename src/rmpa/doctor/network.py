@@ -154,6 +154,27 @@ def judge_rp_filter(values: Mapping[str, int], cards: Sequence[Card]) -> list[Fi
     return [Finding("rp_filter", "", Level.OK, "nothing is dropped for coming by the wrong interface")]
 
 
+def judge_mtu_probing(value: int | None, *, black_hole: bool) -> Finding:
+    """Whether the kernel finds the MTU of a path that drops large packets without a word.
+
+    Agents do it for their own links; this is about all other TCP connections.
+
+    Args:
+        value: ``net.ipv4.tcp_mtu_probing``: 0 never, 1 behind a black hole, 2 always; ``None``: not known.
+        black_hole: Whether an agent has met such a path.
+    """
+    if value is None:
+        return Finding("mtu", "probing", Level.SKIPPED, "this kernel does not tell")
+    name = "net.ipv4.tcp_mtu_probing"
+    if value:
+        return Finding("mtu", "probing", Level.OK, f"{name} is {value}: TCP finds a path's MTU itself")
+    if black_hole:
+        text = f"a path drops large packets, and {name} is 0: ssh and other programs hang on it"
+        return Finding("mtu", "probing", Level.WARN, text, f"sudo sysctl -w {name}=1 (on both machines)")
+    text = f"{name} is 0, Linux's default; agents find a path that drops large packets themselves"
+    return Finding("mtu", "probing", Level.OK, text)
+
+
 def judge_routes(routes: Mapping[str, str]) -> list[Finding]:
     """Whether the kernel has a way to each address that agents want to reach.
 
@@ -180,7 +201,8 @@ class Port:
         what: For what, ready to read.
         number: Its number.
         taken: Why it cannot be had, or empty.
-        owner: Who has it, ready to read; empty if nobody or unknown.
+        owner: Who has it, ready to read; empty if nobody or unknown. A port that is not ``taken`` may have one too:
+            agents share the port of the beacons.
         ours: Whether that is an agent, or an agent's core, of this machine.
     """
 
@@ -196,7 +218,8 @@ def judge_ports(ports: Iterable[Port]) -> list[Finding]:
     found = []
     for port in ports:
         if not port.taken:
-            found.append(Finding("port", str(port.number), Level.OK, f"{port.what}: free"))
+            text = f"used by {port.owner}; others may use it too" if port.owner else "free"
+            found.append(Finding("port", str(port.number), Level.OK, f"{port.what}: {text}"))
         elif port.ours:
             found.append(Finding("port", str(port.number), Level.OK, f"{port.what}: {port.owner} has it"))
         else:

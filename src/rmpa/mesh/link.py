@@ -382,7 +382,9 @@ class Link:
         elif self._state is State.HANDSHAKING:
             self._end(f"{self._name} did not finish the handshake within {limits.HANDSHAKE_TIMEOUT:g} s")
         elif now >= self._lease_over:
-            self._end(f"{self._name} was silent for its lease of {self._lease_over - self._heard:g} s")
+            excused = self._excused_now
+            ours = f", our own pauses of {excused:.2g} s not counted" if excused else ""
+            self._end(f"{self._name} was silent for its lease of {self._awaited_lease:g} s{ours}")
         else:
             self._ping(now)
 
@@ -403,17 +405,25 @@ class Link:
         Behind our welcome a whole round trip goes by before the dialler's first word, which is still a part of the
         handshake's time: with the lease alone, no link with a round trip above it would ever come up for good.
         """
+        return self._heard + self._awaited_lease + self._excused_now
+
+    @property
+    def _awaited_lease(self) -> float:
+        """How long the other side may be silent now, in seconds that we looked."""
         awaited = self.role is Role.ACCEPTOR and self._heard <= self._welcomed
-        lease = max(self._remote_lease, limits.HANDSHAKE_TIMEOUT) if awaited else self._remote_lease
-        return self._heard + lease + (self._excused if self._excused_behind == self._heard else 0.0)
+        return max(self._remote_lease, limits.HANDSHAKE_TIMEOUT) if awaited else self._remote_lease
+
+    @property
+    def _excused_now(self) -> float:
+        """Seconds of this silence in which we did not look."""
+        return self._excused if self._excused_behind == self._heard else 0.0
 
     def _excuse(self, late: float) -> None:
         """Let the other side's silence last longer by the time for which we did not look.
 
         Whose timers come late was away itself: stopped, or without a processor. That is no peer's death.
         """
-        before = self._excused if self._excused_behind == self._heard else 0.0
-        self._excused, self._excused_behind = before + late, self._heard
+        self._excused, self._excused_behind = self._excused_now + late, self._heard
 
     def _admit(self, kind: int) -> bool:
         """Whether a frame of this kind is read now; ``False`` when we are leaving and read nothing more."""

@@ -10,7 +10,7 @@ acknowledged it; the next link begins behind the last message that the receiver 
 
 A message is received when its last fragment is; one cut in the middle is sent again whole. What the sender had to
 drop because its bounds were reached shows as a jump of the sequence, so the receiver knows exactly how many
-messages will never come.
+messages will never come. That holds for a sender that keeps nothing any more, too (``forgo``): it goes on numbering.
 
 Sequence numbers have 32 bits and wrap; they are compared as in RFC 1982: of two, the later one is less than 2³¹
 ahead. An *epoch* names one run of a numbering: a sender that was given up is followed by one of another epoch.
@@ -42,6 +42,54 @@ class Outgoing(NamedTuple):
     sequence: int
     stamp_ns: int
     payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class EndedNumbering:
+    """What is left of a sender that was given up: what that costs its receiver, once its position is known.
+
+    Args:
+        epoch: Names the numbering.
+        confirmed: The receiver has everything up to this message, as far as it has acknowledged.
+        highest: The highest sequence that was sent.
+        following: The sequence that the next message would have had.
+        gaps: Messages lost before ``confirmed``; the receiver has seen these as gaps.
+        dropped: (last sequence, count) of gaps between ``confirmed`` and ``highest``, in order: mostly none.
+    """
+
+    epoch: int
+    confirmed: int
+    highest: int
+    following: int
+    gaps: int
+    dropped: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def told(self) -> int:
+        """Messages lost that the receiver has seen as gaps, or was to see as such."""
+        return self.gaps + sum(count for _, count in self.dropped)
+
+    def untold(self, after: int | None = None) -> int:
+        """Messages that the receiver misses and does not know of.
+
+        Args:
+            after: The last message that it has; ``None``, or one that cannot be: as far as it has acknowledged.
+        """
+        return (self.following - 1 - self._position(after)) & _MASK
+
+    def lost(self, after: int | None = None) -> int:
+        """All messages of the numbering that the receiver misses; see ``untold``."""
+        ahead = (self._position(after) - self.confirmed) & _MASK
+        seen = 0
+        for sequence, count in self.dropped:
+            before = ((sequence - self.confirmed) & _MASK) - count
+            seen += min(max(ahead - before, 0), count)
+        return self.gaps + seen + self.untold(after)
+
+    def _position(self, after: int | None) -> int:
+        if after is None or (after - self.confirmed) & _MASK > (self.highest - self.confirmed) & _MASK:
+            return self.confirmed
+        return after
 
 
 class ReliableSender:
@@ -83,10 +131,11 @@ class ReliableSender:
         self._bytes = 0
         self._under_way_bytes = 0
         self._linked = True
+        self._forgone = False
         self._next = self.first
         self._acknowledged = (first - 1) & _MASK
         self._highest = self._acknowledged
-        """The highest sequence sent over any link."""
+        """The highest sequence sent over any link, or said to be lost."""
 
     @property
     def next_sequence(self) -> int:
@@ -118,8 +167,26 @@ class ReliableSender:
         """Whether all that was offered has arrived or is lost for good."""
         return not (self._unsent or self._sent or self._doubtful)
 
+    @property
+    def forgone(self) -> bool:
+        """Whether messages are only counted, until ``resume``."""
+        return self._forgone
+
+    @property
+    def following(self) -> int:
+        """The sequence of the next message that will be sent: of the oldest one that waits, else of the next one."""
+        return self._unsent[0].sequence if self._unsent else self._next
+
+    @property
+    def lost(self) -> int:
+        """Messages that the receiver will never get; without a link those count that may have arrived."""
+        return self.overflowed if self._linked else self.overflowed + len(self._doubtful)
+
     def offer(self, payload: bytes, stamp_ns: int) -> None:
         """Take one more message; it is kept, so it must not be a view into a buffer."""
+        if self._forgone:
+            self._count()
+            return
         self._unsent.append(Outgoing(self._next, stamp_ns, payload))
         self._next = (self._next + 1) & _MASK
         self._bytes += len(payload)
@@ -148,8 +215,8 @@ class ReliableSender:
             self._sent.append(self._unsent.popleft())
             self._under_way_bytes += size
             taken.append(message)
-        if taken and (taken[-1].sequence - self._highest) & _MASK < _HALF:
-            self._highest = taken[-1].sequence
+        if taken:
+            self._sent_up_to(taken[-1].sequence)
         return taken
 
     def untake(self) -> None:
@@ -183,6 +250,38 @@ class ReliableSender:
         self._under_way_bytes = 0
         self._linked = False
 
+    def forgo(self) -> None:
+        """The link has been gone for too long: let go of everything, and only count what comes, until ``resume``.
+
+        Raises:
+            LocalProtocolError: There is a link.
+        """
+        if self._linked:
+            raise LocalProtocolError("a sender with a link keeps what its receiver has not acknowledged")
+        while self._unsent:
+            self._drop_oldest()
+        self._forgone = True
+
+    def ended(self) -> EndedNumbering:
+        """What is left of this sender when it is given up."""
+        kept = sorted(
+            (sequence - self._acknowledged) & _MASK
+            for sequence in (
+                *(sequence for sequence, _ in self._doubtful),
+                *(message.sequence for message in (*self._sent, *self._unsent)),
+            )
+        )
+        ahead = (self._highest - self._acknowledged) & _MASK
+        dropped = []
+        before = 0
+        for offset in (*(one for one in kept if one <= ahead), ahead + 1):
+            if offset - before > 1:
+                dropped.append(((self._acknowledged + offset - 1) & _MASK, offset - before - 1))
+            before = offset
+        behind = (self._next - 1 - self._acknowledged) & _MASK
+        gaps = self.overflowed - (behind - len(kept))
+        return EndedNumbering(self.epoch, self._acknowledged, self._highest, self._next, gaps, tuple(dropped))
+
     def resume(self, after: int) -> None:
         """There is a new link, and the receiver has everything up to ``after``: go on from there.
 
@@ -197,6 +296,9 @@ class ReliableSender:
         self._doubtful.clear()
         self._under_way_bytes = 0
         self._linked = True
+        self._forgone = False
+        # The receiver is told which message follows, and then has all up to it, be it as a gap.
+        self._sent_up_to(self.following - 1)
 
     def rewind(self) -> None:
         """The link lost a part of what is under way, nobody knows which: all of it is to be sent again.
@@ -205,6 +307,10 @@ class ReliableSender:
         """
         if self._linked:
             self.resume(self._acknowledged)
+
+    def _sent_up_to(self, sequence: int) -> None:
+        if (sequence - self._highest) & _MASK < _HALF:
+            self._highest = sequence & _MASK
 
     def _check(self, ahead: int, sequence: int, verb: str) -> None:
         if ahead > (self._highest - self._acknowledged) & _MASK:
@@ -226,6 +332,12 @@ class ReliableSender:
         while self._unsent and (self._unsent[0].sequence - base) & _MASK <= ahead:
             self._bytes -= len(self._unsent.popleft().payload)
         self._acknowledged = (base + ahead) & _MASK
+
+    def _count(self) -> None:
+        """One more message that will not be sent; numbered, unless the receiver could not tell it from an old one."""
+        self.overflowed += 1
+        if (self._next - self._acknowledged) & _MASK < _HALF - 1:
+            self._next = (self._next + 1) & _MASK
 
     def _drop_oldest(self) -> None:
         """Let go of the oldest kept message; one under way stays in the window until it is acknowledged."""
@@ -308,6 +420,15 @@ class ReliableReceiver:
         self.breaks += known
         return not known
 
+    def skip(self, following: int) -> int:
+        """The sender says which message comes next; return how many before it will never come."""
+        gap = 0 if self._next is None else (following - self._next) & _MASK
+        if not 0 < gap < _HALF:
+            return 0
+        self._next = following
+        self.gap_total += gap
+        return gap
+
     def judge(self, sequence: int, epoch: int) -> Verdict:
         """What ``accept`` would say, at a message's first fragment; nothing changes until its last one has come."""
         if epoch != self._epoch:
@@ -366,35 +487,45 @@ class _Parked:
 
 
 class ResumeTable(Generic[_Key]):
-    """Senders whose link is gone, kept for ``limits.RESUME_WINDOW`` in case their receivers come back.
+    """Senders whose link is gone, in case their receivers come back.
 
-    At most ``limits.RESUMES_MAX`` of them and ``limits.RESUME_BYTES_MAX``; beyond a bound the one parked longest
-    is given up. A key names the receiver and the source. While a sender is parked, offer to it by ``offer``.
+    Each keeps its messages for a time of its own. Of those that keep some there are at most ``limits.RESUMES_MAX``
+    with ``limits.RESUME_BYTES_MAX``; beyond a bound the one parked longest lets its messages go. Those that have let
+    them go only count what comes; they stay until they are claimed, at most ``limits.RESUMES_COUNTED_MAX``, of which
+    the one that counts for longest is forgotten first. A key names the receiver and the source. While a sender is
+    parked, offer to it by ``offer``.
     """
 
     def __init__(self) -> None:
         self._parked: OrderedDict[_Key, _Parked] = OrderedDict()
+        self._counting: OrderedDict[_Key, ReliableSender] = OrderedDict()
         self._bytes = 0
-        self.given_up = 0
-        """Messages lost with senders that were given up."""
 
     def __len__(self) -> int:
-        return len(self._parked)
+        return len(self._parked) + len(self._counting)
 
     @property
     def pending_bytes(self) -> int:
         """Bytes kept by all parked senders."""
         return self._bytes
 
-    def park(self, key: _Key, sender: ReliableSender, now: float) -> list[_Key]:
-        """Suspend a sender and keep it; one already there under this key is replaced.
+    def park(self, key: _Key, sender: ReliableSender, until: float) -> list[_Key]:
+        """Suspend a sender and keep its messages until some time; one already there under this key is replaced.
+
+        Args:
+            key: Its receiver and source.
+            sender: The sender.
+            until: Monotonic seconds.
 
         Returns:
-            The keys given up for it; its own, if it is too large for the table.
+            The keys of senders that let their messages go for it; its own, if it is too large for the table.
         """
         sender.suspend()
         self._remove(key)
-        self._parked[key] = _Parked(sender, now + limits.RESUME_WINDOW, sender.pending_bytes)
+        if sender.forgone:
+            self._counting[key] = sender
+            return []
+        self._parked[key] = _Parked(sender, until, sender.pending_bytes)
         self._bytes += sender.pending_bytes
         return self._shrink()
 
@@ -402,59 +533,68 @@ class ResumeTable(Generic[_Key]):
         """A message for a parked sender; nothing happens if it is not there.
 
         Returns:
-            The keys given up for it.
+            The keys of senders that let their messages go for it.
         """
         parked = self._parked.get(key)
         if parked is None:
+            if (sender := self._counting.get(key)) is not None:
+                sender.offer(payload, stamp_ns)
             return []
         parked.sender.offer(payload, stamp_ns)
         self._bytes += parked.sender.pending_bytes - parked.size
         parked.size = parked.sender.pending_bytes
         return self._shrink()
 
-    def claim(self, key: _Key, epoch: int | None, now: float) -> ReliableSender | None:
-        """The receiver is back: its sender, still suspended, if it is here in time and of this epoch.
+    def claim(self, key: _Key, epoch: int | None) -> ReliableSender | None:
+        """The receiver is back: its sender, still suspended, if it is here and of this epoch.
 
         Whatever was parked under the key leaves the table: a receiver that asks for another epoch has no use for it.
         """
-        parked = self._remove(key)
-        if parked is None:
-            return None
-        if parked.sender.epoch != epoch or now >= parked.until:
-            self.given_up += parked.sender.pending
-            return None
-        return parked.sender
+        sender = self._remove(key)
+        return sender if sender is not None and sender.epoch == epoch else None
+
+    def move(self, old: _Key, new: _Key) -> None:
+        """A sender that is parked under one key is parked under another one from now on."""
+        if (parked := self._parked.pop(old, None)) is not None:
+            self._parked[new] = parked
+        elif (sender := self._counting.pop(old, None)) is not None:
+            self._counting[new] = sender
 
     def expire(self, now: float) -> list[_Key]:
-        """Give up those whose time is over; return their keys."""
-        keys = []
-        while self._parked:
-            key, parked = next(iter(self._parked.items()))
-            if now < parked.until:
-                break
-            self._give_up(key)
-            keys.append(key)
+        """Let those whose time is over only count; return their keys."""
+        keys = [key for key, parked in self._parked.items() if parked.until <= now]
+        for key in keys:
+            self._forgo(key)
         return keys
 
     def next_timer(self) -> float | None:
         """When ``expire`` is due, in monotonic seconds."""
-        return next(iter(self._parked.values())).until if self._parked else None
+        return min((parked.until for parked in self._parked.values()), default=None)
+
+    def forget(self) -> list[_Key]:
+        """Let go of those that have only counted for longest, beyond their bound; return their keys."""
+        keys = []
+        while len(self._counting) > limits.RESUMES_COUNTED_MAX:
+            keys.append(self._counting.popitem(last=False)[0])
+        return keys
 
     def _shrink(self) -> list[_Key]:
         keys = []
         while len(self._parked) > limits.RESUMES_MAX or self._bytes > limits.RESUME_BYTES_MAX:
             key = next(iter(self._parked))
-            self._give_up(key)
+            self._forgo(key)
             keys.append(key)
         return keys
 
-    def _give_up(self, key: _Key) -> None:
-        parked = self._remove(key)
-        if parked is not None:
-            self.given_up += parked.sender.pending
+    def _forgo(self, key: _Key) -> None:
+        sender = self._remove(key)
+        if sender is not None:
+            sender.forgo()
+            self._counting[key] = sender
 
-    def _remove(self, key: _Key) -> _Parked | None:
+    def _remove(self, key: _Key) -> ReliableSender | None:
         parked = self._parked.pop(key, None)
-        if parked is not None:
-            self._bytes -= parked.size
-        return parked
+        if parked is None:
+            return self._counting.pop(key, None)
+        self._bytes -= parked.size
+        return parked.sender

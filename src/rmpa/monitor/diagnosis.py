@@ -83,6 +83,11 @@ class FarSource(msgspec.Struct, frozen=True, kw_only=True):
             ``open``.
         messages: That the agent has had of it since it connected.
         dropped: Of these, those given up because a link was too slow.
+        lost: Messages of a reliable route to the one that asks that were given up, because it was away for too long.
+        oversized: Messages that are too long, and were left out.
+        oversized_bytes: The last one's.
+        beyond: That module's ``limits.topics``, if it is not offered because there are more; else 0.
+        unreachable: Why its agent cannot connect to its node, ready to read; empty where it can.
     """
 
     node: str
@@ -94,6 +99,11 @@ class FarSource(msgspec.Struct, frozen=True, kw_only=True):
     route: str = ""
     messages: int = 0
     dropped: int = 0
+    lost: int = 0
+    oversized: int = 0
+    oversized_bytes: int = 0
+    beyond: int = 0
+    unreachable: str = ""
 
 
 class FarTopic(msgspec.Struct, frozen=True, kw_only=True):
@@ -103,11 +113,18 @@ class FarTopic(msgspec.Struct, frozen=True, kw_only=True):
         sources: Its module's own publishers of the topic.
         subscribers: Its module's own subscribers.
         near: A topic over there of nearly this name, or empty.
+        awaited: Nodes that published it before its agent was restarted, with their addresses, and do not answer now.
+        path_problem: What is wrong with the path from there to the one that asks, ready to read; empty if nothing is
+            known.
+        path_remedy: What to do about that.
     """
 
     sources: tuple[FarSource, ...] = ()
     subscribers: tuple[str, ...] = ()
     near: str = ""
+    awaited: tuple[str, ...] = ()
+    path_problem: str = ""
+    path_remedy: str = ""
 
 
 class Reader(msgspec.Struct, frozen=True, kw_only=True):

@@ -9,6 +9,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
+from rmpa.core.open_files import remedy
 from rmpa.monitor.health_values import agent_values, link_values, number, route_values, service_values
 from rmpa.ros.diagnostic_array import Level, Status
 
@@ -20,12 +21,15 @@ if TYPE_CHECKING:
 HERE: Final = "rmpa: this module"
 """The agent's own status."""
 _LINKED: Final = "linked"
+_UNKNOWN: Final = "loss_unknown"
 _LOST, _RESTORED, _DEADLINE = "liveliness_lost", "liveliness_restored", "deadline_missed"
 _MISSES: Final = {
     "lost": "lost",
     "late": "late",
     "expired": "beyond their lifespan",
     "dropped": "dropped for a slow receiver",
+    "oversized": "left out, too long to cross",
+    _UNKNOWN: "times an unknown number lost",
     _DEADLINE: "deadlines missed",
 }
 
@@ -65,7 +69,15 @@ class Health:
             counts[name] = _missing(route)
             self._topics.setdefault(route.peer, set()).add(name)
             yield _route(name, here, topic, route, self._new(name, counts[name]))
+        for name, route in _outgoing(snapshot.topics):
+            counts[name] = Counter(lost=route.lost, oversized=route.oversized)
+            # A status that was not there before: nothing was missed then.
+            before = self._counts.get(name, Counter()) if self._counts else counts[name]
+            yield _sent(name, here, route, counts[name] - before)
         yield from _refused(snapshot, here)
+        for node in snapshot.unreachable:
+            values = {"unreachable for (s)": number(node.ago)}
+            yield Status(Level.WARN, f"rmpa: node {node.node}", str(node), here, values)
         for service in snapshot.services:
             if service.calls:
                 name = f"rmpa: {service.peer}: " if service.peer else "rmpa: "
@@ -120,6 +132,27 @@ def _named(topics: tuple[TopicInfo, ...]) -> Iterator[tuple[str, TopicInfo, Rout
             yield name if taken[name] == 1 else f"{name} #{taken[name]}", topic, route
 
 
+def _outgoing(topics: tuple[TopicInfo, ...]) -> Iterator[tuple[str, RouteInfo]]:
+    """What peers miss, or may miss, of what goes to them, each with its status's name, which must be unique."""
+    taken: Counter[str] = Counter()
+    for topic in topics:
+        for route in topic.routes:
+            if route.direction == "out" and (route.state == "away" or route.lost or route.oversized):
+                name = f"rmpa: to {route.peer}: {topic.name} ({route.node})"
+                taken[name] += 1
+                yield name if taken[name] == 1 else f"{name} #{taken[name]}", route
+
+
+def _sent(name: str, here: str, route: RouteInfo, new: Counter[str]) -> Status:
+    """What a peer misses: worth a warning while it is away, and when it has become more."""
+    texts = [route.problem] if route.problem else []
+    texts += [f"{count} {_MISSES[kind]}" for kind, count in new.items()]
+    if route.lost and not new["lost"]:
+        texts.append(f"{route.lost} messages lost to it until now")
+    level = Level.WARN if new or (route.state == "away" and route.lost) else Level.OK
+    return Status(level, name, "; ".join(texts) or "nothing is missed", here, route_values(route))
+
+
 def _refused(snapshot: Snapshot, here: str) -> Iterator[Status]:
     """Our own topics that somebody elsewhere could not take; one that comes from a peer has a status already."""
     for topic in snapshot.topics:
@@ -142,22 +175,32 @@ def _missing(route: RouteInfo) -> Counter[str]:
         late=route.late,
         expired=route.expired,
         dropped=route.dropped,
+        oversized=route.oversized,
         deadline_missed=route.events.get(_DEADLINE, 0),
+        loss_unknown=route.events.get(_UNKNOWN, 0),
     )
 
 
 def _agent(snapshot: Snapshot) -> Status:
     linked = sum(info.state == _LINKED for info in snapshot.peers)
-    text = "; ".join(snapshot.notes) or f"{linked} of {len(snapshot.peers)} known peers linked"
-    return Status(
-        Level.WARN if snapshot.notes else Level.OK, HERE, text, snapshot.agent.name, agent_values(snapshot, linked)
-    )
+    notes, files = list(snapshot.notes), snapshot.agent.files
+    if files is not None and files.near and not files.problem:
+        notes.append(f"{files.open} of {files.limit} file descriptors are open; {remedy(snapshot.agent.pid)}")
+    level = Level.WARN if notes else Level.OK
+    if files is not None and files.problem:
+        level = Level.ERROR
+    text = "; ".join(notes) or f"{linked} of {len(snapshot.peers)} known peers linked"
+    return Status(level, HERE, text, snapshot.agent.name, agent_values(snapshot, linked))
 
 
 def _peer(name: str, here: str, info: PeerInfo, new: Counter[str], *, was_linked: bool) -> Status:
     link = info.link
     if info.state == _LINKED and link is not None:
         level, text = Level.OK, "linked" + (f", round trip {link.rtt * 1e3:.2f} ms" if link.rtt is not None else "")
+        troubles = [f"{link.path_problem}; {link.path_remedy}"] if link.path_problem else []
+        troubles += [bound.text for bound in info.beyond]
+        if troubles:
+            level, text = Level.WARN, "; ".join(troubles)
         if new["dropped"]:
             level, text = Level.WARN, f"{new['dropped']} messages dropped: the link takes them too slowly"
     elif info.state in ("conflict", "refused"):
@@ -175,6 +218,8 @@ def _route(name: str, here: str, topic: TopicInfo, route: RouteInfo, new: Counte
 
 def _judged(topic: TopicInfo, route: RouteInfo, new: Counter[str]) -> tuple[Level, str]:
     """The worst that is true of a route now, or since the last look."""
+    if route.limit:
+        return Level.WARN, route.problem  # the peer's own status says it for all of them
     if route.state == "hidden":
         return Level.ERROR, route.problem or "hidden"
     if route.events.get(_LOST, 0) > route.events.get(_RESTORED, 0):

@@ -21,12 +21,17 @@ def agent_values(snapshot: Snapshot, linked: int) -> dict[str, str]:
         "GUID": agent.guid,
         "domain": str(agent.domain),
         "ROS core": agent.core_uri,
+        "core memory": agent.core_memory,
         "version": agent.version,
         "uptime (s)": number(agent.uptime),
         "CPU (%)": number(agent.cpu),
         "memory (MB)": number(agent.rss, 1e-6),
+        "open files": str(agent.files.open) if agent.files else "",
+        "limit of open files": str(agent.files.limit) if agent.files else "",
         "peers": str(len(snapshot.peers)),
         "linked": str(linked),
+        "proxies": str(agent.proxies),
+        "proxies' listening sockets": str(agent.proxy_sockets),
         "real time": "; ".join(agent.realtime),
     }
     return _known(known) | {f"count {name}": str(count) for name, count in snapshot.counters.items()}
@@ -47,9 +52,14 @@ def link_values(info: PeerInfo) -> dict[str, str]:
             "bytes out": str(link.bytes_out),
             "queued (B)": str(link.queued),
             "dropped": str(link.dropped),
+            "packet (B)": number(link.packet),
+            "path": link.path_problem,
             "topics in": str(info.topics_in),
             "topics out": str(info.topics_out),
         }
+    for bound in info.beyond:
+        where = "here" if bound.here else "there"
+        known[f"{bound.kind} hidden {where} (limit {bound.limit})"] = str(bound.hidden)
     return _known(known)
 
 
@@ -102,7 +112,11 @@ def route_values(route: RouteInfo) -> dict[str, str]:
             "latency last (ms)": number(latency.last, 1e3),
             "latency error (± ms)": number(latency.error, 1e3),
         }
-    if route.messages or route.dropped:
+    if route.direction == "out":
+        known |= {"waiting": str(route.kept)}
+    if route.oversized:
+        known |= {"too long": str(route.oversized), "too long, last (B)": str(route.oversized_bytes)}
+    if route.messages or route.dropped or route.lost:
         counted = ("messages", "lost", "late", "expired", "dropped")
         known |= {name: str(getattr(route, name)) for name in counted}
     known |= {f"contract {key}": str(value) for key, value in route.contract.items()}

@@ -9,6 +9,28 @@ from __future__ import annotations
 import msgspec
 
 
+class FilesInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """The file descriptors of the agent's process.
+
+    Attributes:
+        open: How many are open.
+        limit: How many it may have (the soft limit, ``ulimit -n``).
+        hard: What the limit may be raised to (``ulimit -Hn``).
+        reserved: The last ones, kept for the ROS core, the control socket and the links to peers.
+        near: Whether there are soon none left for data.
+        refused: Attempts to accept or to dial so far for which there was none, repetitions among them.
+        problem: What waits for one now, and what to do, ready to read; empty where nothing does.
+    """
+
+    open: int
+    limit: int
+    hard: int
+    reserved: int
+    near: bool = False
+    refused: int = 0
+    problem: str = ""
+
+
 class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
     """The agent itself.
 
@@ -28,6 +50,12 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
         interfaces: The interfaces that beacons go out on.
         config_file: Where its settings were read, or empty.
         realtime: What came of each wish of ``--realtime``, ready to read; empty without it.
+        files: Its file descriptors.
+        proxies: Nodes of peers that stand in the local graph.
+        proxy_sockets: Sockets that listen for all of them together.
+        proxy_listening: How these are used, ready to read: the ports that all share, or why each has its own.
+        core_memory: Where the core keeps its registrations and parameters, and what it took up of the run before,
+            ready to read; empty for one that keeps nothing.
     """
 
     name: str
@@ -45,6 +73,11 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
     interfaces: tuple[str, ...] = ()
     config_file: str = ""
     realtime: tuple[str, ...] = ()
+    files: FilesInfo | None = None
+    proxies: int = 0
+    proxy_sockets: int = 0
+    proxy_listening: str = ""
+    core_memory: str = ""
 
 
 class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
@@ -62,6 +95,9 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
         queued: Bytes that wait for the peer to take them.
         dropped: Messages dropped because it took them too slowly.
         heard_ago: Seconds since anything arrived.
+        packet: Bytes of the largest packet that large messages leave in, headers included.
+        path_problem: What is wrong with the path to it, ready to read; empty if nothing is known.
+        path_remedy: What to do about that.
     """
 
     remote: str
@@ -75,6 +111,27 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
     queued: int = 0
     dropped: int = 0
     heard_ago: float | None = None
+    packet: int | None = None
+    path_problem: str = ""
+    path_remedy: str = ""
+
+
+class BoundInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """Something of a module that another one hides because there is more than its ``[limits]`` say.
+
+    Attributes:
+        kind: The limit: ``nodes``, ``topics`` or ``services``.
+        limit: Its value.
+        hidden: How many of these are hidden.
+        here: Whether they are the peer's and hidden here; else they are ours and hidden there.
+        text: Ready to read, with the remedy.
+    """
+
+    kind: str
+    limit: int
+    hidden: int
+    here: bool
+    text: str
 
 
 class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
@@ -99,6 +156,7 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
         topics_in: Topics that it offers us.
         topics_out: Topics that we offer it.
         via: The name of the peer that passes on what it publishes, if one does.
+        beyond: What of it is hidden here, and what of ours there, by the limits of either side.
     """
 
     name: str
@@ -117,6 +175,7 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
     topics_in: int = 0
     topics_out: int = 0
     via: str = ""
+    beyond: tuple[BoundInfo, ...] = ()
 
 
 class Spread(msgspec.Struct, kw_only=True, frozen=True):
@@ -187,13 +246,18 @@ class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
         node: The publishing node, by its name in its own graph.
         direction: ``in`` or ``out``.
         state: ``idle`` (visible, nobody listens), ``opening``, ``open``, ``lingering``, ``waiting`` (it failed and
-            is tried again) or ``hidden`` (not shown: see ``problem``).
+            is tried again) or ``hidden`` (not shown: see ``problem``); of those that go out ``open`` or ``away`` (the
+            peer has no link, and reliable messages are kept or counted for it).
         type: The message type that the source has.
         md5: Of that type; empty before it is known.
         messages: That crossed since the route was opened.
         bytes: Of these, without the lengths that TCPROS puts in front.
         dropped: Messages dropped because a receiver was slow.
-        lost: Messages that never came, by the gaps in their numbers.
+        lost: Messages that never came, by the gaps in their numbers and by what the sender says; of a route that goes
+            out: messages of a reliable one that were given up.
+        kept: Messages that wait for the peer, of a reliable route that goes out.
+        oversized: Messages that the publisher's agent left out because they are too long to cross.
+        oversized_bytes: The last one's.
         late: Messages that came behind newer ones, or that an outage held up, and were left out.
         expired: Messages dropped beyond their lifespan.
         age: Seconds since the last message.
@@ -209,6 +273,7 @@ class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
         recent: The last of these, oldest first.
         problem: Why it does not flow, ready to read; empty if nothing is wrong.
         wire: The topic's name over there, where that is another one than here.
+        limit: The setting that hides it, where one of ``[limits]`` does: ``nodes`` or ``topics``; else empty.
     """
 
     peer: str
@@ -221,6 +286,9 @@ class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
     bytes: int = 0
     dropped: int = 0
     lost: int = 0
+    kept: int = 0
+    oversized: int = 0
+    oversized_bytes: int = 0
     late: int = 0
     expired: int = 0
     age: float | None = None
@@ -236,6 +304,7 @@ class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
     recent: tuple[EventInfo, ...] = ()
     problem: str = ""
     wire: str = ""
+    limit: str = ""
 
 
 class TopicInfo(msgspec.Struct, kw_only=True, frozen=True):
@@ -251,6 +320,7 @@ class TopicInfo(msgspec.Struct, kw_only=True, frozen=True):
         crosses: Whether policy lets it cross.
         policy: The rule that says so, ready to read.
         mismatches: Sources with another type or md5, each ready to read.
+        unreachable: Local publishers that nothing can connect to, each ready to read.
     """
 
     name: str
@@ -262,6 +332,7 @@ class TopicInfo(msgspec.Struct, kw_only=True, frozen=True):
     crosses: bool = True
     policy: str = ""
     mismatches: tuple[str, ...] = ()
+    unreachable: tuple[str, ...] = ()
 
     @property
     def peers(self) -> tuple[str, ...]:
@@ -313,6 +384,29 @@ class ServiceInfo(msgspec.Struct, kw_only=True, frozen=True):
     problem: str = ""
 
 
+class UnreachableInfo(msgspec.Struct, kw_only=True, frozen=True):
+    """A node of the local graph that nothing can connect to; it may be dead, or its network may be down.
+
+    Attributes:
+        node: Its name.
+        uri: The slave API that it registered with.
+        problem: Why it cannot be reached, ready to read.
+        ago: Seconds since it was first found so.
+        withdrawn: Whether peers are not offered it any more.
+    """
+
+    node: str
+    uri: str
+    problem: str
+    ago: float
+    withdrawn: bool = False
+
+    def __str__(self) -> str:
+        """What is wrong, for people."""
+        text = f"{self.node} cannot be reached at {self.uri} ({self.problem})"
+        return f"{text}, so peers are not offered it" if self.withdrawn else text
+
+
 class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
     """Everything at one moment.
 
@@ -324,6 +418,7 @@ class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
         services: The graph's services and the peers', by name; of one name first the local one.
         counters: What was refused or dropped, by name: ``beacon.malformed`` …
         notes: What the user should know (a port taken, no multicast), each ready to read.
+        unreachable: Nodes of the local graph that nothing can connect to, by name.
     """
 
     agent: AgentInfo
@@ -333,6 +428,7 @@ class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
     services: tuple[ServiceInfo, ...] = ()
     counters: dict[str, int] = {}
     notes: tuple[str, ...] = ()
+    unreachable: tuple[UnreachableInfo, ...] = ()
 
 
 class FollowedInfo(msgspec.Struct, kw_only=True, frozen=True):

@@ -3,7 +3,7 @@
 Pure: what is known on both sides goes in, stages with their evidence come out, and the first that fails says what to
 do. The stages::
 
-    peer ─ link ─ publisher ─ policy there ─ offer ─ policy here ─ type ─ graph ─ subscriber ─ md5 ─ route
+    peer ─ link ─ publisher ─ policy there ─ offer ─ limit ─ policy here ─ type ─ graph ─ subscriber ─ md5 ─ route
          ─ sent ─ arrived ─ contract ─ reader
 """
 
@@ -51,8 +51,9 @@ def walk_peer(snapshot: Snapshot, name: str) -> tuple[Stage, ...]:
         )
         return (Stage("peer", _FAIL, text, remedy),)
     if peer.conflicts:
-        remedy = "give each module a --name and an address of its own"
-        return (Stage("peer", _FAIL, "; ".join(peer.conflicts), remedy),)
+        texts, remedies = zip(*(conflict.partition("; ")[::2] for conflict in peer.conflicts), strict=True)
+        remedy = "; ".join(filter(None, remedies)) or "give each module a --name and an address of its own"
+        return (Stage("peer", _FAIL, "; ".join(texts), remedy),)
     if peer.state == "relayed":
         heard = Stage("peer", _OK, f"{peer.name} is known ({peer.guid})")
         return (heard, Stage("link", _OK, f"no link of its own; {peer.via} passes on what it publishes"))
@@ -87,6 +88,8 @@ def _linked(peer: PeerInfo) -> Stage:
     if link.heard_ago is not None and link.heard_ago > limits.LINK_LEASE / 2:
         text += f"; silent for {link.heard_ago:.1f} s"
         return Stage("link", _WARN, text, "if it stays so, the cable or the radio is the place to look at")
+    if link.path_problem:
+        return Stage("link", _WARN, f"{text}; {link.path_problem}", link.path_remedy)
     return Stage("link", _OK, text)
 
 
@@ -166,6 +169,12 @@ def _published(sight: Sight, peer: str, wire: str) -> Stage:
         text = f"{nodes} on {peer} publish{'' if len(far.sources) > 1 else 'es'} {wire}"
         others = {source.topic for source in far.sources} - {"", wire}
         return Stage("publisher", _OK, f"{text} ({', '.join(sorted(others))} over there)" if others else text)
+    if far.awaited:
+        text = (
+            f"{', '.join(far.awaited)} published {wire} before the agent of {peer} was restarted, and does not answer"
+        )
+        remedy = "it is asked again by itself; is that program stopped or stuck? Else start it again"
+        return Stage("publisher", _FAIL, text, remedy)
     text = f"no node of {peer} publishes {wire}"
     if far.subscribers:
         text += f"; {', '.join(far.subscribers)} there only subscribe to it"
@@ -179,17 +188,24 @@ def _source_stages(sight: Sight, later: Sight | None, peer: str, node: str, wire
     """The stages of one publisher, lazily: nobody looks behind the first that fails."""
     far = _far(sight, node)
     yield _policy_there(far, peer)
+    if far is not None and far.unreachable:
+        yield _unreachable(far, peer)
     route = _route(sight, peer, node)
     if route is None:
         yield _not_offered(sight, far, peer)
         return
     yield Stage("offer", _OK, f"{sight.near.snapshot.agent.name} knows of it, as {route.type}")
+    if route.limit:
+        yield _limit(sight.near, route)
+        return
     yield _policy_here(sight.near, route)
     yield _type(sight.near, route)
     yield _in_graph(sight.near, route)
     yield from _subscriber(sight.near, route)
     now, now_far = _route(later, peer, node) or route, _far(later, node) or far
     yield _open_route(now, now_far, peer)
+    if sight.far is not None and sight.far.path_problem:
+        yield Stage("path", _WARN, f"{peer} says: {sight.far.path_problem}", sight.far.path_remedy)
     if now.state in _FLOWING:
         yield _sent(now, now_far, peer, wire)
         yield _arrived(route, now, far, now_far, peer, sight.near.snapshot.agent.name)
@@ -208,18 +224,43 @@ def _policy_there(far: FarSource | None, peer: str) -> Stage:
     return Stage("policy there", _FAIL, f"{peer} keeps it at home: {far.rule}", remedy)
 
 
+def _unreachable(far: FarSource, peer: str) -> Stage:
+    """The node is registered over there, and nothing there can connect to it."""
+    text = f"{far.node} is registered on {peer}, but cannot be reached at {far.unreachable}"
+    remedy = (
+        "if it is alive, start it with ROS_IP=127.0.0.1 (and no ROS_HOSTNAME) in its shell; if it is dead, "
+        f"`rosnode cleanup` on {peer} removes it"
+    )
+    return Stage("reachable", _FAIL, text, remedy)
+
+
 def _not_offered(sight: Sight, far: FarSource | None, peer: str) -> Stage:
     if far is not None and far.type in ("", "*"):
         text = f"its node has not told {peer}'s core what type it is"
         return Stage("offer", _FAIL, text, "a publisher tells its type when it registers; is it an old script?")
+    if far is not None and far.beyond:
+        text = f"{peer} does not offer it: it has more topics than limits.topics = {far.beyond} of that module"
+        return Stage("offer", _FAIL, text, "raise it over there and `rmpa reload`, or deny some by bridge.deny there")
     if far is not None and not far.offered:
-        text = f"{peer} does not offer it: more than {limits.TOPICS_PER_PEER_MAX} sources, or too long a name"
-        return Stage("offer", _FAIL, text, "deny some by bridge.deny over there")
+        text = f"{peer} does not offer it: its name or type is none that can cross, or is too long"
+        return Stage("offer", _FAIL, text, f"names of at most {limits.CROSSING_NAME_MAX} characters cross")
     peers = [p for p in sight.near.snapshot.peers if p.name == peer]
+    for bound in (bound for p in peers for bound in p.beyond if bound.here and bound.kind == "topics"):
+        text, _, remedy = bound.text.partition("; ")
+        return Stage("limit", _FAIL, text, remedy)
     count = peers[0].topics_in if peers else 0
     text = f"the offer of it has not come here ({count} topics of {peer} have)"
     remedy = f"if it stays so for more than {limits.RECONCILE_INTERVAL:g} s, it is a bug of ours: both logs, please"
     return Stage("offer", _FAIL, text, remedy)
+
+
+def _limit(near: Near, route: RouteInfo) -> Stage:
+    """The place that there is none of: the setting, and how much else it hides."""
+    peers = [p for p in near.snapshot.peers if p.name == route.peer]
+    hidden = [b.hidden for p in peers for b in p.beyond if b.here and b.kind == route.limit]
+    text = route.problem + (f"; {hidden[0]} {route.limit} of it are hidden" if hidden else "")
+    remedy = f"raise limits.{route.limit} in this module's rmpa.toml and `rmpa reload`, or deny what is not needed"
+    return Stage("limit", _FAIL, text, remedy)
 
 
 def _policy_here(near: Near, route: RouteInfo) -> Stage:
@@ -241,6 +282,9 @@ def _in_graph(near: Near, route: RouteInfo) -> Stage:
     proxy = near.proxies.get(route.node, f"/rmpa/{route.peer}{route.node}")
     if route.node not in near.registered:
         text = f"its proxy {proxy} is not in the local graph as a publisher of {near.topic}"
+        if route.problem:
+            problem, _, remedy = route.problem.partition("; ")
+            return Stage("graph", _FAIL, f"{text}: {problem}", remedy)
         remedy = f"it is put there again within {limits.RECONCILE_INTERVAL:g} s; if not, the agent's log says why"
         return Stage("graph", _FAIL, text, remedy)
     return Stage("graph", _OK, f"its proxy {proxy} stands in the local graph")
@@ -259,6 +303,16 @@ def _subscriber(near: Near, route: RouteInfo) -> Iterator[Stage]:
             yield Stage("md5", _FAIL, "; ".join(refused), remedy)
         elif listed:
             text = f"{', '.join(listed)} subscribes, but has not connected to its proxy"
+            files = near.snapshot.agent.files
+            if files is not None and files.problem:
+                problem, _, remedy = files.problem.partition("; ")
+                yield Stage(
+                    "subscriber",
+                    _FAIL,
+                    f"{text}; the agent has no file descriptor to accept it with: {problem}",
+                    remedy,
+                )
+                return
             remedy = (
                 "look into that node's log; its ROS_IP and ROS_HOSTNAME must be of this machine, and its "
                 f"ROS_MASTER_URI {near.snapshot.agent.core_uri}: `rmpa doctor`"
@@ -297,10 +351,18 @@ def _open_route(route: RouteInfo, far: FarSource | None, peer: str) -> Stage:
 def _sent(route: RouteInfo, far: FarSource | None, peer: str, wire: str) -> Stage:
     if far is None:
         return Stage("sent", _UNKNOWN, f"{peer} did not tell")
+    if far.oversized:
+        text = f"{far.oversized} messages of its publisher {route.node} are too long, the last has "
+        text += f"{far.oversized_bytes} bytes, and at most {limits.TCPROS_MESSAGE_MAX} cross"
+        text += f"; {far.messages} others came" if far.messages else ""
+        return Stage("sent", _WARN if far.messages else _FAIL, text, "send them in parts, or compressed")
     if not far.messages and not route.messages:
         text = f"its publisher {route.node} is connected, and has published nothing since"
         return Stage("sent", _FAIL, text, f"look at that node; on {peer}: rostopic hz {wire}")
     text = f"{far.messages} messages from its publisher so far"
+    if far.lost:
+        text += f"; {far.lost} of them given up, while {peer} had no link to this module or a slow one"
+        return Stage("sent", _WARN, text, "a longer outage, or more depth, in [[contract]] keeps more")
     if far.dropped:
         return Stage("sent", _WARN, f"{text}; {far.dropped} given up over there", "the link is slower than the topic")
     return Stage("sent", _OK, text)
@@ -338,7 +400,10 @@ def _contract(route: RouteInfo) -> Stage:
         return Stage("contract", _OK, f"kept ({said})" if said else "nothing lost, late or expired")
     parts = [f"{count} {key}" for key, count in missing.items()]
     parts += [f"{kind.replace('_', ' ')} {count} times" for kind, count in events.items()]
-    return Stage("contract", _WARN, ", ".join(parts), "`rmpa topic info` tells when; docs/contracts.md what to do")
+    remedy = "`rmpa topic info` tells when; docs/contracts.md what to do"
+    if "lost" in missing and route.contract.get("reliability") == "reliable":
+        remedy = "a longer outage, or more depth, in [[contract]] keeps more; `rmpa topic info` tells when"
+    return Stage("contract", _WARN, ", ".join(parts), remedy)
 
 
 def _reading(sight: Sight, later: Sight | None, node: str) -> Stage:

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from rmpa.core.errors import LocalProtocolError
 from rmpa.resource.fence import passage
+from rmpa.ros.definitions import UnknownTypeError
+from rmpa.ros.find_types import find_message_type
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -42,22 +44,66 @@ class Asker(Protocol):
         ...
 
 
+class TopicType:
+    """The message type of an output or input: found on this machine, or told later by a publisher.
+
+    Args:
+        name: ``package/Name``.
+
+    Raises:
+        DefinitionError: It is malformed, or of a package that comes with rmpa, and not in it.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.known: MessageType | None = None
+        """The type, once it is known."""
+        self.problem: UnknownTypeError | None = None
+        """Where it was looked for in vain."""
+        try:
+            self.known = find_message_type(name)
+        except UnknownTypeError as error:
+            if not error.learnable:
+                raise
+            self.problem = error
+
+    def get(self) -> MessageType:
+        """The type.
+
+        Raises:
+            UnknownTypeError: It is not known yet.
+        """
+        if self.known is None:
+            assert self.problem is not None  # noqa: S101 - it is either
+            raise self.problem
+        return self.known
+
+
 @dataclass(eq=False)
 class Output:
     """A topic that the resource publishes.
 
     Args:
         name: As declared, in the resource's namespace unless it is global.
-        type: Its message type.
+        kind: Its message type, which may be told later.
         contract: What its messages need; the agent's rules apply on top.
         latch: Whether a late subscriber gets the last message.
     """
 
     name: str
-    type: MessageType
+    kind: TopicType
     contract: Contract
     latch: bool = False
     outlet: Outlet | None = field(default=None, repr=False)
+
+    @property
+    def type(self) -> MessageType:
+        """Its message type.
+
+        Raises:
+            UnknownTypeError: It is not known here, and no publisher has told it yet.
+        """
+        return self.kind.get()
 
     def publish(self, message: object | None = None, /, **values: Any) -> None:
         """Send a message: whole, or its fields; it is dropped while the resource is not active.
@@ -77,15 +123,20 @@ class Input:
 
     Args:
         name: As declared.
-        type: Its message type.
+        kind: Its message type, which its first publisher tells where it is not known here.
         contract: What is asked of its messages.
         required: Whether the resource is stale while nobody publishes it.
     """
 
     name: str
-    type: MessageType
+    kind: TopicType
     contract: Contract
     required: bool = True
+
+    @property
+    def type(self) -> MessageType:
+        """Its message type; errors as of ``Output.type``."""
+        return self.kind.get()
 
 
 @dataclass(eq=False)

@@ -29,7 +29,7 @@ from rmpa.core.names import is_legal_name
 from rmpa.resource.adaptation import AdaptationSettings
 from rmpa.resource.attributes import MEASURED, Attribute, Category, Direction, Scale
 from rmpa.resource.behaviour import Context, DeclaredProfile, Hook, OnFailure, Task, TaskFunction
-from rmpa.resource.connections import DeclaredAttribute, Demand, Input, Output
+from rmpa.resource.connections import DeclaredAttribute, Demand, Input, Output, TopicType
 from rmpa.resource.contexts import parse_rule
 from rmpa.resource.declared_words import check_takes, read_contract, read_word
 from rmpa.resource.parameters import INT_MAX, INT_MIN, Parameter, ParameterValue
@@ -37,7 +37,6 @@ from rmpa.resource.profiles import Profile, check_profiles
 from rmpa.resource.requirements import find_attribute
 from rmpa.resource.units import quantity
 from rmpa.resource.wishes import Wish, at_least, at_most, between, exactly
-from rmpa.ros.messages import MessageType
 
 if TYPE_CHECKING:
     from rmpa.resource.attributes import Value
@@ -134,29 +133,34 @@ class Resource:
 
         Args:
             name: In its namespace, or global (``/cmd_vel``).
-            kind: The message type, ``package/Name``.
+            kind: The message type, ``package/Name``: one that comes with rmpa, or of this machine's ROS packages
+                (``rmpa.ros.find_types``). One of another package is learnt from a publisher of that type, here or in
+                another module, when the resource starts; until there is one, it waits.
             latch: Whether a late subscriber gets the last message.
             contract: The words of a ``[[contract]]``: ``deadline="100 ms"``, ``reliability="reliable"`` …
 
         Raises:
             ConfigError: A name twice, an illegal one, or a word that no contract has.
-            DefinitionError: The type is not known.
+            DefinitionError: The type is malformed, or its package is known and has no such type.
         """
         self._new("output", name, self.outputs)
         if name in self.inputs:
             where = f"output {name} of {self.name}"
             raise ConfigError(where, "it is an input of the same resource", "a global name (/scan) is another topic")
-        made = Output(name, MessageType(kind), read_contract(f"output {name} of {self.name}", contract), latch)
+        made = Output(name, TopicType(kind), read_contract(f"output {name} of {self.name}", contract), latch)
         self.outputs[name] = made
         return made
 
     def input(self, name: str, kind: str, *, required: bool = True, **contract: object) -> Input:
-        """Declare a topic that it needs; arguments and errors as for ``output``."""
+        """Declare a topic that it needs; arguments and errors as for ``output``.
+
+        A type that is not known here is learnt from the topic's publisher; the resource does not wait for it.
+        """
         self._new("input", name, self.inputs)
         if name in self.outputs:
             where = f"input {name} of {self.name}"
             raise ConfigError(where, "it is an output of the same resource", "a global name (/scan) is another topic")
-        made = Input(name, MessageType(kind), read_contract(f"input {name} of {self.name}", contract), required)
+        made = Input(name, TopicType(kind), read_contract(f"input {name} of {self.name}", contract), required)
         self.inputs[name] = made
         return made
 

@@ -237,7 +237,7 @@ def _topic(topic: Output | Input, node: str, *, required: bool = True) -> TopicD
     said = {key: getattr(topic.contract, key) for key in KEYS}
     contract = {key: value for key, value in said.items() if value != getattr(_DEFAULT, key)}
     return TopicDescriptor(
-        name=topic.name, topic=topic_of(topic.name, node), type=topic.type.name, contract=contract, required=required
+        name=topic.name, topic=topic_of(topic.name, node), type=topic.kind.name, contract=contract, required=required
     )
 
 

@@ -27,10 +27,10 @@ class Measuring:
         self._topics: dict[str, TopicQuality] = {}
         for name, output in resource.outputs.items():
             self._topics[name] = TopicQuality(now, stamped=_stamped(output), deadline=output.contract.deadline)
-        for name, item in resource.inputs.items():
-            self._topics[name] = TopicQuality(
-                now, stamped=_stamped(item), numbered=True, deadline=item.contract.deadline
-            )
+        for item in resource.inputs.values():
+            self._listen(item, now)
+        self._unknown = {name: item for name, item in resource.inputs.items() if item.kind.known is None}
+        """Inputs whose type their first publisher tells."""
         self._primary = next(iter(resource.outputs), "")
         """The output whose qualities are also named without it."""
         self._own = {
@@ -47,8 +47,15 @@ class Measuring:
             now_ns: By the wall clock, which stamps are by.
             caller: Who sent it, for inputs.
         """
+        if topic in self._unknown and self._unknown[topic].kind.known is not None:
+            self._listen(self._unknown.pop(topic), now)
         if (quality := self._topics.get(topic)) is not None:
             quality.message(raw, now, now_ns, caller)
+
+    def _listen(self, item: Input, now: float) -> None:
+        self._topics[item.name] = TopicQuality(
+            now, stamped=_stamped(item), numbered=True, deadline=item.contract.deadline
+        )
 
     def observed(self, attribute: str, value: Value) -> None:
         """An attribute of the user's own was observed."""
@@ -86,5 +93,5 @@ class Measuring:
 
 
 def _stamped(topic: Output | Input) -> bool:
-    fields = topic.type.fields
+    fields = topic.kind.known.fields if topic.kind.known is not None else ()
     return bool(fields) and fields[0].name == "header"

@@ -19,7 +19,7 @@ from rmpa.core.errors import LimitExceeded, RmpaError
 from rmpa.core.names import is_type_name
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
 SEPARATOR: Final = "=" * 80
 _NUMBERS: Final = (
@@ -48,11 +48,20 @@ class DefinitionError(RmpaError):
     type: str
     problem: str
     remedy: str = ""
+    what: str = "message type"
 
     def __str__(self) -> str:
         """Say which type, what is wrong, and what to do."""
         remedy = f"; {self.remedy}" if self.remedy else ""
-        return f"message type {self.type}: {self.problem}{remedy}"
+        return f"{self.what} {self.type}: {self.problem}{remedy}"
+
+
+@dataclass
+class UnknownTypeError(DefinitionError):
+    """No definition of a type was found."""
+
+    learnable: bool = True
+    """Whether a publisher may well know it: it is not of a package whose types all come with us."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,6 +272,39 @@ def _texts() -> Mapping[str, str]:
     return packaged_texts("definitions.json")
 
 
+def complete(known: dict[str, Specification], find: Callable[[str], str | None]) -> None:
+    """Add what types embed, and what that embeds.
+
+    Args:
+        known: Types by name; what is found is added.
+        find: Gives the own text of a type, or ``None``.
+
+    Raises:
+        UnknownTypeError: One is not found.
+        DefinitionError: One is malformed.
+        LimitExceeded: All together are larger than ``limits.DEFINITION_MAX``.
+    """
+    size = 0
+    todo = [(name, embedded) for name in known for embedded in known[name].depends()]
+    while todo:
+        outer, name = todo.pop()
+        if name in known:
+            continue
+        text = find(name)
+        if text is None:
+            raise UnknownTypeError(name, f"is not known here, and {outer} embeds it")
+        size += len(text)
+        if size > limits.DEFINITION_MAX:
+            raise LimitExceeded(f"definition of {outer} with all that it embeds", size, limits.DEFINITION_MAX)
+        known[name] = Specification.parse(name, text)
+        todo += [(name, embedded) for embedded in known[name].depends()]
+
+
+def known_text(name: str) -> str | None:
+    """The own text of a type that comes with us, or ``None``."""
+    return _texts().get(name)
+
+
 def known_types() -> tuple[str, ...]:
     """The names of all types that come with us."""
     return tuple(_texts())
@@ -276,7 +318,7 @@ def known_specifications(name: str) -> Mapping[str, Specification]:
         DefinitionError: It does not come with us.
     """
     if name not in _texts():
-        raise DefinitionError(
+        raise UnknownTypeError(
             name, "is not one that comes with rmpa", "its definition is learnt from a publisher of that type"
         )
     found: dict[str, Specification] = {}

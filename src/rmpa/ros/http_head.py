@@ -17,6 +17,16 @@ _HEAD: Final = re.compile(
 _HARMLESS: Final = frozenset({b"accept", b"accept-encoding", b"content-type", b"user-agent"})
 """Headers that change nothing for us."""
 
+REASONS: Final = {
+    200: b"OK",
+    400: b"Bad Request",
+    405: b"Method Not Allowed",
+    413: b"Content Too Large",
+    415: b"Unsupported Media Type",
+    431: b"Request Header Fields Too Large",
+}
+"""Of the statuses that we answer with."""
+
 
 class Head(NamedTuple):
     """A request.

@@ -50,14 +50,19 @@ class MessageType:
 
     Args:
         name: ``package/Name``.
-        specifications: The type and all that it embeds, by name; by default those that come with us.
+        specifications: The type and all that it embeds, by name; by default those that come with us. To find those of
+            this machine's packages, use ``rmpa.ros.find_types``.
+        source: The file that its definition is from; empty: it comes with us, or was learnt.
 
     Raises:
         DefinitionError: The type is not known, or malformed.
     """
 
-    def __init__(self, name: str, specifications: Mapping[str, Specification] | None = None) -> None:
+    def __init__(
+        self, name: str, specifications: Mapping[str, Specification] | None = None, source: str = ""
+    ) -> None:
         self.name = name
+        self.source = source
         self._learnt = specifications is not None
         self._specifications = specifications if specifications is not None else known_specifications(name)
         self.md5sum = md5sum(name, self._specifications)
@@ -80,22 +85,6 @@ class MessageType:
         if md5 and learnt.md5sum != md5:
             raise DefinitionError(name, f"its definition has the md5 sum {learnt.md5sum}, its publisher says {md5}")
         return learnt
-
-    @classmethod
-    def from_header(cls, fields: Mapping[str, str]) -> MessageType:
-        """A type from a publisher's connection header; one that comes with us if the publisher sends no definition.
-
-        Raises:
-            DefinitionError: As for ``learn``.
-        """
-        name, md5 = fields.get("type", ""), fields.get("md5sum", "")
-        definition = fields.get("message_definition", "")
-        if definition or md5 == _EMPTY_MD5:
-            return cls.learn(name, definition, md5)
-        known = cls(name)
-        if known.md5sum != md5:
-            raise DefinitionError(name, "its publisher has another version of it and sends no definition")
-        return known
 
     def describe(self, *, latching: bool = False) -> Description:
         """What a publisher of this type says."""
@@ -242,7 +231,6 @@ class MessageType:
         return self._plain(field.type, value)
 
 
-_EMPTY_MD5: Final = "d41d8cd98f00b204e9800998ecf8427e"
 _RANGES: Final = {
     f"{sign}int{bits}": (0, (1 << bits) - 1) if sign else (-(1 << bits - 1), (1 << bits - 1) - 1)
     for sign in ("u", "")

@@ -1,7 +1,7 @@
 """Service types: their definitions, MD5 sums, and requests and responses as Python objects.
 
 A definition is the request's text, a line ``---``, and the response's (wiki.ros.org/srv). Those of ROS's own packages
-come with us; others are found where ROS finds them on this machine (``ros.installed``), for no server sends its own.
+come with us; ``ros.find_types`` finds those of this machine's packages, for no server sends its own.
 """
 
 from __future__ import annotations
@@ -9,7 +9,15 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
-from rmpa.ros.definitions import DefinitionError, Specification, known_specifications, packaged_texts, service_md5sum
+from rmpa.ros.definitions import (
+    DefinitionError,
+    Specification,
+    UnknownTypeError,
+    complete,
+    known_text,
+    packaged_texts,
+    service_md5sum,
+)
 from rmpa.ros.messages import MessageType
 from rmpa.ros.services import ServiceDescription
 
@@ -25,45 +33,40 @@ class ServiceType:
     Args:
         name: ``package/Name``.
         text: Its definition; by default that which comes with us.
-        find: Gives the text of a message type that it embeds and that does not come with us, or ``None``.
+        find: Gives the own text of a message type that it embeds, or ``None``; by default those that come with us.
+        source: The file that its definition is from; empty: it comes with us.
 
     Raises:
         DefinitionError: The type is not known, or malformed.
     """
 
-    def __init__(self, name: str, text: str | None = None, find: Callable[[str], str | None] | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        text: str | None = None,
+        find: Callable[[str], str | None] | None = None,
+        source: str = "",
+    ) -> None:
         self.name = name
+        self.source = source
         text = text if text is not None else known_service(name)
         halves = _MARK.split(text)
         if len(halves) != 2:
             raise DefinitionError(
-                name, f"has {len(halves) - 1} lines '---' instead of one", "is it a message's type?"
+                name,
+                f"has {len(halves) - 1} lines '---' instead of one",
+                "is it a message's type?",
+                "service type",
             )
         parts = (f"{name}Request", f"{name}Response")
         known = {part: Specification.parse(part, half) for part, half in zip(parts, halves, strict=True)}
-        for part in parts:
-            _complete(known[part], known, find)
+        complete(known, find if find is not None else known_text)
         self.request, self.response = (MessageType(part, known) for part in parts)
         self.md5sum = service_md5sum(*parts, known)
 
     def describe(self) -> ServiceDescription:
         """What a server of this type says."""
         return ServiceDescription(self.name, self.md5sum, self.request.name, self.response.name)
-
-
-def _complete(
-    specification: Specification, known: dict[str, Specification], find: Callable[[str], str | None] | None
-) -> None:
-    """Add what a type embeds, as far as it is found; what is missing is told by whoever computes the sum."""
-    for name in specification.depends():
-        if name in known:
-            continue
-        text = find(name) if find is not None else None
-        if text is not None:
-            known[name] = Specification.parse(name, text)
-        else:
-            known.update(known_specifications(name))
-        _complete(known[name], known, find)
 
 
 def _texts() -> Mapping[str, str]:
@@ -82,9 +85,10 @@ def known_service(name: str) -> str:
         DefinitionError: It does not.
     """
     if name not in _texts():
-        raise DefinitionError(
+        raise UnknownTypeError(
             name,
-            "is not a service that comes with rmpa, nor one of this machine's ROS packages",
-            "source the workspace that has it (PYTHONPATH, ROS_PACKAGE_PATH)",
+            "is not a service that comes with rmpa",
+            "rmpa.ros.find_types finds those of this machine's packages",
+            "service type",
         )
     return _texts()[name]

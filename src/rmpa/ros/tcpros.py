@@ -36,6 +36,10 @@ class MalformedHeader(RemoteProtocolError):  # noqa: N818 - the name says what h
     """The bytes are not a connection header."""
 
 
+class MalformedStream(RemoteProtocolError):  # noqa: N818 - the name says what happened
+    """The bytes where a message's length must be are no length: the stream is out of step."""
+
+
 @dataclass(frozen=True, slots=True)
 class Description:
     """What a publisher says about its messages.
@@ -161,7 +165,8 @@ def split_messages(data: memoryview) -> tuple[list[memoryview], int, int]:
 
     Raises:
         LimitExceeded: The first message claims more than ``limits.TCPROS_MESSAGE_MAX``. Whole messages before such
-            a one are returned first.
+            a one are returned first, as before the next one.
+        MalformedStream: The first message claims more than ``limits.TCPROS_LENGTH_MAX``: those bytes are no length.
     """
     messages: list[memoryview] = []
     start = 0
@@ -171,6 +176,9 @@ def split_messages(data: memoryview) -> tuple[list[memoryview], int, int]:
         if size > limits.TCPROS_MESSAGE_MAX:
             if messages:
                 break
+            if size > limits.TCPROS_LENGTH_MAX:
+                text = f"a message's length of {size} bytes cannot be (the most is {limits.TCPROS_LENGTH_MAX}): "
+                raise MalformedStream(text + "the publisher's stream is corrupt")
             raise LimitExceeded("message", size, limits.TCPROS_MESSAGE_MAX)
         end = start + LENGTH.size + size
         if end > filled:
@@ -273,7 +281,7 @@ def check_publisher(fields: Mapping[str, str], type_name: str = ANY, md5sum: str
 
     Args:
         fields: The reply header.
-        type_name: The type that we asked for, for the text.
+        type_name: The type that we asked for, or ``*``; it is compared where the md5 sum is not.
         md5sum: The md5 sum that we asked for, or ``*``.
     """
     if "error" in fields:
@@ -283,7 +291,8 @@ def check_publisher(fields: Mapping[str, str], type_name: str = ANY, md5sum: str
             return f"required field '{required}' is missing in the publisher's reply"
     if ANY in (fields["type"], fields["md5sum"]):
         return "the publisher's reply has '*' where a type or md5 sum must be"
-    if md5sum not in (ANY, fields["md5sum"]):
+    another = type_name not in (ANY, fields["type"]) if md5sum == ANY else md5sum != fields["md5sum"]
+    if another:
         return (
             f"the publisher has [{printable(fields['type'])}/{printable(fields['md5sum'])}], "
             f"not [{type_name}/{md5sum}]"

@@ -135,7 +135,7 @@ class _Reader:
         self._waiting = bytearray()
         self._token = 0
 
-    def feed(self, data: bytes) -> None:
+    def feed(self, data: bytes | memoryview) -> None:
         """Take the next piece.
 
         Raises:

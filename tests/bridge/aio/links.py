@@ -100,6 +100,7 @@ class LinkEnd:
         self.clock_offset: float | None = None
         self.clock_error: float | None = None
         self.gone = False
+        self.busy = False
         self.expects_the_worst = False
         self.aborted = ""
         self.resumed_at = -math.inf

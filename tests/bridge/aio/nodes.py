@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from rmpa.ros.aio.publication import Publication
+    from rmpa.ros.master.reachability import Unreachable
 
 MD5: Final = "5a9ea5f83505693b71e785041e67a8bb"
 
@@ -100,7 +101,13 @@ class Core:
 
     def state(self) -> Any:
         """As RosCore's, as far as it is asked for."""
-        return SimpleNamespace(publishers={topic: dict(nodes) for topic, nodes in self._topics.items()})
+        subscribers = {listener.topic: {"/listener": ""} for listener in self._side.listeners}
+        publishers = {topic: dict(nodes) for topic, nodes in self._topics.items()}
+        return SimpleNamespace(publishers=publishers, subscribers=subscribers)
+
+    def unreachable(self) -> Mapping[str, Unreachable]:
+        """As RosCore's."""
+        return {}
 
     def suspect(self, node: str) -> None:
         """As RosCore's; nobody dies silently here."""
@@ -204,12 +211,15 @@ class PublisherConnection:
         on_header: Callable[[Mapping[str, str]], None],
         on_refused: Callable[[str], None],
         on_lost: Callable[[str], None],
+        on_oversized: Callable[[int], None],
         number: int,
     ) -> None:
         self.topic, self.uri, self.number = topic, uri, number
         self._on_message, self._parts, self._on_header, self._on_lost = on_message, on_parts, on_header, on_lost
+        self._on_oversized = on_oversized
         self._loop = asyncio.get_running_loop()
         self._queue: deque[bytes] = deque()
+        self.malformed = False
         self._rest: memoryview | None = None
         self._speaker: Speaker | None = None
         self._busy = False
@@ -241,6 +251,9 @@ class PublisherConnection:
 
     def take(self, framed: bytes) -> None:
         """The speaker has said something."""
+        if len(framed) - 4 > limits.TCPROS_MESSAGE_MAX:
+            self._on_oversized(len(framed) - 4)
+            return
         self._queue.append(framed)
         if not self._busy:
             self._go_on()

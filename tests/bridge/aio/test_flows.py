@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rmpa.bridge.aio.flows import ExportFlow, ImportFlow, LinkTime
+from rmpa.bridge.aio.flows import ExportFlow, ImportFlow
+from rmpa.bridge.aio.link_time import LinkTime
 from rmpa.bridge.watch import Kind
 from rmpa.core import limits
 from rmpa.core.contract import Contract, Durability, Priority, Reliability

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -30,6 +29,15 @@ if TYPE_CHECKING:
 
 CMD = Source("/cmd", "/joy")
 SURE = Contract(reliability=Reliability.RELIABLE)
+TOLD: list[tuple[dict[str, Any], int, list[Kind]]] = [
+    ({"epoch": 5, "following": 2}, 0, []),
+    ({"epoch": 5, "following": 9}, 7, [Kind.MESSAGES_LOST]),
+    ({"epoch": 6, "lost": 0}, 0, []),
+    ({"epoch": 6, "lost": 7}, 7, [Kind.MESSAGES_LOST]),
+    ({"epoch": 6, "lost": 7, "at_least": True}, 7, [Kind.MESSAGES_LOST, Kind.LOSS_UNKNOWN]),
+    ({"epoch": 6}, 0, [Kind.LOSS_UNKNOWN]),
+]
+"""What a peer says when its route is open again, and what is made of it."""
 ALIVE = Contract(liveliness_lease=5.0)
 
 
@@ -89,9 +97,10 @@ class Proxied:
         first: int = 1,
         latching: bool = False,
         definition: str = "",
+        **told: Any,
     ) -> ImportFlow:
         about = Description("a/B", MD5, definition, latching)
-        self.inbound.describe(Describe(1, CMD, route, about, contract, epoch, first), self.acks.append)
+        self.inbound.describe(Describe(1, CMD, route, about, contract, epoch, first, **told), self.acks.append)
         return self.inbound.flows[route]
 
     def kinds(self) -> list[Kind]:
@@ -215,7 +224,7 @@ def test_a_reliable_source_goes_on_with_the_same_flow() -> None:
     play(scene)
 
 
-def test_a_sender_that_began_anew_is_said_and_brings_nothing_again(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_sender_that_began_anew_is_said_and_brings_nothing_again() -> None:
     async def scene(proxied: Proxied) -> None:
         listener = Heard(await proxied.publish())
         flow = proxied.describe(SURE, epoch=5, latching=True)
@@ -226,12 +235,41 @@ def test_a_sender_that_began_anew_is_said_and_brings_nothing_again(caplog: pytes
         flow.message(1, 0, framed("map"))
         flow.message(2, 0, framed("new map"))
         assert listener.texts == ["map", "new map"]
+        assert proxied.kinds() == [Kind.LOSS_UNKNOWN]
 
-    caplog.set_level(logging.WARNING, "rmpa")
     play(scene)
-    assert [record.getMessage() for record in caplog.records] == [
-        "! /rmpa/b: /cmd from /joy: messages were lost, it is not known how many"
-    ]
+
+
+@pytest.mark.parametrize(("told", "lost", "kinds"), TOLD)
+def test_what_a_sender_says_that_it_has_given_up_is_lost(told: dict[str, Any], lost: int, kinds: list[Kind]) -> None:
+    async def scene(proxied: Proxied) -> None:
+        await proxied.publish()
+        flow = proxied.describe(SURE, epoch=5)
+        flow.message(1, 0, framed("one"))
+        proxied.inbound.link_down()
+        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        assert proxied.describe(SURE, route=2, **told) is flow
+        assert (flow.lost, proxied.kinds()) == (lost, kinds)
+
+    play(scene)
+
+
+def test_where_a_numbering_goes_on_a_gap_is_counted_once() -> None:
+    async def scene(proxied: Proxied) -> None:
+        listener = Heard(await proxied.publish())
+        flow = proxied.describe(SURE, epoch=5)
+        flow.message(1, 0, framed("one"))
+        proxied.inbound.retract(Retract(1, CMD))
+        await asyncio.sleep(1.0)
+        assert proxied.inbound.position(CMD) == (5, 1)
+        again = Heard(await proxied.publish())
+        new = proxied.describe(SURE, route=2, epoch=5, following=8)
+        assert new is not flow
+        assert (new.lost, proxied.kinds()) == (6, [Kind.MESSAGES_LOST])
+        new.message(9, 0, framed("nine"))
+        assert (new.lost, listener.texts, again.texts) == (7, ["one"], ["nine"])
+
+    play(scene)
 
 
 def test_a_contract_that_changed_meanwhile_makes_a_new_flow_that_loses_nothing() -> None:
@@ -264,6 +302,11 @@ def test_what_is_not_to_go_on_any_more_is_forgotten(how: str) -> None:
             assert publication.latched == ()
         else:
             proxied.inbound.retract(Retract(1, CMD))
+        # A source that leaves the graph while its peer is away is still missed.
+        assert proxied.inbound.position(CMD) == (None if how == "detach" else (5, 1))
+        proxied.inbound.unheard(lambda topic: topic == CMD.topic)
+        assert proxied.inbound.position(CMD) == (None if how == "detach" else (5, 1))
+        proxied.inbound.unheard(lambda _: False)
         assert proxied.inbound.position(CMD) is None
         assert proxied.inbound._latest == {}
         await asyncio.sleep(limits.ACK_DELAY * 2)

@@ -59,13 +59,23 @@ class Side:
 
     def __init__(self, name: str, number: int, rules: Iterable[Rule], rng: random.Random) -> None:
         self.name = name
-        self.identity = Identity(Guid.of(f"10.0.0.{number}", 1000), bytes([number]) * 16, name)
-        self.core = Core(self)
-        core = cast("RosCore", self.core)
-        self.bridge = Bridge(core, Policy(PolicySettings()), rng=rng.random, contracts=Contracts(tuple(rules)))
+        self._number = number
+        self._rules = tuple(rules)
+        self._rng = rng
+        self._runs = 0
+        self.begin()
         self.speakers: dict[tuple[str, str], Speaker] = {}
         self.listeners: list[Listener] = []
         self.link: LinkEnd | None = None
+
+    def begin(self) -> None:
+        """A new run of its agent, with a core that knows nobody."""
+        self._runs += 1
+        instance = bytes([self._number, self._runs]) * 8
+        self.identity = Identity(Guid.of(f"10.0.0.{self._number}", 1000), instance, self.name)
+        self.core = Core(self)
+        core, contracts = cast("RosCore", self.core), Contracts(self._rules)
+        self.bridge = Bridge(core, Policy(PolicySettings()), rng=self._rng.random, contracts=contracts)
 
     @property
     def attached(self) -> Iterator[Attached]:
@@ -246,6 +256,15 @@ class World:
         listener.side.listeners.remove(listener)
         listener.leave()
 
+    async def restart(self, side: Side) -> None:
+        """An agent without a link ends, and another run of it begins; its nodes register anew."""
+        assert side.link is None or side.link.gone
+        await side.bridge.close()
+        side.begin()
+        await side.bridge.start()
+        for (topic, node), speaker in side.speakers.items():
+            side.core.call("registerPublisher", node, topic, "a/B", speaker.uri)
+
     # --- rest -----------------------------------------------------------------------------------------------
 
     async def wait(self, seconds: float) -> None:
@@ -295,8 +314,9 @@ def made_up(loop: VirtualLoop) -> Iterator[None]:
     with ExitStack() as stack:
         for name, value in SMALL_LIMITS.items():
             stack.enter_context(mock.patch.object(limits, name, value))
-        for where in ("inbound", "bridge"):
+        for where in ("proxy_nodes", "bridge"):
             stack.enter_context(mock.patch(f"rmpa.bridge.aio.{where}.SlaveNode", Node))
+        stack.enter_context(mock.patch("rmpa.bridge.aio.proxy_nodes.is_loopback", return_value=False))
         stack.enter_context(mock.patch("rmpa.bridge.aio.outbound.PublisherConnection", PublisherConnection))
         stack.enter_context(mock.patch("rmpa.bridge.aio.flows.time", SimpleNamespace(time_ns=loop.time_ns)))
         yield

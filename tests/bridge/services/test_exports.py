@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rmpa.bridge.actions import Send, Warn
+from rmpa.bridge.actions import Send
 from rmpa.bridge.messages import (
     AdvertiseServices,
     CloseService,
@@ -157,14 +157,6 @@ def test_one_route_for_two_services_breaks_the_protocol(exports: ServiceExports)
     exports.opened(1, OpenService(ROUTE, "/add"))
     with pytest.raises(RemoteProtocolError):
         exports.opened(1, OpenService(ROUTE, "/add"))
-
-
-def test_too_many_services_stay_home(exports: ServiceExports, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "SERVICES_PER_PEER_MAX", 1)
-    (warning,) = exports.graph("/sub", ADD)
-    assert isinstance(warning, Warn)
-    assert "/sub stays home" in warning.text
-    assert told(exports) == []
 
 
 def test_names_on_the_way_are_each_peers_own() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rmpa.bridge.actions import Send, Warn
+from rmpa.bridge.actions import Send
 from rmpa.bridge.messages import (
     AdvertiseServices,
     CloseService,
@@ -181,15 +181,6 @@ def test_what_is_not_shown_is_not_opened(imports: ServiceImports) -> None:
         with pytest.raises(LocalProtocolError):
             imports.want(1, service, 0.0)
     assert imports.release(1, "/add") == imports.release(7, "/nothing") == []
-
-
-def test_bounds_of_one_peer(imports: ServiceImports, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "NODES_PER_PEER_MAX", 1)
-    assert imports.advertised(1, offer("/sub", node="/second")) == []
-    assert "more than 1 nodes" in hidden(imports, 1, "/sub")
-    monkeypatch.setattr(limits, "SERVICES_PER_PEER_MAX", 2)
-    (warning,) = imports.advertised(1, offer("/mul"))
-    assert isinstance(warning, Warn)
 
 
 def test_names_here_are_made_by_the_peers_rules() -> None:

@@ -61,6 +61,8 @@ class Peer:
         self.marks: list[tuple[Kind, int, int]] = []
         self.clocks: list[MeshLink] = []
         self.lanes_lost: list[MeshLink] = []
+        self.hand_made: list[socket.socket] = []
+        """Sockets of ``raw``, closed at the end whatever becomes of the test."""
         self._begun: dict[int, tuple[int, int, bytearray]] = {}
         self.mesh = Mesh(
             self.identity,
@@ -117,11 +119,9 @@ class Peer:
     def kill(self) -> None:
         """As kill -9: the kernel closes the sockets, nobody says bye."""
         self.mesh._running = False
-        asyncio.get_running_loop().remove_reader(self.mesh._listen.fileno())
-        self.mesh._listen.close()
-        for timer in (self.mesh._timer, self.mesh._accept_timer):
-            if timer is not None:
-                timer.cancel()
+        self.mesh._acceptor.close()
+        if self.mesh._timer is not None:
+            self.mesh._timer.cancel()
         for link in self.mesh._links.values():
             link.abort("killed")
 
@@ -136,6 +136,9 @@ async def peers(count: int, *, found: bool = True, lanes: LaneSettings | None = 
             introduce(made)
         yield made
     finally:
+        for peer in made:
+            for sock in peer.hand_made:
+                sock.close()
         await asyncio.gather(*(p.mesh.close() for p in made))
 
 
@@ -161,6 +164,7 @@ async def raw(
     """A hand-made dialler: its socket, and the first frame that it is answered."""
     loop = asyncio.get_running_loop()
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+    peer.hand_made.append(sock)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
     await loop.sock_connect(sock, ("127.0.0.1", peer.port))
     hello = Hello.of(identity, lease=lease, expected=peer.identity.guid, lane=lane)

@@ -23,6 +23,8 @@ from rmpa.ros.xmlrpc import RosFault, XmlRpcValue
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
+    from rmpa.core.aio.descriptors import Use
+
 DEADLINE: Final = 10.0
 STRING: Final = "std_msgs/String"
 
@@ -98,9 +100,9 @@ async def test_it_says_what_roscore_says(core: RosCore) -> None:
 
 
 async def test_it_listens_on_loopback_only(core: RosCore) -> None:
-    server = core._server._server
-    assert server is not None
-    assert [sock.getsockname()[0] for sock in server.sockets] == ["127.0.0.1"]
+    acceptor = core._server._acceptor
+    assert acceptor is not None
+    assert acceptor.address[0] == "127.0.0.1"
 
 
 async def test_a_port_in_use(core: RosCore) -> None:
@@ -173,8 +175,8 @@ async def test_a_node_that_does_not_answer_is_told_again(core: RosCore, monkeypa
 
 
 def _with_timeout(seconds: float) -> Callable[..., object]:
-    async def quick(uri: str, method: str, *params: XmlRpcValue) -> XmlRpcValue:
-        return await call(uri, method, *params, timeout=seconds)
+    async def quick(uri: str, method: str, *params: XmlRpcValue, use: Use) -> XmlRpcValue:
+        return await call(uri, method, *params, timeout=seconds, use=use)
 
     return quick
 
@@ -245,10 +247,10 @@ async def test_a_node_without_get_name_tells_its_name_in_its_header(monkeypatch:
     await node.start()
     node.add_publication(Publication("/rosout", "/like_roscpp", Description(LOG_TYPE, LOG_MD5, "")))
 
-    async def no_get_name(uri: str, method: str, *params: XmlRpcValue) -> object:
+    async def no_get_name(uri: str, method: str, *params: XmlRpcValue, use: Use) -> object:
         if method == "getName":
             raise RosFault(-1, "getName: unknown method name")
-        return await call_api(uri, method, *params)
+        return await call_api(uri, method, *params, use=use)
 
     monkeypatch.setattr(identify, "call_api", no_get_name)
     assert await identify.name_at(node.uri, ["/t"]) == "/like_roscpp"
@@ -321,40 +323,144 @@ async def test_a_client_can_end_it() -> None:
     await core.close()
 
 
+class Logs:
+    """A node that logs, and one that reads what is aggregated, following the core as ROS nodes do."""
+
+    def __init__(self, core: RosCore) -> None:
+        self.core = core
+        self.heard: list[bytes] = []
+        self.speaker = SlaveNode("/speaker", "127.0.0.1", core.uri)
+        self.reader = SlaveNode("/reader", "127.0.0.1", core.uri)
+        self.log = Publication("/rosout", "/speaker", Description(LOG_TYPE, LOG_MD5, "any"))
+        self.aggregated = Subscription(
+            AGGREGATED, "/reader", on_message=lambda _, framed: self.heard.append(bytes(framed))
+        )
+
+    async def __aenter__(self) -> Self:
+        await self.speaker.start()
+        await self.reader.start()
+        self.speaker.add_publication(self.log)
+        self.core.call("registerPublisher", "/speaker", "/rosout", LOG_TYPE, self.speaker.uri)
+        self.reader.add_subscription(self.aggregated)
+        uris = self.core.call("registerSubscriber", "/reader", AGGREGATED, LOG_TYPE, self.reader.uri).value
+        assert isinstance(uris, list)
+        self.aggregated.update([str(uri) for uri in uris])
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.reader.close()
+        await self.speaker.close()
+
+    async def flow(self, text: bytes) -> None:
+        """Wait until a log message comes out at the other end."""
+        async with asyncio.timeout(DEADLINE):
+            while frame_message(text) not in self.heard:
+                self.log.publish_framed(frame_message(text))
+                await asyncio.sleep(0.005)
+
+
+def rosout_at(core: RosCore) -> str:
+    """The slave API of whatever publishes /rosout_agg; empty for nothing."""
+    return core.publishers(AGGREGATED).get("/rosout", "")
+
+
 async def test_rosout_is_aggregated_byte_for_byte() -> None:
     core = RosCore(port=0)
     await core.start()
-    speaker = SlaveNode("/speaker", "127.0.0.1", core.uri)
-    await speaker.start()
-    log = Publication("/rosout", "/speaker", Description(LOG_TYPE, LOG_MD5, "any"))
-    speaker.add_publication(log)
-    core.call("registerPublisher", "/speaker", "/rosout", LOG_TYPE, speaker.uri)
-    assert core.call("getPublishedTopics", "/x", "").value == [[AGGREGATED, LOG_TYPE], ["/rosout", LOG_TYPE]]
-    heard: list[bytes] = []
-    reader = SlaveNode("/reader", "127.0.0.1", core.uri)
-    await reader.start()
-    subscription = Subscription(AGGREGATED, "/reader", on_message=lambda _, framed: heard.append(bytes(framed)))
-    reader.add_subscription(subscription)
-    uris = core.call("registerSubscriber", "/reader", AGGREGATED, LOG_TYPE, reader.uri).value
-    assert isinstance(uris, list)
-    subscription.update([str(uri) for uri in uris])
-    await until(lambda: log.subscribers == 1 and subscription.publishers == 1)
-    log.publish_framed(frame_message(b"not decoded"))
-    await until(lambda: bool(heard))
-    assert heard == [frame_message(b"not decoded")]
-    await reader.close()
-    await speaker.close()
+    async with Logs(core) as logs:
+        published = core.call("getPublishedTopics", "/x", "").value
+        assert published == [[AGGREGATED, LOG_TYPE], ["/rosout", LOG_TYPE]]
+        await until(lambda: logs.log.subscribers == 1 and logs.aggregated.publishers == 1)
+        logs.log.publish_framed(frame_message(b"not decoded"))
+        await until(lambda: bool(logs.heard))
+        assert logs.heard == [frame_message(b"not decoded")]
     await core.close()
     assert core.state().nodes.keys() <= {"/speaker", "/reader"}
 
 
-async def test_another_rosout_takes_over(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_killed_rosout_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "ROSOUT_RESPAWN", 0.01)
+    core = RosCore(port=0)
+    await core.start()
+    async with Logs(core) as logs:
+        await logs.flow(b"before")
+        killed = rosout_at(core)
+        assert await call_api(killed, "shutdown", "/rosnode", "user request") == (1, "shutdown", 0)
+        await until(lambda: rosout_at(core) not in {"", killed})
+        await logs.flow(b"after")
+        assert core.counters["rosout.restarted"] == 1
+        assert sorted(s for s in core.state().services if s.startswith("/rosout/")) == [
+            "/rosout/get_loggers",
+            "/rosout/set_logger_level",
+        ]
+    await core.close()
+    assert core.state().nodes.keys() <= {"/speaker", "/reader"}
+
+
+async def test_an_unregistered_rosout_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "ROSOUT_RESPAWN", 0.01)
+    core = RosCore(port=0)
+    await core.start()
+    async with Logs(core) as logs:
+        before = rosout_at(core)
+        assert core.call("unregisterSubscriber", "/rosout", "/rosout", before).value == 1
+        await until(lambda: rosout_at(core) not in {"", before})
+        await logs.flow(b"again")
+    await core.close()
+
+
+async def test_rosout_yields_its_name_and_takes_it_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "ROSOUT_RESPAWN", 0.01)
+    monkeypatch.setattr(limits, "ROSOUT_LOOK", 0.05)
+    core = RosCore(port=0)
+    await core.start()
+    async with Slave("/rosout") as other, Logs(core) as logs:
+        first = rosout_at(core)
+        core.call("registerPublisher", "/rosout", AGGREGATED, LOG_TYPE, other.uri)
+        core.call("subscribeParam", "/rosout", other.uri, "/p")
+        assert rosout_at(core) == other.uri
+        await until(lambda: core._rosout is not None and not core._rosout.uri)
+        for _ in range(20):
+            await asyncio.sleep(0.01)
+            assert rosout_at(core) == other.uri, "the name is the other node's as long as that is there"
+        core.call("unregisterPublisher", "/rosout", AGGREGATED, other.uri)
+        assert core._api.registrations.node_api("/rosout") == other.uri
+        core.call("unsubscribeParam", "/rosout", other.uri, "/p")
+        await until(lambda: rosout_at(core) not in {"", first, other.uri})
+        await logs.flow(b"back")
+        assert not [name for name, _ in other.calls if name == "shutdown"]
+    await core.close()
+
+
+async def test_rosout_starts_when_it_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "ROSOUT_RESPAWN", 0.01)
+    monkeypatch.setattr(limits, "ROSOUT_LOOK", 0.01)
+    core = RosCore(port=0)
+    await core.start()
+    start, failures = SlaveNode.start, 0
+
+    async def fails_twice(node: SlaveNode) -> None:
+        nonlocal failures
+        failures += 1
+        if failures < 3:
+            raise StartError("node /rosout", "no file descriptor is left")
+        await start(node)
+
+    monkeypatch.setattr(SlaveNode, "start", fails_twice)
+    killed = rosout_at(core)
+    await call_api(killed, "shutdown", "/rosnode", "user request")
+    await until(lambda: rosout_at(core) not in {"", killed})
+    assert failures == 3
+    await core.close()
+
+
+async def test_a_core_ends_while_another_rosout_has_the_name() -> None:
     core = RosCore(port=0)
     await core.start()
     async with Slave("/rosout") as other:
         core.call("registerSubscriber", "/rosout", "/rosout", LOG_TYPE, other.uri)
         assert core.state().nodes == {"/rosout": other.uri}
-        await until(lambda: core.counters["notify.sent"] >= 1)
+        await until(lambda: core._rosout is not None and not core._rosout.uri)
         await core.close()
         assert core.state().nodes == {"/rosout": other.uri}, "our late unregisters do not hit it"
 

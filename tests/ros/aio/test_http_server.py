@@ -199,14 +199,114 @@ async def test_refusals_are_answered_counted_and_closed(
     assert server.counters[counter] == 1
 
 
-async def test_a_chunked_body_beyond_the_limit_is_refused(
+@pytest.mark.parametrize("chunked", [False, True])
+async def test_a_call_beyond_the_limit_is_read_to_its_end_and_its_caller_told(
+    server: XmlRpcServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, *, chunked: bool
+) -> None:
+    """A client reads no answer before it has sent its call; rospy shows the text of a fault, and of nothing else."""
+    monkeypatch.setattr(limits, "HTTP_BODY_MAX", 100_000)
+    monkeypatch.setattr(limits, "HTTP_BODY_INLINE", 10_000)
+    body = serialize_call("setParam", ["/loader", "/robot_description", "x" * 3_000_000])
+    async with client(server) as c:
+        if chunked:
+            c.writer.write(b"POST / HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n")
+            for begin in range(0, len(body), 50_000):
+                part = body[begin : begin + 50_000]
+                c.writer.write(b"%x\r\n%s\r\n" % (len(part), part))
+            c.writer.write(b"0\r\n\r\n")
+        else:
+            c.writer.write(post(body))
+        await c.writer.drain()
+        with pytest.raises(RosFault) as told:
+            parse_response((await c.response())[1])
+        for part_of_it in ("setParam /robot_description", str(len(body)), "100000", "one by one"):
+            assert part_of_it in told.value.text
+        c.writer.write(post(CALL))
+        assert parse_response((await c.response())[1]), "the connection goes on"
+    assert server.counters["http.too_large"] == 1
+    assert [r.levelname for r in caplog.records if "/robot_description" in r.getMessage()] == ["WARNING"]
+
+
+async def test_large_calls_have_a_bound_together_and_the_slow_one_gives_way(
+    server: XmlRpcServer, echo: Echo, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "HTTP_BODY_INLINE", 1000)
+    monkeypatch.setattr(limits, "HTTP_BODIES_MAX", 5000)
+    large = post(serialize_call("wait", ["x" * 2500]))
+    async with client(server) as stuck, client(server) as first, client(server) as second:
+        first.writer.write(large)
+        await echo.waiting.wait()  # its room is taken until it is answered
+        second.writer.write(large)
+        with pytest.raises(RosFault, match=r"wait: .* try again in a moment"):
+            parse_response((await second.response())[1])
+        echo.go.set()
+        assert parse_response((await first.response())[1]) == "waited"
+        stuck.writer.write(large[:1500])
+        while not any(one.reserved for one in server._connections):
+            await asyncio.sleep(0)
+        (slow,) = (one for one in server._connections if one.reserved)
+        slow.begun -= 60.0
+        second.writer.write(large)
+        assert parse_response((await second.response())[1]) == "waited"
+        assert await stuck.ended() == b""
+    assert server.counters["http.evicted.slow"] == 1
+    assert not any(one.reserved for one in server._connections)
+
+
+@pytest.mark.parametrize("begin", [b"POST / HTTP/1.1\r\n", post(CALL)[:-30], post(b"x" * 5000)[:300]])
+async def test_slow_connections_keep_nobody_out(
+    server: XmlRpcServer, monkeypatch: pytest.MonkeyPatch, begin: bytes
+) -> None:
+    """Seven hundred that send a byte a second took every place: nobody was answered for 10 s."""
+    monkeypatch.setattr(limits, "HTTP_CONNECTIONS_MAX", 8)
+    async with contextlib.AsyncExitStack() as stack:
+        slow = [await stack.enter_async_context(client(server)) for _ in range(12)]
+        for c in slow:
+            c.writer.write(begin)
+        while sum(one._receiving for one in server._connections) < 8:
+            await asyncio.sleep(0)
+        for one in server._connections:
+            one.begun -= 5.0
+        fast = await stack.enter_async_context(client(server))
+        for _ in range(3):
+            fast.writer.write(post(CALL))
+            assert parse_response((await fast.response())[1])
+            further = await stack.enter_async_context(client(server))
+            further.writer.write(post(CALL)[:40])
+            await asyncio.sleep(0.01)
+        assert server.connections <= 8
+        assert server.counters["http.refused.connections"] == 0
+        assert server.counters["http.evicted.slow"] + server.counters["http.evicted"] >= 5
+
+
+async def test_answers_that_nobody_reads_keep_nobody_out(
     server: XmlRpcServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(limits, "HTTP_BODY_MAX", 1000)
+    monkeypatch.setattr(limits, "HTTP_CONNECTIONS_MAX", 2)
+    async with client(server) as one, client(server) as other:
+        for c in (one, other):
+            c.writer.write(post(serialize_call("echo", ["x" * 8_000_000])))
+        while server.counters["xmlrpc.calls"] < 2 or not all(c._pending() for c in server._connections):
+            await asyncio.sleep(0.001)
+        assert await call(f"http://127.0.0.1:{server.port}/", "echo", 1) == [1, "127.0.0.1", [1]]
+    assert server.counters["http.evicted.slow"] == 1
+
+
+async def test_calls_in_one_go_are_answered_behind_a_half_close(server: XmlRpcServer) -> None:
     async with client(server) as c:
-        c.writer.write(b"POST / HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n")
-        c.writer.write((b"100\r\n" + b"a" * 0x100 + b"\r\n") * 5)
-        assert (await c.ended()).startswith(b"HTTP/1.1 413")
+        c.writer.write(post(CALL) * 5)
+        c.writer.write_eof()
+        assert (await c.ended()).count(b"HTTP/1.1 200 OK") == 5
+
+
+async def test_calls_in_one_go_are_answered_in_turn_with_those_of_others(server: XmlRpcServer) -> None:
+    async with client(server) as greedy, client(server) as other:
+        greedy.writer.write(post(CALL) * 200)
+        other.writer.write(post(CALL))
+        await other.response()
+        assert server.counters["xmlrpc.calls"] < 100
+        for _ in range(200):
+            assert parse_response((await greedy.response())[1])
 
 
 async def test_large_calls_and_answers_take_many_turns_of_the_loop(server: XmlRpcServer) -> None:

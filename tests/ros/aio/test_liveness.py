@@ -1,10 +1,14 @@
 from __future__ import annotations
 
+import asyncio
+import errno
 import socket
+import threading
 from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.core.errors import UnreachableError
 from rmpa.ros.aio import liveness
 from rmpa.ros.aio.liveness import listening_ports, read_tables
 from rmpa.ros.aio.sock_diag import ask_listening_ports, read_ports
@@ -66,3 +70,61 @@ def test_a_kernel_that_does_not_tell_is_no_failure(tmp_path: Path, monkeypatch: 
     assert read_tables() is None
     monkeypatch.setattr(liveness, "ask_listening_ports", lambda: None)
     assert listening_ports() is None
+
+
+async def test_the_end_waits_for_a_look_under_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread cannot be cancelled, and the look has a socket open."""
+    began, go = threading.Event(), threading.Event()
+    seen: list[socket.socket] = []
+
+    def look() -> set[int]:
+        with socket.socket() as sock:
+            seen.append(sock)
+            began.set()
+            assert go.wait(20.0)
+        return set()
+
+    monkeypatch.setattr(liveness, "listening_ports", look)
+    looking = liveness.Liveness(nodes=dict, on_dead=lambda _node, _api: None)
+    looking.start()
+    assert await asyncio.to_thread(began.wait, 20.0)
+    closing = asyncio.ensure_future(looking.close())
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert not closing.done()
+    go.set()
+    await closing
+    assert seen[0].fileno() < 0
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (OSError(errno.EHOSTUNREACH, "as asked"), "No route to host"),
+        (OSError("no number"), "no number"),
+        (TimeoutError(), "no answer in 3 s"),
+        (UnreachableError("machine", "x", "the name does not resolve here"), "the name does not resolve here"),
+        (None, ""),
+    ],
+)
+async def test_why_a_node_cannot_be_reached(
+    monkeypatch: pytest.MonkeyPatch, error: Exception | None, text: str
+) -> None:
+    async def connect(*_: object) -> socket.socket:
+        if error is not None:
+            raise error
+        return socket.socket()
+
+    monkeypatch.setattr(liveness, "connect", connect)
+    assert await liveness.try_connect("http://10.9.9.9:1234/") == text
+    assert not await liveness.refuses("http://10.9.9.9:1234/")
+
+
+async def test_an_address_that_is_none_cannot_be_reached() -> None:
+    assert "a ROS URI looks like" in await liveness.try_connect("http://nowhere/")
+
+
+async def test_a_refusal_is_no_outage() -> None:
+    with pytest.raises(ConnectionRefusedError):
+        await liveness.try_connect("http://127.0.0.1:9/")
+    assert await liveness.refuses("http://127.0.0.1:9/")

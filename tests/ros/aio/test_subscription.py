@@ -37,6 +37,7 @@ class Said:
         self.messages: list[bytes] = []
         self.refused: list[str] = []
         self.lost: list[str] = []
+        self.oversized: list[int] = []
         self.link = PublisherConnection(
             "/t",
             uri,
@@ -46,6 +47,7 @@ class Said:
             on_parts=on_parts,
             on_refused=self.refused.append,
             on_lost=self.lost.append,
+            on_oversized=self.oversized.append,
             type_name=options.get("type_name", "*"),
             md5sum=options.get("md5sum", "*"),
         )
@@ -191,14 +193,76 @@ async def test_a_malformed_reply_is_a_loss(publisher: RawPublisher, junk: bytes)
 
 
 @pytest.mark.trap(17)
-async def test_a_message_beyond_the_limit_ends_the_connection(publisher: RawPublisher) -> None:
+async def test_what_cannot_be_a_length_ends_the_connection(publisher: RawPublisher) -> None:
     said = Said(publisher.uri)
     link, _ = await publisher.serve()
-    await link.send(b"\xff\xff\xff\xff")
+    await link.send(frame_message(b"before") + b"\xff\xff\xff\xff")
     await until(lambda: said.lost)
-    assert "message of 4294967295 bytes exceeds the limit" in said.lost[0]
+    assert "a message's length of 4294967295 bytes cannot be" in said.lost[0]
+    assert [m[4:] for m in said.messages] == [b"before"]
+    assert said.oversized == []
+    assert said.link.malformed
     await said.close()
     link.close()
+
+
+@pytest.mark.trap(17)
+@pytest.mark.parametrize("parts", [False, True])
+@pytest.mark.parametrize("chunk", [1, 7, 1000, 1 << 20])
+async def test_a_message_beyond_the_limit_is_left_out_and_others_come(
+    publisher: RawPublisher, monkeypatch: pytest.MonkeyPatch, parts: bool, chunk: int
+) -> None:
+    monkeypatch.setattr(limits, "TCPROS_MESSAGE_MAX", 1000)
+    monkeypatch.setattr(limits, "CUT_THROUGH_BYTES", 500)
+    said = InParts(publisher.uri) if parts else Said(publisher.uri)
+    link, _ = await publisher.serve()
+    sent = [b"one", bytes(1001), b"two", bytes(700), bytes(5000), bytes(1002), bytes(1000), b"3", bytes(9000), b""]
+    wire = b"".join(len(body).to_bytes(4, "little") + body for body in sent)
+    for start in range(0, len(wire), chunk):
+        await link.send(wire[start : start + chunk])
+    wanted = [body for body in sent if len(body) <= 1000]
+    await until(lambda: len(said.messages) == len(wanted))
+    assert [m[4:] for m in said.messages] == wanted
+    assert said.oversized == [1001, 5000, 1002, 9000]
+    connection = said.link.connection()
+    assert (connection.messages, connection.bytes) == (len(wanted), len(wire))
+    assert not said.lost
+    await said.close()
+    link.close()
+
+
+async def test_a_message_beyond_the_limit_takes_no_memory(
+    publisher: RawPublisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "TCPROS_MESSAGE_MAX", 1 << 20)
+    said = Said(publisher.uri)
+    link, _ = await publisher.serve()
+    await link.send((64 << 20).to_bytes(4, "little"))
+    for _ in range(64):
+        await link.send(bytes(1 << 20))
+    await link.send(frame_message(b"behind"))
+    await until(lambda: said.messages)
+    assert len(said.link._stream._buffer) <= 8 << 20  # type: ignore[union-attr] # it is connected
+    await said.close()
+    link.close()
+
+
+@pytest.mark.trap(17)
+async def test_a_publisher_that_goes_in_the_middle_of_such_a_message_is_found_again(
+    publisher: RawPublisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "TCPROS_MESSAGE_MAX", 1000)
+    said = Said(publisher.uri)
+    link, _ = await publisher.serve()
+    await link.send((1001).to_bytes(4, "little") + bytes(500))
+    await until(lambda: said.oversized)
+    link.close()
+    again, _ = await publisher.serve()
+    await again.send(frame_message(b"after"))
+    await until(lambda: said.messages)
+    assert [m[4:] for m in said.messages] == [b"after"]
+    await said.close()
+    again.close()
 
 
 @pytest.mark.trap(18)
@@ -300,6 +364,7 @@ async def test_half_a_message_holds_nobody_else_up_and_the_kernel_watches(publis
         await until(lambda: len(fine.messages) == 3)
         assert len(stuck.messages) == 1
         assert stuck.link._stream is not None
+        assert isinstance(stuck.link._stream._sock, socket.socket)
         assert stuck.link._stream._sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
         await half.send(b" a minute ago")
         await stuck.close()

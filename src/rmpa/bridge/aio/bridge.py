@@ -5,17 +5,21 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
-from collections import deque
+from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import actions as act
+from rmpa.bridge.aio.absent import Absent, AbsentPeers
 from rmpa.bridge.aio.asks import Asks
 from rmpa.bridge.aio.inbound import Inbound
+from rmpa.bridge.aio.kills import RemoteKills
 from rmpa.bridge.aio.local_sources import LocalSources
+from rmpa.bridge.aio.loss_reports import LossReports
 from rmpa.bridge.aio.outbound import Outbound
 from rmpa.bridge.aio.presence import Presence
+from rmpa.bridge.aio.proxy_nodes import ProxyNodes
 from rmpa.bridge.exports import Exports
 from rmpa.bridge.imports import Imports
 from rmpa.bridge.messages import (
@@ -34,11 +38,14 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.mismatches import Mismatches
 from rmpa.bridge.naming import Names
-from rmpa.bridge.policy import OWN_NODE, Policy
+from rmpa.bridge.pacing import Pacing
+from rmpa.bridge.policy import OWN_NODE, Policy, is_own
 from rmpa.bridge.proxy_names import proxy_name, proxy_prefix
 from rmpa.bridge.relay import Linked, Relay
+from rmpa.bridge.watch import shown_seconds
 from rmpa.core import limits
 from rmpa.core.aio.loop import breathe
+from rmpa.core.config import LimitSettings
 from rmpa.core.contract import Contracts, Priority
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
@@ -51,6 +58,7 @@ from rmpa.ros.master.effects import GraphChange, Kind
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from rmpa.bridge.aio.flows import ExportFlow
     from rmpa.bridge.aio.part import DataTaker, Part
     from rmpa.bridge.relay import Place
     from rmpa.bridge.watch import Occurred
@@ -62,6 +70,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 _ADVERTISE: Final = b'{"op":"advertise"'
 _SERVICES: Final = b'{"op":"services"'
+_ROUNDING: Final = 0.001
 
 
 @dataclass(slots=True)
@@ -73,8 +82,12 @@ class Attached:
     inbound: Inbound
     away: asyncio.TimerHandle | None = None
     """Runs while the link is gone and reliable routes wait for the peer; ``link`` is the last one."""
+    away_since: float = 0.0
+    """When that link ended, monotonic seconds."""
     back: asyncio.TimerHandle | None = None
     """Runs while it is back and may still ask for routes that waited."""
+    untold: bool = False
+    """Whether it has not been told yet of all that it may ask for: ``back`` runs anew when it has."""
     takers: dict[int, DataTaker] = field(default_factory=dict)
     """What comes on routes that are not topics'; by the parts."""
 
@@ -88,6 +101,7 @@ class Bridge:
         contracts: What its topics need.
         names: How names read at the peers, and theirs here.
         relay: Whether what comes from one peer is offered to others.
+        most: How much of one peer is taken, and how much is offered.
         rng: Uniform numbers in [0, 1) for back-off jitter.
     """
 
@@ -100,13 +114,16 @@ class Bridge:
         contracts: Contracts | None = None,
         names: Names | None = None,
         relay: bool = False,
+        most: LimitSettings | None = None,
     ) -> None:
+        most = most if most is not None else LimitSettings()
         self._core = core
         self.names = names if names is not None else Names()
         """How names read at the peers, and theirs here; another one after ``reload``."""
-        self._exports = Exports(policy, contracts, self.names)
-        self._imports = Imports(policy, rng, contracts, self._position, self.names)
+        self._imports = Imports(policy, rng, contracts, self._position, self.names, most)
         self.counters = Counters()
+        self.asks = Asks(self.counters)
+        self._kills = RemoteKills(self.asks)
         self._node = SlaveNode(
             OWN_NODE,
             core.node_host,
@@ -114,11 +131,24 @@ class Bridge:
             advertised_host=core.node_address,
             counters=self.counters,
             on_param_update=self._param_update,
+            on_kill=self._kills.own,
             taps=lambda: self._outbound.connections,
         )
+        self.proxy_nodes = ProxyNodes(core, self.counters)
+        """How what stands for the nodes of peers listens."""
         self._outbound = Outbound(
-            core, self._node, on_described=self._described, on_lost=self._lost, on_given_up=self._given_up
+            core,
+            self._node,
+            on_described=self._described,
+            on_lost=self._lost,
+            on_given_up=self._given_up,
+            on_let_go=lambda keys: self.losses.let_go(keys, self._outbound.lost),
+            on_missed=self._missed,
+            on_oversized=self._oversized,
+            on_malformed=lambda source, text: self._warn("publisher.malformed", str(source), f"{source}: {text}"),
         )
+        self._exports = Exports(policy, contracts, self.names, most, self._outbound)
+        self._absent = AbsentPeers(lambda peer: self._act(self._exports.unclaimed(peer)), self._outbound.forget)
         self._numbers = itertools.count(1)
         self._by_number: dict[int, Attached] = {}
         self._by_link: dict[MeshLink, Attached] = {}
@@ -130,20 +160,24 @@ class Bridge:
         self._closed = False
         # Topics of the local graph to look at, advertisements to learn, and what is to be done: each is worked off a
         # little at a time, so that a graph of thousands delays no message.
-        self._changed: dict[str, None] = {}
+        # Ordered: to take the first of a plain dict passes over all that were taken before it.
+        self._changed: OrderedDict[str, None] = OrderedDict()
         self._learning: deque[tuple[Attached, bytes | Iterator[Advertise]]] = deque()
         self._learning_bytes = 0
+        self._pacing = Pacing()
         self._forgetting: deque[Iterator[act.Action]] = deque()
         self._rejudging: Iterator[list[act.Action]] = iter(())
         self._actions: deque[act.Action] = deque()
         self._acting = False
         self._mismatches = Mismatches()
         self._refusals = RefusalLog(_log, self.counters)
-        self.asks = Asks(self.counters)
+        get = self._by_number.get
+        self.losses = LossReports(self._exports, get, self._absent, self.asks, self.counters, self._refusals)
+        """What does not reach its listeners, for the monitor."""
         self._presence = Presence(self._exports, self._imports, self._by_number.get, self._refusals)
         self.relay = Relay(enabled=relay)
         """What is passed on between peers."""
-        self._local = LocalSources(core, self.relay)
+        self._local = LocalSources(core, self.relay, lambda source: self._exports.description(source) is not None)
         self._relayed: dict[str, str] = {}
         self._parts: list[Part] = [self.asks, self._presence]
 
@@ -162,8 +196,9 @@ class Bridge:
         """
         policy, contracts = Policy(settings.policy, settings.peers, settings.time), Contracts(settings.contracts)
         self.names = Names(settings.peers)
-        self._act(self._exports.rules(policy, contracts, self.names))
-        self._rejudging = self._imports.rules(policy, contracts, self.names, self._loop.time())
+        most = settings.limits
+        self._act(self._exports.rules(policy, contracts, self.names, most))
+        self._rejudging = self._imports.rules(policy, contracts, self.names, self._loop.time(), most)
         self._scan_all()
         for part in self._parts:
             part.reload(settings)
@@ -204,6 +239,7 @@ class Bridge:
         """Follow the local graph."""
         self._loop = asyncio.get_running_loop()
         await self._node.start()
+        await self.proxy_nodes.start()
         self._core.on_change(self._graph_changed)
         self._scan_all()
         self._reconciler = self._loop.call_later(limits.RECONCILE_INTERVAL, self._reconcile)
@@ -223,6 +259,7 @@ class Bridge:
         for part in reversed(self._parts):
             await part.close()
         self._outbound.close()
+        await self.proxy_nodes.close()
         await self._node.close()
 
     # --- the mesh's side ---------------------------------------------------------------------------------------
@@ -233,26 +270,38 @@ class Bridge:
         if back is not None:
             _log.info("= %s is back: reliable topics go on", link.name)
             back.link = link
-            back.back = self._loop.call_later(limits.RESUME_CLAIM, self._unclaimed, back)
             back.inbound.time.resumed_at = lambda: link.resumed_at
             self._by_link[link] = back
+            self._await_claims(back)
             self._introduce(back)
             self._parts_link_up(back)
             self._schedule()
             return
-        peer = next(self._numbers)
+        absent = self._absent.back(link.identity)
+        again = absent is not None and absent.identity.instance == link.identity.instance
+        peer = absent.peer if absent is not None and again else next(self._numbers)
         prefix = proxy_prefix(link.identity, self._prefixes(link.identity.instance.hex()))
         inbound = Inbound(
             self._core,
             prefix,
+            nodes=self.proxy_nodes,
             counters=self.counters,
             on_demand=lambda source, wanted: self._demand(peer, source, wanted=wanted),
             on_mismatch=lambda source, subscriber, text: self._mismatched(peer, source, subscriber, text),
             on_occurred=lambda source, occurred: self._occurred(peer, source, occurred),
             on_listeners=lambda source: self._presence.changed(peer, source),
+            pasts=absent.pasts if absent is not None else None,
+            on_kill=lambda node, caller, reason: self._kills.proxy(attached, node, caller, reason),
         )
         inbound.time.resumed_at = lambda: link.resumed_at
         attached = Attached(peer, link, inbound)
+        if absent is not None:
+            if not again:
+                self._exports.inherit(absent.peer, peer)
+                self._outbound.inherit(absent.peer, peer)
+            away = shown_seconds(self._loop.time() - absent.since)
+            _log.info("= %s is back after %s%s", link.name, away, "" if again else ", another run of it")
+            self._await_claims(attached)
         self._by_number[peer] = self._by_link[link] = attached
         self._introduce(attached)
         self._parts_link_up(attached)
@@ -263,6 +312,7 @@ class Bridge:
         linked = Linked(who.name, who.instance.hex(), who.guid)
         self._act(self._imports.link_up(attached.peer, who.name, linked))
         self._act(self._exports.link_up(attached.peer, who.name, linked.instance))
+        self._told(attached)
 
     def _prefixes(self, instance: str) -> set[str]:
         """The namespaces of proxies that a module must leave to others."""
@@ -301,6 +351,7 @@ class Bridge:
         self._learning_bytes = sum(len(lesson) for _, lesson in self._learning if isinstance(lesson, bytes))
         exports, _ = self._exports.link_away(attached.peer)
         self._act(exports)
+        attached.away_since = self._loop.time()
         if link.silent:
             # Most silences end soon, by a new link: until then nobody need notice.
             attached.away = self._loop.call_later(limits.AWAY_GRACE, self._stay_away, attached)
@@ -312,19 +363,46 @@ class Bridge:
     def _stay_away(self, attached: Attached) -> None:
         """A peer without a link does not come back at once: only what a reliable route needs waits for it."""
         name = attached.link.name
-        attached.away = self._loop.call_later(limits.RESUME_WINDOW, self._give_up, attached)
         if not self._exports.waits_for(attached.peer) and not self._imports.waits_for(attached.peer):
             self._act(self._imports.detached(attached.peer))
             self._give_up(attached)
             return
         imports, _ = self._imports.link_away(attached.peer)
         self._act(imports)
-        _log.info("= %s is away: its reliable topics wait for %g s", name, limits.RESUME_WINDOW)
+        outages = {*self._imports.outages(attached.peer), self._exports.outage(attached.peer)}
+        _log.info("= %s is away: its reliable topics wait for %s", name, shown_seconds(max(outages)))
+        self._outlast(attached)
+
+    def _outlast(self, attached: Attached) -> None:
+        """A peer has been away for a while: give up what does not wait for longer, and all when nothing does."""
+        away_for = self._loop.time() - attached.away_since
+        self._act(self._imports.outlasted(attached.peer, away_for))
+        outages = {*self._imports.outages(attached.peer), self._exports.outage(attached.peer)}
+        due = min((outage for outage in outages if outage > away_for), default=None)
+        if due is None:
+            self._give_up(attached)
+        else:
+            # A moment later, for the loop's clock may round to before it.
+            when = attached.away_since + due + _ROUNDING
+            attached.away = self._loop.call_at(when, self._outlast, attached)
+
+    def _await_claims(self, attached: Attached) -> None:
+        """A peer is back: it can ask for what waits for it as soon as it was told of it."""
+        attached.untold = True
+        attached.back = self._loop.call_later(limits.RESUME_CLAIM_MAX, self._unclaimed, attached)
+
+    def _told(self, attached: Attached) -> None:
+        """A peer may have been told everything: then it asks soon. A large graph takes long on a busy lane."""
+        if attached.back is not None and attached.untold and not self._exports.beginning(attached.peer):
+            attached.untold = False
+            attached.back.cancel()
+            attached.back = self._loop.call_later(limits.RESUME_CLAIM, self._unclaimed, attached)
 
     def _unclaimed(self, attached: Attached) -> None:
-        """A peer has been back for a while: what it has not asked for is not wanted any more."""
+        """A peer has known everything for a while: what it has not asked for is not wanted any more."""
         attached.back = None
         self._act(self._exports.unclaimed(attached.peer))
+        self._outbound.unclaimed(attached.peer)
 
     def clock(self, link: MeshLink) -> None:
         """A link knows its peer's clock better."""
@@ -461,17 +539,24 @@ class Bridge:
                 part.link_down(attached)
         for part in self._parts:
             part.gone(attached)
-        for action in self._exports.link_down(attached.peer):
+        absent = Absent(attached.peer, attached.link.identity, attached.away_since, attached.inbound.leave())
+        counting = self._exports.waits_for(attached.peer)
+        for action in self._exports.link_down(attached.peer, counting=not self._closed):
             self._act([action])
         # Its actions are what closing the inbound side does at once.
         self._forgetting.append(self._imports.link_down(attached.peer))
         self.relay.peer_gone(attached.peer)
+        self._pacing.forget(attached.peer)
         self._act(self._imports.unlinked(attached.peer))
         self._schedule()
         task = asyncio.create_task(attached.inbound.close(), name=f"retract {attached.inbound.prefix}")
         self._closing.add(task)
         task.add_done_callback(self._closing.discard)
         self._set_timer()
+        if not self._closed and (counting or absent.pasts):
+            self._absent.add(absent)
+        else:
+            self._outbound.forget(attached.peer)
 
     def _position(self, peer: int, source: Source) -> tuple[int, int] | None:
         attached = self._by_number.get(peer)
@@ -510,11 +595,14 @@ class Bridge:
         """Do a part of what has to be done since graphs have changed, the local one or a peer's."""
         self._rescan = None
         for _ in range(min(len(self._changed), limits.RESCANNED_AT_ONCE)):
-            topic = next(iter(self._changed))
-            del self._changed[topic]
+            topic, _ = self._changed.popitem(last=False)
             breathe()
             self._look_at(topic)
-        self._act(self._exports.tell())
+        told = self._exports.tell(self._may_tell)
+        self._act(told)
+        if told:
+            for attached in self._by_number.values():
+                self._told(attached)
         if self._learning:
             self._learn(*self._learning.popleft())
         if self._forgetting and not tuple(islice(self._forgetting[0], limits.LEARNT_AT_ONCE)):
@@ -522,10 +610,22 @@ class Bridge:
         rejudged = tuple(islice(self._rejudging, limits.LEARNT_AT_ONCE))
         # In one: what data brings in between belongs behind all of it.
         self._act([action for actions in rejudged for action in actions])
-        if self._changed or self._learning or self._forgetting or rejudged or self._exports.untold:
+        if self._changed or self._learning or self._forgetting or rejudged or (told and self._exports.untold):
             self._schedule()
+        elif self._exports.untold:
+            self._scan_later()
         elif self._mismatches:
             self._mismatches.keep(lambda source: source in self._exports.offered or self._imports.knows(source))
+
+    def _scan_later(self) -> None:
+        """Peers have to be told more, but what they were told is still on its way."""
+        if self._rescan is None and not self._closed:
+            self._rescan = self._loop.call_later(limits.TELL_PAUSE, self._scan)
+
+    def _may_tell(self, peer: int) -> bool:
+        attached = self._by_number.get(peer)
+        busy = attached is not None and attached.link.busy
+        return self._pacing.ready(peer, self._loop.time(), busy=busy)
 
     def _learn(self, attached: Attached, lesson: bytes | Iterator[Advertise]) -> None:
         """Read an advertisement, or take in the next portion of one that was read."""
@@ -565,7 +665,9 @@ class Bridge:
     def _reconcile(self) -> None:
         self._reconciler = self._loop.call_later(limits.RECONCILE_INTERVAL, self._reconcile)
         self._scan_all()
+        self._absent.expire(self._loop.time())
         publishers = self._core.state().publishers
+        self._forget_unheard()
         for attached in list(self._by_number.values()):
             breathe()
             if again := attached.inbound.reconcile(publishers):
@@ -579,6 +681,17 @@ class Bridge:
         for part in self._parts:
             breathe()
             part.reconcile()
+
+    def _forget_unheard(self) -> None:
+        """What nobody subscribes to any more is not missed."""
+        subscribers = self._core.state().subscribers
+
+        def subscribed(topic: str) -> bool:
+            return any(not is_own(node) for node in subscribers.get(topic, ()))
+
+        self._absent.unheard(subscribed)
+        for attached in self._by_number.values():
+            attached.inbound.unheard(subscribed)
 
     def _demand(self, peer: int, source: Source, *, wanted: bool) -> None:
         self._act(self._imports.demand(peer, source, self._loop.time(), wanted=wanted))
@@ -605,9 +718,14 @@ class Bridge:
     def _lost(self, source: Source, reason: str) -> None:
         self._act(self._exports.lost(source, reason))
 
+    def _missed(self, source: Source, peer: int, count: int, why: str) -> None:
+        self.losses.missed(source, peer, count, why)
+
+    def _oversized(self, source: Source, flow: ExportFlow) -> None:
+        self.losses.oversized(source, flow)
+
     def _given_up(self, source: Source, peer: int) -> None:
-        text = f"{source}: more than {limits.RESUME_BYTES_MAX >> 20} MiB wait for peers that are away; given up"
-        self._warn("route.given_up", str(source), text)
+        self.losses.uncounted(source)
         self._act(self._exports.given_up(source, peer))
 
     # --- carrying out ------------------------------------------------------------------------------------------
@@ -657,6 +775,8 @@ class Bridge:
                 if attached is not None:
                     try:
                         self._outbound.add_route(action, attached.link)
+                        flow = self._outbound.flows[action.source]
+                        self.losses.tell_oversized(action.source, flow, action.peer)
                     except RemoteProtocolError as error:
                         # Here, for what waits to be done has other causes. The next link begins a new numbering.
                         self._refuse(attached, error)

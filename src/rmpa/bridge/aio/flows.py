@@ -8,13 +8,13 @@ with the planning side.
 from __future__ import annotations
 
 import asyncio
-import math
 import time
 from collections import deque
 from itertools import islice
 from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.bridge.aio.legs import Leg, ReliableLeg, make_leg
+from rmpa.bridge.losses import Past
 from rmpa.bridge.quality import Quality
 from rmpa.bridge.watch import Watch
 from rmpa.core import limits
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from rmpa.bridge.aio.legs import DataLink
+    from rmpa.bridge.aio.link_time import LinkTime
     from rmpa.bridge.watch import Occurred
     from rmpa.core.aio.stream import Buffer
 
@@ -76,6 +77,8 @@ class ExportFlow:
         "large",
         "latching",
         "messages",
+        "oversized",
+        "oversized_bytes",
     )
 
     def __init__(self) -> None:
@@ -92,6 +95,13 @@ class ExportFlow:
         self.messages = 0
         self.bytes = 0
         self.dropped = 0
+        self.oversized = self.oversized_bytes = 0
+        """Messages of the publisher that were left out because they are too long; the last one's bytes."""
+
+    def left_out(self, size: int) -> None:
+        """A message of so many bytes is too long."""
+        self.oversized += 1
+        self.oversized_bytes = size
 
     def latch(self) -> None:
         """The publisher latches."""
@@ -123,6 +133,13 @@ class ExportFlow:
         leg = self.by_peer.get(peer)
         if isinstance(leg, ReliableLeg):
             leg.suspend(keep)
+
+    def inherit(self, old: int, new: int) -> Leg | None:
+        """What is kept for a peer is kept for another one, which has none yet."""
+        leg = self.by_peer.pop(old, None)
+        if leg is not None:
+            self.by_peer[new] = leg
+        return leg
 
     def remove(self, peer: int) -> None:
         """Send to that peer no longer."""
@@ -191,30 +208,6 @@ class ExportFlow:
             self._latched.append((whole, self._stamp))
 
 
-def _never() -> float:
-    """No silence so far."""
-    return -math.inf
-
-
-class LinkTime:
-    """How a link's messages are dated here: one for all of its flows, renewed whenever the link knows better."""
-
-    __slots__ = ("ahead_ns", "error_ns", "resumed_at")
-
-    def __init__(self) -> None:
-        self.resumed_at: Callable[[], float] = _never
-        """When the link's last silence was last seen, monotonic seconds; see ``core.aio.stream``."""
-        self.ahead_ns = 0
-        """The peer's wall clock less ours."""
-        self.error_ns: int | None = None
-        """± bound of that; ``None`` while nothing is known."""
-
-    def set(self, offset: float | None, error: float | None) -> None:
-        """Take a link's estimate, in seconds."""
-        self.ahead_ns = round((offset or 0.0) * 1e9)
-        self.error_ns = None if error is None else round(error * 1e9)
-
-
 class ImportFlow:
     """From one peer's route to the local subscribers of its proxy.
 
@@ -226,6 +219,7 @@ class ImportFlow:
         on_torn: Subscribers were closed in the middle of a message: let them come again.
         on_broken: A reliable route has lost messages all the same.
         counters: Outlive the route: ``message.lost``, ``message.late``, ``message.stale``, ``message.expired``.
+        past: What is known from before, of a reliable source.
     """
 
     def __init__(
@@ -238,6 +232,7 @@ class ImportFlow:
         on_torn: Callable[[], None] | None = None,
         on_broken: Callable[[Occurred], None] | None = None,
         counters: Counters | None = None,
+        past: Past | None = None,
     ) -> None:
         self._counters = counters if counters is not None else Counters()
         self._loop = asyncio.get_running_loop()
@@ -253,7 +248,8 @@ class ImportFlow:
         self._replay: deque[bytes] | None = None
         self._receiver: ReliableReceiver | None = None
         if contract.reliability is Reliability.RELIABLE:
-            self._receiver = ReliableReceiver()
+            known = past.receiver if past is not None else None
+            self._receiver = known if known is not None else ReliableReceiver()
         self._epoch = 0
         self._plain = self._receiver is None
         self._stale_ns = round((contract.lifespan or limits.STALE_AGE) * 1e9)
@@ -267,7 +263,10 @@ class ImportFlow:
         self._ack_timer: asyncio.TimerHandle | None = None
         self.quality = Quality()
         self.watch = Watch(contract, now)
-        self.lost = 0
+        if past is not None:
+            self.watch.counts.update(past.counts)
+            self.watch.recent.extend(past.recent)
+        self.lost = past.lost if past is not None else 0
         """Messages that never came: the sender's queue, or a link, lost them."""
         self.late = 0
         """Messages that came behind newer ones, or again, and were left out."""
@@ -275,6 +274,8 @@ class ImportFlow:
         """Best-effort messages that an outage had held up and that gave way to newer ones."""
         self.expired = 0
         """Messages that came after their lifespan."""
+        self.oversized = self.oversized_bytes = 0
+        """Messages that its publisher's agent has left out because they are too long; the last one's bytes."""
         self._last_size = 0
 
     @property
@@ -290,10 +291,39 @@ class ImportFlow:
         return self._receiver.position() if self._receiver is not None else None
 
     def begin_epoch(self, epoch: int, first: int) -> bool:
-        """The sender says which numbering this is; whether nothing is known to be missing."""
+        """The sender says which numbering this is; whether it is the one that was received before, or the first."""
         self._epoch = epoch
         self._drop_parts()
         return self._receiver.begin(epoch, first) if self._receiver is not None else True
+
+    def missed(self, count: int) -> None:
+        """The sender says how many messages it has given up that no gap will tell of."""
+        if count:
+            self._missing(count)
+
+    def skip(self, following: int) -> None:
+        """The sender says which message comes next: those before it will not."""
+        self.missed(self._receiver.skip(following) if self._receiver is not None else 0)
+
+    def missed_unknown(self, why: str) -> None:
+        """Messages may be lost, and nobody knows how many."""
+        self._counters.add("message.lost_unknown")
+        occurred = self.watch.lost_unknown(why, self._loop.time())
+        if self._on_broken is not None:
+            self._on_broken(occurred)
+
+    def past(self, topic: str, *, missed: bool) -> Past | None:
+        """What is to be known when the source's next route opens; ``None``: nothing."""
+        if self._receiver is None:
+            return None
+        return Past(
+            topic,
+            self._receiver if missed and self._receiver.position() is not None else None,
+            missed,
+            self.lost,
+            self.watch.counts,
+            tuple(self.watch.recent),
+        )
 
     def expect_replay(self, kept: Iterable[bytes]) -> None:
         """The subscribers have these kept messages already; the new route brings again those that are still kept."""

@@ -4,35 +4,42 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
+from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rmpa.bridge.actions import Publish
-from rmpa.bridge.aio.flows import ImportFlow, LinkTime
+from rmpa.bridge.aio.flows import ImportFlow
+from rmpa.bridge.aio.link_time import LinkTime
+from rmpa.bridge.aio.proxy_nodes import ProxyNodes
 from rmpa.bridge.proxy_names import proxy_name
 from rmpa.core import limits
+from rmpa.core.aio.descriptors import is_shortage
 from rmpa.core.aio.loop import breathing
 from rmpa.core.contract import Durability, Reliability
 from rmpa.core.errors import RmpaError
+from rmpa.core.open_files import remedy
 from rmpa.ros.aio.publication import Publication
-from rmpa.ros.aio.slave_server import SlaveNode
 from rmpa.ros.tcpros import Description, printable
+from rmpa.ros.xmlrpc import Reply
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Awaitable, Callable, Iterator, Mapping
 
     from rmpa.bridge.actions import Describe, Detach, Retract
+    from rmpa.bridge.losses import Past
     from rmpa.bridge.messages import Source
     from rmpa.bridge.watch import Occurred
     from rmpa.core.counters import Counters
     from rmpa.ros.aio.core_api import Core
+    from rmpa.ros.aio.slave_server import SlaveNode
 
 _log = logging.getLogger(__name__)
 
 
-def _not_here(name: str, reason: str) -> None:
-    """Somebody asked a proxy to end (``rosnode kill``); only its module can do that."""
-    _log.warning("! %s stands for a node of another module and cannot be ended from here (%s)", name, reason)
+async def _stays(node: str, _caller: str, _reason: str) -> Reply:
+    return Reply(0, f"{node} is a node of another module", 0)
 
 
 @dataclass(slots=True)
@@ -68,17 +75,20 @@ class _Hold:
 class Inbound:
     """The proxies of one peer.
 
-    Making a proxy binds sockets, which takes a turn of the loop; so what changes the graph is done one after the
+    Making a proxy may bind sockets, which takes a turn of the loop; so what changes the graph is done one after the
     other by a task, in the order in which it was asked for.
 
     Args:
         core: The local core, in which the proxies are registered.
         prefix: The namespace of this peer's proxies.
+        nodes: Makes the proxies; by default with sockets of their own.
         counters: Where refusals at the proxies' ports, and messages that reach no subscriber, are counted.
         on_demand: Called with a source and whether somebody local listens to it.
         on_mismatch: Called with a source, the caller id of a refused subscriber and the text it was told.
         on_occurred: Called with a source and what became of its contract.
         on_listeners: Called with a source when other nodes than before are served with it.
+        pasts: What is known of reliable sources from before, by ``leave`` of another one.
+        on_kill: ``(node, caller id, reason) -> reply``: a proxy was asked to end; the node is the peer's.
     """
 
     def __init__(
@@ -86,23 +96,30 @@ class Inbound:
         core: Core,
         prefix: str,
         *,
+        nodes: ProxyNodes | None = None,
         counters: Counters | None = None,
         on_demand: Callable[[Source, bool], None],
         on_mismatch: Callable[[Source, str, str], None],
         on_occurred: Callable[[Source, Occurred], None],
         on_listeners: Callable[[Source], None] = lambda _: None,
+        pasts: Mapping[Source, Past] | None = None,
+        on_kill: Callable[[str, str, str], Awaitable[Reply]] = _stays,
     ) -> None:
         self._on_listeners = on_listeners
+        self._on_kill = on_kill
         self._on_occurred = on_occurred
         self.prefix = prefix
         self._core = core
         self._counters = counters
+        self._nodes = nodes if nodes is not None else ProxyNodes(core, counters)
         self._on_demand = on_demand
         self._on_mismatch = on_mismatch
         self._proxies: dict[str, Proxy] = {}
         self._wanted: dict[Source, Publish] = {}
         self._holds: dict[tuple[str, str], Callable[[SlaveNode], None]] = {}
         self._jobs: asyncio.Queue[Publish | Retract | _Hold | None] = asyncio.Queue()
+        self.problems: dict[str, str] = {}
+        """Why the proxy of a node could not be made, ready to read; it is tried again by ``reconcile``."""
         self._task = asyncio.create_task(self._work(), name=f"proxies {prefix}")
         self.names: dict[str, str] = {}
         """Of nodes of other modules that the peer passes on: what stands for them here."""
@@ -112,6 +129,13 @@ class Inbound:
         self._latest: dict[Source, ImportFlow] = {}
         """Of each source: the flow of its route, or of the one that its last link had."""
         self._watches: dict[Source, asyncio.TimerHandle] = {}
+        self._pasts: OrderedDict[Source, Past] = OrderedDict(pasts or {})
+        """Of each reliable source without a flow that had one: what its next one must know."""
+
+    @property
+    def count(self) -> int:
+        """How many proxies there are."""
+        return len(self._proxies)
 
     def __iter__(self) -> Iterator[tuple[str, Proxy]]:
         """Each remote node and its proxy."""
@@ -134,7 +158,7 @@ class Inbound:
     def retract(self, action: Retract) -> None:
         """Let a source disappear: its data stops at once, its registration a moment later."""
         self._wanted.pop(action.source, None)
-        self._over(action.source)
+        self._over(action.source, missed=True)
         self._jobs.put_nowait(action)
 
     def hold(self, node: str, key: str, ready: Callable[[SlaveNode], None]) -> None:
@@ -173,26 +197,59 @@ class Inbound:
             flow.expect_replay(publication.latched)
 
     def position(self, source: Source) -> tuple[int, int] | None:
-        """Where a reliable source goes on that outlived its link."""
+        """Where a reliable source goes on that outlived its link, or whose route ended though somebody listens."""
         flow = self._latest.get(source)
-        return flow.position if flow is not None else None
+        if flow is not None:
+            return flow.position
+        past = self._pasts.get(source)
+        return past.receiver.position() if past is not None and past.receiver is not None else None
+
+    def past(self, source: Source) -> Past | None:
+        """What is known of a reliable source without a route."""
+        return self._pasts.get(source)
+
+    def left_out(self, source: Source, count: int, size: int) -> bool:
+        """A source's agent says how many of its messages were too long; whether that is news of an open route.
+
+        Args:
+            source: Which.
+            count: Messages, since that agent connected to the publisher.
+            size: The last one's bytes.
+        """
+        flow = self._latest.get(source)
+        if flow is None or (count, size) == (flow.oversized, flow.oversized_bytes):
+            return False
+        flow.oversized, flow.oversized_bytes = count, size
+        return True
+
+    def unheard(self, subscribed: Callable[[str], bool]) -> None:
+        """Nobody misses what comes on topics that nobody subscribes to any more.
+
+        Args:
+            subscribed: Whether a local node subscribes to a topic.
+        """
+        for past in self._pasts.values():
+            if past.missed and not subscribed(past.topic):
+                past.forget_position(missed=False)
 
     def _flow(
         self, action: Describe, publication: Publication, on_ack: Callable[[int], None]
     ) -> tuple[ImportFlow, bool]:
         """The flow of a route, and whether it goes on exactly where it was when its link fell."""
         source, contract = action.source, action.contract
-        flow = flow_before = self._latest.pop(source, None)
-        goes_on = False
-        if flow is not None and flow.contract == contract and contract.reliability is Reliability.RELIABLE:
+        reliable = contract.reliability is Reliability.RELIABLE
+        flow = self._latest.pop(source, None)
+        outlived = flow is not None and flow.contract == contract and reliable
+        past = self._pasts.pop(source, None)
+        if flow is not None and outlived:
             flow.rebind(on_ack)
             flow.watch.link_up(asyncio.get_running_loop().time())
-            goes_on = flow.begin_epoch(action.epoch, action.first)
-            if not goes_on:
-                _log.warning("! %s: %s: messages were lost, it is not known how many", self.prefix, source)
+            missed = True
         else:
             if flow is not None:
+                past = flow.past(publication.topic, missed=True)
                 self._end(source, flow)
+            missed = past is not None and past.missed
             flow = ImportFlow(
                 publication,
                 contract,
@@ -201,16 +258,38 @@ class Inbound:
                 on_torn=lambda: self._call_back_soon(source, publication),
                 on_broken=lambda occurred: self._on_occurred(source, occurred),
                 counters=self._counters,
+                past=past if reliable else None,
             )
-            position = flow_before.position if flow_before is not None else None
-            known = position is not None and position[0] == action.epoch
-            flow.begin_epoch(action.epoch, position[1] + 1 if position is not None and known else action.first)
+        same = missed and flow.position is not None and flow.position[0] == action.epoch
+        flow.begin_epoch(action.epoch, action.first)
         publication.bound(contract.depth)
         if contract.durability is Durability.TRANSIENT_LOCAL:
             publication.keep(contract.kept)
         self._latest[source] = flow
         self._watch(source, flow)
-        return flow, goes_on
+        if reliable:
+            self._count_missed(flow, action, missed=missed, same=same)
+        return flow, outlived and same
+
+    @staticmethod
+    def _count_missed(flow: ImportFlow, action: Describe, *, missed: bool, same: bool) -> None:
+        """Count what the peer says that it has given up.
+
+        Args:
+            flow: The source's.
+            action: What the peer says.
+            missed: Whether somebody listened before, so that nothing may be lost unseen.
+            same: Whether the numbering goes on.
+        """
+        if same:
+            if action.following is not None:
+                flow.skip(action.following)
+            return
+        if action.lost is not None:
+            flow.missed(action.lost)
+        if action.at_least or (missed and action.lost is None):
+            what = "more than that" if action.lost else "its agent was restarted, or knows nothing of what it missed"
+            flow.missed_unknown(what)
 
     def _watch(self, source: Source, flow: ImportFlow) -> None:
         """Look at a source's contract when it may be broken next."""
@@ -234,13 +313,36 @@ class Inbound:
             timer.cancel()
         flow.close()
 
-    def _over(self, source: Source) -> None:
-        """No flow of a source goes on; its proxy may go with it, so the lease is not waited for."""
+    def _over(self, source: Source, *, missed: bool) -> None:
+        """No flow of a source goes on; its proxy may go with it, so the lease is not waited for.
+
+        Args:
+            source: Which.
+            missed: Whether somebody listens all the same.
+        """
         flow = self._latest.pop(source, None)
-        if flow is not None:
+        if flow is None:
+            if not missed and (past := self._pasts.get(source)) is not None:
+                past.forget_position(missed=False)
+        else:
+            self._remember(source, flow, missed=missed)
             for occurred in flow.watch.link_gone(asyncio.get_running_loop().time()):
                 self._on_occurred(source, occurred)
             self._end(source, flow)
+
+    def _remember(self, source: Source, flow: ImportFlow, *, missed: bool) -> None:
+        publication = self.publication(source)
+        past = flow.past(publication.topic if publication is not None else source.topic, missed=missed)
+        if past is not None and (missed or past.lost or past.counts):
+            self._pasts[source] = past
+            if len(self._pasts) > limits.LOSSES_REMEMBERED:
+                self._pasts.popitem(last=False)
+
+    def leave(self) -> dict[Source, Past]:
+        """The peer has been away for too long: what is to be known when it is back."""
+        for source, flow in self._latest.items():
+            self._remember(source, flow, missed=True)
+        return dict(self._pasts)
 
     def _call_back_soon(self, source: Source, publication: Publication) -> None:
         """Subscribers were hung up on: they come again when the master names the proxy.
@@ -274,7 +376,7 @@ class Inbound:
             if flow is not None:
                 self._watch(action.source, flow)
             return
-        self._over(action.source)
+        self._over(action.source, missed=action.missed)
         publication = self.publication(action.source)
         if publication is not None:
             publication.forget_latched()
@@ -290,8 +392,12 @@ class Inbound:
         for proxy, topic in missing:
             self._register(proxy, topic)
         if self._jobs.empty():
-            there = {*self._proxies, *(source.node for source in self._wanted), *(node for node, _ in self._holds)}
-            self.names = {node: name for node, name in self.names.items() if node in there}
+            if self.names or self.problems:
+                there = set(self._proxies)
+                there.update(source.node for source in breathing(list(self._wanted)))
+                there.update(node for node, _ in breathing(list(self._holds)))
+                self.names = {node: name for node, name in self.names.items() if node in there}
+                self.problems = {node: text for node, text in self.problems.items() if node in there}
             for source, action in breathing(list(self._wanted.items())):
                 if self.publication(source) is None:
                     self._jobs.put_nowait(action)
@@ -323,13 +429,21 @@ class Inbound:
                 else:
                     await self._retract(job.source)
             except (RmpaError, OSError) as error:
-                # Most likely no file descriptor is left; what is wanted is tried again by ``reconcile``.
-                what = job.key if isinstance(job, _Hold) else job.source
-                _log.error("! %s: %s is not in the local graph: %s", self.prefix, what, error)
+                self._failed(job.node if isinstance(job, _Hold) else job.source.node, error)
             except Exception:  # noqa: BLE001 - the task's top: one source that fails must not stop the others
                 _log.exception("! %s: %s failed; the others go on", self.prefix, job)
         for node in list(self._proxies):
             await self._close_proxy(node)
+
+    def _failed(self, node: str, error: Exception) -> None:
+        """A proxy could not be made; it is tried again by ``reconcile``, and told once."""
+        text = (
+            f"no file descriptor is left for its proxy; {remedy(os.getpid())}" if is_shortage(error) else str(error)
+        )
+        if self.problems.get(node) != text:
+            self.problems[node] = text
+            level = logging.DEBUG if is_shortage(error) else logging.ERROR  # a shortage is told for the process
+            _log.log(level, "! %s: %s is not in the local graph: %s", self.prefix, node, text)
 
     async def _publish(self, action: Publish) -> None:
         source = action.source
@@ -384,15 +498,9 @@ class Inbound:
         proxy = self._proxies.get(remote)
         if proxy is None:
             name = self.names.get(remote) or proxy_name(self.prefix, remote)
-            node = SlaveNode(
-                name,
-                self._core.node_host,
-                self._core.uri,
-                advertised_host=self._core.node_address,
-                counters=self._counters,
-                on_shutdown=lambda reason: _not_here(name, reason),
-            )
+            node = self._nodes.make(name, lambda caller, reason: self._on_kill(remote, caller, reason))
             await node.start()
+            self.problems.pop(remote, None)
             proxy = self._proxies[remote] = Proxy(node)
         return proxy
 

@@ -281,6 +281,7 @@ class ReliableLeg(Leg):
             depth, limits.REPLAY_BYTES, limits.RELIABLE_WINDOW_MESSAGES, limits.RELIABLE_WINDOW_BYTES, epoch
         )
         self._keep: Callable[[bytes, int], object] | None = None
+        self._told = 0
         super().__init__(link, route, contract, large=large)
         self._direct = False
 
@@ -333,6 +334,11 @@ class ReliableLeg(Leg):
         self._settle()
         self._direct = False
         self._pump()
+
+    def missed(self) -> int:
+        """Messages that the peer will never get, since this was asked last."""
+        missed, self._told = self.sender.lost - self._told, self.sender.lost
+        return missed
 
     # --- inside ---------------------------------------------------------------------------------------------
 

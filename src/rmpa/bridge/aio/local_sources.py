@@ -11,11 +11,12 @@ from rmpa.core.names import is_type_name
 from rmpa.ros.master.effects import Kind
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from rmpa.bridge.relay import Relay
     from rmpa.ros.aio.core_api import Core
     from rmpa.ros.master.effects import GraphChange
+    from rmpa.ros.master.reachability import Unreachable
 
 
 class LocalSources:
@@ -26,10 +27,12 @@ class LocalSources:
     Args:
         core: The local core.
         relay: What of the proxies here is passed on for other modules.
+        flows: Whether the agent is connected to a source: that one can be reached, whatever the core found.
     """
 
-    def __init__(self, core: Core, relay: Relay) -> None:
+    def __init__(self, core: Core, relay: Relay, flows: Callable[[Source], bool] = lambda _: False) -> None:
         self._core = core
+        self._flows = flows
         self._relay = relay
         self._types: dict[Source, str] = {}
 
@@ -43,8 +46,13 @@ class LocalSources:
                 self._types[source] = change.type
 
     def of(self, topic: str) -> dict[str, LocalSource]:
-        """This module's own publishers of a topic, by node."""
-        nodes = {node: uri for node, uri in self._core.publishers(topic).items() if not is_own(node)}
+        """This module's own publishers of a topic, by node, but for those that nothing can connect to."""
+        unreachable = self._core.unreachable()
+        nodes = {
+            node: uri
+            for node, uri in self._core.publishers(topic).items()
+            if not is_own(node) and not (node in unreachable and self._withdrawn(unreachable[node], topic, node))
+        }
         said = self._core.type_of(topic) if nodes else ""
         return {node: LocalSource(self._type(topic, node, said), uri) for node, uri in nodes.items()}
 
@@ -59,6 +67,9 @@ class LocalSources:
             for node, uri in publishers.items()
             if (origin := self._relay.origin((topic, node))) is not None
         }
+
+    def _withdrawn(self, found: Unreachable, topic: str, node: str) -> bool:
+        return found.withdrawn and not self._flows(Source(topic, node))
 
     def _type(self, topic: str, node: str, otherwise: str) -> str:
         return self._types.get(Source(topic, node)) or otherwise

@@ -104,7 +104,11 @@ def check_size(size: int) -> None:
 
 def too_large(key: str, size: int) -> str:
     """Why a value cannot cross."""
-    return f"{key} has {size} characters as XML-RPC text; a parameter may have {limits.PARAM_TEXT_MAX}"
+    most = limits.PARAM_TEXT_MAX
+    return (
+        f"{key} has {size} characters as XML-RPC text, above the {most} ({most >> 20} MiB) that cross between "
+        "modules; take its parts one by one, or let a latched topic carry it"
+    )
 
 
 @dataclass(slots=True)

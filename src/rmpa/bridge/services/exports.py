@@ -10,11 +10,13 @@ what a server said of itself; it gets back actions. A peer opens a service once,
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.actions import Send, Warn
+from rmpa.bridge.bounds import Beyond
 from rmpa.bridge.messages import (
     AdvertiseServices,
     CloseService,
@@ -26,10 +28,11 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.relay import may_have
 from rmpa.core import limits
+from rmpa.core.config import LimitSettings
 from rmpa.core.errors import RemoteProtocolError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from rmpa.bridge.messages import Origin
     from rmpa.bridge.services.rules import ServiceRules
@@ -142,15 +145,25 @@ class _Peer:
     instance: str = ""
 
 
+_DEFAULT_LIMITS: Final = LimitSettings()
+
+
+def _always(_peer: int) -> bool:
+    return True
+
+
 class ServiceExports:
     """The outbound half: our services, called by peers.
 
     Args:
         rules: What may cross, and under which names.
+        most: How much is offered.
     """
 
-    def __init__(self, rules: ServiceRules) -> None:
+    def __init__(self, rules: ServiceRules, most: LimitSettings = _DEFAULT_LIMITS) -> None:
         self._rules = rules
+        self._most = most
+        self._too_many: OrderedDict[str, None] = OrderedDict()
         self._seen: dict[str, LocalService] = {}
         self._crossing: dict[str, LocalService] = {}
         self._about: dict[str, About] = {}
@@ -165,6 +178,11 @@ class ServiceExports:
     def offered(self) -> Mapping[str, LocalService]:
         """What peers are told of."""
         return self._crossing
+
+    @property
+    def beyond(self) -> Beyond:
+        """What is offered to no peer because there is too much (``limits.services``)."""
+        return Beyond("services", self._most.services, len(self._too_many))
 
     def about(self, service: str) -> About | None:
         """What is known of a service of ours."""
@@ -195,19 +213,20 @@ class ServiceExports:
             self._seen[service] = server
         return self._judge(service)
 
-    def obey(self, rules: ServiceRules) -> Iterator[list[ExportAction]]:
+    def obey(self, rules: ServiceRules, most: LimitSettings = _DEFAULT_LIMITS) -> Iterator[list[ExportAction]]:
         """Other rules hold from now on; what they do not touch goes on.
 
         Returns:
             What is to be done for one service after the other, looked at when it is asked for.
         """
-        self._rules = rules
+        self._rules, self._most = rules, most
         for peer in self._peers.values():
             peer.news |= dict.fromkeys(self._crossing)
         return (self._judge(service) for service in tuple(self._seen))
 
     def _judge(self, service: str) -> list[ExportAction]:
         server, before = self._seen.get(service), self._crossing.get(service)
+        self._too_many.pop(service, None)
         reason = "its server has gone"
         if server is not None and not self._crosses(service, server):
             server, reason = None, "a rule keeps it home now"
@@ -217,8 +236,14 @@ class ServiceExports:
         if server is None:
             del self._crossing[service]
             actions = self._end(service, reason)
-        elif before is None and len(self._crossing) >= limits.SERVICES_PER_PEER_MAX:
-            text = f"more than {limits.SERVICES_PER_PEER_MAX} services would cross; {service} stays home: deny some"
+            if self._too_many:
+                actions += self._judge(next(iter(self._too_many)))
+        elif before is None and len(self._crossing) >= self._most.services:
+            self._too_many[service] = None
+            text = (
+                f"this module has more services than limits.services = {self._most.services}; the rest is offered to "
+                "no peer: raise it in rmpa.toml and `rmpa reload`, or deny some"
+            )
             return [Warn("services.too_many", "local", text)]
         else:
             self._crossing[service] = server
@@ -256,11 +281,11 @@ class ServiceExports:
         sessions = gone.sessions.items() if gone is not None else ()
         return [EndRoute(peer, route, s.requests) for route, s in sessions if s.requests]
 
-    def tell(self) -> list[ExportAction]:
-        """One message for each peer that has not heard everything; call again while ``untold``."""
+    def tell(self, ready: Callable[[int], bool] = _always) -> list[ExportAction]:
+        """One message for each peer that has not heard everything and is ready; call again while ``untold``."""
         actions: list[ExportAction] = []
         for number, peer in self._peers.items():
-            if peer.news or peer.beginning:
+            if (peer.news or peer.beginning) and ready(number):
                 begins = peer.beginning
                 message = self._next(peer)
                 if message.added or message.removed or begins:
@@ -307,8 +332,8 @@ class ServiceExports:
         peer = self._peers[number]
         if message.route in peer.sessions:
             raise RemoteProtocolError(f"route {message.route} is opened twice, for {message.service} now")
-        if len(peer.sessions) >= limits.SERVICE_SESSIONS_MAX:
-            text = f"more than {limits.SERVICE_SESSIONS_MAX} services are open on one link"
+        if len(peer.sessions) >= self._most.services:
+            text = f"more services are open on one link than limits.services = {self._most.services} over there"
             return [Send(number, ServiceClosed(message.route, text))]
         service = peer.wires.get(message.service)
         server = self._crossing.get(service) if service is not None else None

@@ -15,11 +15,12 @@ costs nothing on the way.
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field
 from enum import Enum, auto
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Final
 
+from rmpa.bridge import bounds
 from rmpa.bridge.actions import Send, Warn
 from rmpa.bridge.messages import (
     AdvertiseServices,
@@ -33,6 +34,7 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.relay import Linked, Ways
 from rmpa.bridge.services.exports import About
 from rmpa.core import limits
+from rmpa.core.config import LimitSettings
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.core.guid import Guid
 
@@ -160,22 +162,27 @@ class _Peer:
     Args:
         name: The peer's name.
         rank: The lower one is shown.
+        nodes: Which of its nodes stand here, and what waits for a place.
+        surplus: What it offers beyond ``limits.services``.
         services: What it offers, by the name on the way.
         routes: What is asked for or open, by our route.
         serial: Counts our routes: odd ones, the even ones are for its calls.
-        nodes: How many services each of its nodes has.
         away: Whether it has no link, and may come back.
         doubtful: What it offered over its last link and has not offered again since.
     """
 
     name: str
     rank: int
+    nodes: bounds.NodePlaces[str]
+    surplus: bounds.Surplus[ServiceOffer]
     services: dict[str, RemoteService] = field(default_factory=dict)
     routes: dict[int, RemoteService] = field(default_factory=dict)
     serial: int = -1
-    nodes: Counter[str] = field(default_factory=Counter)
     away: bool = False
     doubtful: set[str] = field(default_factory=set)
+
+
+_DEFAULT_LIMITS: Final = LimitSettings()
 
 
 class ServiceImports:
@@ -183,10 +190,12 @@ class ServiceImports:
 
     Args:
         rules: What may cross, and under which names; the receiving side judges too.
+        most: How much of one peer is taken.
     """
 
-    def __init__(self, rules: ServiceRules) -> None:
+    def __init__(self, rules: ServiceRules, most: LimitSettings = _DEFAULT_LIMITS) -> None:
         self._rules = rules
+        self._most = most
         self._peers: dict[int, _Peer] = {}
         self.ways = Ways()
         """By which of its ways each module is reached whose services relays offer."""
@@ -215,13 +224,23 @@ class ServiceImports:
         found = self._peers.get(peer)
         return found is not None and found.away
 
+    def beyond(self, peer: int) -> bounds.Beyond:
+        """What a peer offers beyond ``limits.services``."""
+        known = self._peers.get(peer)
+        return bounds.Beyond("services", self._most.services, len(known.surplus) if known is not None else 0)
+
+    def crowded(self, peer: int) -> Mapping[str, Collection[str]]:
+        """The nodes of a peer whose services have no place here (``limits.nodes``), and these."""
+        return known.nodes.waiting if (known := self._peers.get(peer)) is not None else {}
+
     # --- links -------------------------------------------------------------------------------------------------
 
     def link_up(self, peer: int, name: str, rank: int, instance: str = "") -> list[ImportAction]:
         """A link is up, of a new peer or of one that was away."""
         known = self._peers.get(peer)
         if known is None:
-            self._peers[peer] = _Peer(name, rank)
+            places: bounds.NodePlaces[str] = bounds.NodePlaces(self._most.nodes)
+            self._peers[peer] = _Peer(name, rank, places, bounds.Surplus(limits.SURPLUS_MAX))
         else:
             known.away = False
             known.serial = -1
@@ -258,6 +277,8 @@ class ServiceImports:
         if known is None:
             return []
         actions = self.link_down(peer)
+        known.nodes.give_up()
+        known.surplus.clear()
         for wire in list(known.services):
             actions += self._remove(peer, wire, f"{known.name} is gone")
         del self._peers[peer]
@@ -272,8 +293,11 @@ class ServiceImports:
             return []
         if message.full:
             known.doubtful = set(known.services)
+            known.surplus.clear()
         actions: list[ImportAction] = []
         for wire in message.removed:
+            if wire not in known.services:
+                known.surplus.discard(wire)
             actions += self._remove(peer, wire, f"its server at {known.name} has gone")
         for offer in message.added:
             actions += self._offer(peer, known, offer)
@@ -283,7 +307,16 @@ class ServiceImports:
                 for wire in known.doubtful:
                     actions += self._remove(peer, wire, f"its server at {known.name} has gone")
                 known.doubtful = set()
+        for admitted in islice(self._admit(peer), limits.LEARNT_AT_ONCE):
+            actions += admitted
         return actions
+
+    def _admit(self, peer: int) -> Iterator[list[ImportAction]]:
+        """Take in what was beyond ``limits.services`` while there is room, one after the other."""
+        while (known := self._peers.get(peer)) is not None and len(known.services) < self._most.services:
+            if (offer := known.surplus.pop()) is None:
+                return
+            yield self._offer(peer, known, offer)
 
     def _offer(self, peer: int, known: _Peer, offer: ServiceOffer) -> list[ImportAction]:
         before = known.services.get(offer.service)
@@ -294,12 +327,12 @@ class ServiceImports:
             return [ForgetAbout(peer, before.name)] if before.shown else []
         if before is not None:
             actions += self._remove(peer, offer.service, f"another node of {known.name} provides it now")
-        elif len(known.services) >= limits.SERVICES_PER_PEER_MAX:
-            text = f"{known.name} offers more than {limits.SERVICES_PER_PEER_MAX} services; the rest is left out"
+        elif len(known.services) >= self._most.services:
+            known.surplus.add(offer.service, offer)
+            text = bounds.warning(known.name, "services", self._most.services)
             return [Warn("services.too_many", known.name, text)]
         name = self._rules.local_name(offer.origin.name if offer.origin else known.name, offer.service)
         remote = known.services[offer.service] = RemoteService(offer.service, offer.node, name, origin=offer.origin)
-        known.nodes[offer.node] += 1
         if offer.origin is not None and self.ways.learn(peer, offer.origin):
             actions += self._choose_of({offer.origin.instance})
         if not is_crossing_name(name):
@@ -317,15 +350,14 @@ class ServiceImports:
         remote = known.services.pop(wire, None)
         if remote is None:
             return []
-        known.nodes[remote.node] -= 1
-        if not known.nodes[remote.node]:
-            del known.nodes[remote.node]
+        known.nodes.leave(remote.node, remote.name)
         # Our words may have crossed: what we asked for last is open over there, for another server perhaps.
         actions = self._release(peer, remote, reason)
         another_way = remote.origin is not None and self.ways.forget(peer, remote.origin)
         if remote.shown:
             remote.shown = False
             actions.append(Withdraw(peer, remote.name, remote.node, reason))
+            known.nodes.hide(remote.node)
         claims = self._claims.get(remote.name, {})
         if claims.get(peer) is remote:
             del claims[peer]
@@ -335,6 +367,15 @@ class ServiceImports:
                 del self._claims[remote.name]
         if remote.origin is not None and another_way:
             actions += self._choose_of({remote.origin.instance})
+        return actions + self._next_in(known)
+
+    def _next_in(self, known: _Peer) -> list[ImportAction]:
+        """A node of a peer may have left its place to another one."""
+        actions: list[ImportAction] = []
+        for waiting in known.nodes.next_in():
+            for name in waiting:
+                if name in self._claims:
+                    actions += self._choose(name)
         return actions
 
     # --- who is shown ------------------------------------------------------------------------------------------
@@ -347,16 +388,19 @@ class ServiceImports:
             self._local[service] = node
         return self._choose(service) if service in self._claims else []
 
-    def obey(self, rules: ServiceRules) -> Iterator[list[ImportAction]]:
+    def obey(self, rules: ServiceRules, most: LimitSettings = _DEFAULT_LIMITS) -> Iterator[list[ImportAction]]:
         """Other rules hold from now on; what they do not touch goes on.
 
         Returns:
             What is to be done for one service after the other, looked at when it is asked for.
         """
-        self._rules = rules
+        self._rules, self._most = rules, most
+        for known in self._peers.values():
+            known.nodes.bound(most.nodes)
         offers = [(number, wire) for number, known in self._peers.items() for wire in known.services]
         # A second time, for those whose new name was still another one's old one.
-        return (self._rejudge(number, wire, again=again) for again in (False, True) for number, wire in offers)
+        judged = (self._rejudge(number, wire, again=again) for again in (False, True) for number, wire in offers)
+        return chain(judged, (actions for number in list(self._peers) for actions in self._admit(number)))
 
     def _rejudge(self, number: int, wire: str, *, again: bool) -> list[ImportAction]:
         known = self._peers.get(number)
@@ -376,22 +420,31 @@ class ServiceImports:
         local = self._local.get(service)
         seen: str | None = f"{local} of this module provides it itself" if local is not None else None
         new: tuple[int, RemoteService] | None = None
+        left: list[_Peer] = []
         actions: list[ImportAction] = []
         for number in sorted(claims, key=lambda number: (self._peers[number].rank, number)):
             remote = claims[number]
+            nodes = self._peers[number].nodes
             hidden = seen or self._objection(service, number, remote)
+            nodes.leave(remote.node, service)
+            if hidden is None and not nodes.free(remote.node):
+                nodes.wait(remote.node, service)
+                hidden = f"{self._peers[number].name} has more nodes than limits.nodes = {nodes.limit} of this module"
             if hidden is None:
                 new = (number, remote)
                 seen = f"{self._peers[number].name} provides it too, and is shown: its GUID is lower"
             elif remote.shown:
                 actions += self._hide(number, remote, hidden)
+                left.append(self._peers[number])
             if hidden is not None:
                 remote.hidden = hidden
         if new is not None and not new[1].shown:
             number, remote = new
             remote.shown, remote.hidden = True, ""
+            self._peers[number].nodes.show(remote.node)
             actions.append(Provide(number, service, remote.node))
-        return actions
+        # Not before: a service that comes is chosen likewise, and may need the place that was just found free.
+        return actions + [action for known in left for action in self._next_in(known)]
 
     def _objection(self, service: str, number: int, remote: RemoteService) -> str | None:
         origin = remote.origin
@@ -403,14 +456,12 @@ class ServiceImports:
                 decision = self._rules.judge_for(name, service, remote.wire)
         if not decision.allowed:
             return f"policy: {decision.rule}"
-        nodes = self._peers[number].nodes
-        if len(nodes) > limits.NODES_PER_PEER_MAX and remote.node not in list(nodes)[: limits.NODES_PER_PEER_MAX]:
-            return f"more than {limits.NODES_PER_PEER_MAX} nodes of {self._peers[number].name} provide services"
         return None
 
     def _hide(self, number: int, remote: RemoteService, reason: str) -> list[ImportAction]:
         actions = self._release(number, remote, reason)
         remote.shown = False
+        self._peers[number].nodes.hide(remote.node)
         return [*actions, Withdraw(number, remote.name, remote.node, reason)]
 
     # --- calling -----------------------------------------------------------------------------------------------

@@ -1,23 +1,12 @@
-"""The mesh port: TCP for links and UDP for unicast beacons under one number; and room for all the other sockets."""
+"""The mesh port: TCP for links and UDP for unicast beacons under one number."""
 
 from __future__ import annotations
 
 import errno
-import resource
 import socket
 
 from rmpa.core import limits
 from rmpa.core.errors import StartError
-
-
-def raise_file_limit() -> int:
-    """Let this process open as many files as it may, up to ``limits.OPEN_FILES``; return how many that are."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = limits.OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, limits.OPEN_FILES)
-    if soft == resource.RLIM_INFINITY or soft >= wanted:
-        return soft
-    resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-    return wanted
 
 
 def open_mesh_port(port: int = 0) -> tuple[socket.socket, socket.socket]:

@@ -9,13 +9,17 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import logging
 import math
 import socket
+import sys
+import termios
 from collections.abc import Callable, Sequence
 from typing import Final, cast
 
 from rmpa.core import limits
+from rmpa.core.aio.segments import SegmentedSocket
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST, URGENT, Framer, Outbox, Parcel
 
@@ -54,6 +58,7 @@ class Stream:
         frame: Makes the header of each fragment of an opened message; without it its bytes go out as they are.
             The outbox has the same one.
         keep: What waits when the socket is gone stays in the outbox, for the next one.
+        segment: Bytes that one packet may carry, ``None`` for as many as the kernel likes; see ``segments``.
     """
 
     def __init__(
@@ -65,9 +70,10 @@ class Stream:
         outbox: Outbox,
         frame: Framer | None = None,
         keep: bool = False,
+        segment: int | None = None,
     ) -> None:
         self._loop = asyncio.get_running_loop()
-        self._sock = sock
+        self._sock: socket.socket | SegmentedSocket = sock if segment is None else SegmentedSocket(sock, segment)
         self._on_bytes = on_bytes
         self._on_close = on_close
         self._outbox = outbox
@@ -110,9 +116,23 @@ class Stream:
         return self._outbox.pending_bytes
 
     @property
+    def unacknowledged(self) -> int:
+        """Bytes in the kernel that the other side has not acknowledged, those that have not left included."""
+        if self._closed:
+            return 0
+        return int.from_bytes(fcntl.ioctl(self._fd, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
+
+    @property
     def outbox(self) -> Outbox:
         """What waits, and what was dropped."""
         return self._outbox
+
+    def segment(self, size: int) -> None:
+        """Send in packets of at most ``size`` bytes from now on."""
+        if isinstance(self._sock, SegmentedSocket):
+            self._sock.size = size
+        else:
+            self._sock = SegmentedSocket(self._sock, size)
 
     def feed(self, data: Buffer) -> None:
         """Take bytes that somebody else read from the socket before the stream had it."""

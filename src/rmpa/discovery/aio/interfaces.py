@@ -157,7 +157,13 @@ class InterfaceWatcher:
         self._timer = None
         if self._netlink is None:
             self._look_in(limits.INTERFACE_LOOK)
-        now = self._look()
+        try:
+            now = self._look()
+        except OSError as error:  # no file descriptor is left to ask the kernel; what changed is looked at later
+            _log.debug("! interfaces cannot be listed: %s", error)
+            if self._timer is None:
+                self._look_in(limits.INTERFACE_LOOK)
+            return
         if now != self._known:
             self._known = now
             self._on_change(now)

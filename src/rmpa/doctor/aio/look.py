@@ -16,7 +16,7 @@ from rmpa.doctor.aio import look_machine, look_network
 from rmpa.doctor.aio.programs import resolve
 from rmpa.doctor.finding import Finding, Level
 from rmpa.doctor.machine import judge_clock, judge_rights
-from rmpa.doctor.network import judge_cards, judge_ports, judge_routes, judge_rp_filter
+from rmpa.doctor.network import judge_cards, judge_mtu_probing, judge_ports, judge_routes, judge_rp_filter
 from rmpa.doctor.ros_environment import Shell, judge_shell, names_of
 from rmpa.monitor.aio.control_client import ControlClient, find_agents
 from rmpa.monitor.snapshot import Snapshot
@@ -86,11 +86,13 @@ def examine(patient: Patient) -> Iterator[Finding]:
     yield from look_network.look_at_multicast(settings)
     yield from look_network.look_at_firewall(settings)
     yield from judge_rp_filter(look_network.look_at_rp_filter(), cards)
+    holes = any(peer.link and peer.link.path_problem for shown in snapshots.values() for peer in shown.peers)
+    yield judge_mtu_probing(look_network.look_at_mtu_probing(), black_hole=holes)
     yield from judge_routes(_routes(patient))
-    yield from judge_ports(look_network.look_at_ports(settings, _ports(snapshots)))
+    yield from judge_ports(look_network.look_at_ports(settings, _ports(snapshots), _processes(snapshots)))
     yield from judge_shell(_shell(patient, {str(n.ip) for card in cards for n in card.networks}))
     yield from judge_clock(look_machine.look_at_clock())
-    yield from judge_rights(look_machine.look_at_rights(wanted=settings.realtime.enabled))
+    yield from judge_rights(look_machine.look_at_rights(wanted=settings.realtime.enabled, agents=bool(snapshots)))
 
 
 def _routes(patient: Patient) -> dict[str, str]:
@@ -106,6 +108,11 @@ def _routes(patient: Patient) -> dict[str, str]:
         targets |= {address: f"{address} (seed {seed})" for address in addresses[:1]}
     found = {text: look_network.look_at_route(host) for host, text in targets.items()}
     return found | {f"seed {name}": "nobody knows this name" for name in names if not known[name]}
+
+
+def _processes(snapshots: Mapping[str, Snapshot]) -> dict[int, str]:
+    """The agents of this machine, by their processes."""
+    return {snapshot.agent.pid: name for name, snapshot in snapshots.items()}
 
 
 def _ports(snapshots: Mapping[str, Snapshot]) -> dict[int, str]:

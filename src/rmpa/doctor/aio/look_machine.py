@@ -49,8 +49,13 @@ def look_at_clock() -> Clock:
     )
 
 
-def look_at_rights(*, wanted: bool) -> Rights:
-    """Try SCHED_FIFO in a thread that ends at once, and read the limits."""
+def look_at_rights(*, wanted: bool, agents: bool) -> Rights:
+    """Try SCHED_FIFO in a thread that ends at once, and read the limits.
+
+    Args:
+        wanted: Whether the settings ask for real time.
+        agents: Whether an agent runs, which tells its own limit of open files.
+    """
     refusal = ["it was not tried"]
 
     def attempt() -> None:
@@ -70,7 +75,7 @@ def look_at_rights(*, wanted: bool) -> Rights:
         fifo=refusal[0],
         memlock=None if free else memlock,
         wanted=wanted,
-        files=limits.OPEN_FILES if files == resource.RLIM_INFINITY else files,
+        files=None if agents else limits.OPEN_FILES if files == resource.RLIM_INFINITY else files,
     )
 
 

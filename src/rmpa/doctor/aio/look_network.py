@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from rmpa.core.config import Settings
 
 _CONF: Final = Path("/proc/sys/net/ipv4/conf")
+_MTU_PROBING: Final = Path("/proc/sys/net/ipv4/tcp_mtu_probing")
 _MARKS_OF_CONTAINERS: Final = (Path("/.dockerenv"), Path("/run/.containerenv"))
 
 
@@ -89,6 +90,14 @@ def look_at_rp_filter() -> dict[str, int]:
     return found
 
 
+def look_at_mtu_probing() -> int | None:
+    """``net.ipv4.tcp_mtu_probing``; ``None`` where there is no such setting."""
+    try:
+        return int(_MTU_PROBING.read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return None
+
+
 def look_at_route(host: str) -> str:
     """Why the kernel knows no way to an address, or an empty string; nothing is sent."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -99,12 +108,13 @@ def look_at_route(host: str) -> str:
     return ""
 
 
-def look_at_ports(settings: Settings, ours: Mapping[int, str]) -> tuple[Port, ...]:
+def look_at_ports(settings: Settings, ours: Mapping[int, str], agents: Mapping[int, str]) -> tuple[Port, ...]:
     """Whether the ports of an agent with these settings can be had.
 
     Args:
         settings: The settings.
         ours: The ports that agents of this machine have, and whose each is.
+        agents: The agents of this machine that answer, by their processes.
     """
     ports: list[Port] = []
     if settings.core_mode == "embedded":  # an external core has its port already
@@ -117,7 +127,7 @@ def look_at_ports(settings: Settings, ours: Mapping[int, str]) -> tuple[Port, ..
     except OSError as error:
         ports.append(Port("beacons (UDP)", number, error.strerror or str(error), _owner(number)))
     else:
-        ports.append(Port("beacons (UDP)", number))
+        ports.append(Port("beacons (UDP)", number, owner=_users(number, agents)))
     return tuple(ports)
 
 
@@ -140,6 +150,26 @@ def _owner(number: int) -> str:
             if listens and connection.laddr and connection.laddr.port == number and connection.pid:
                 return f"{psutil.Process(connection.pid).name()} (pid {connection.pid})"
     return ""
+
+
+def _users(number: int, agents: Mapping[int, str]) -> str:
+    """Which programs use a UDP port that can be shared, ready to read; empty for none."""
+    names: dict[str, None] = {}
+    with contextlib.suppress(psutil.Error, OSError):
+        for connection in psutil.net_connections("udp4"):
+            if connection.laddr and connection.laddr.port == number:
+                names[_name(connection.pid, agents)] = None
+    return " and ".join(names)
+
+
+def _name(pid: int | None, agents: Mapping[int, str]) -> str:
+    if pid is None:
+        return "a program of another user"
+    if pid in agents:
+        return f"agent {agents[pid]}"
+    with contextlib.suppress(psutil.Error):
+        return f"{psutil.Process(pid).name()} (pid {pid})"
+    return f"a program (pid {pid})"
 
 
 def look_at_firewall(settings: Settings) -> list[Finding]:

@@ -109,7 +109,10 @@ class Agent:
     def env(self) -> dict[str, str]:
         """The environment of the agent and of ``rmpa`` commands against it."""
         kept = {key: value for key, value in os.environ.items() if not key.startswith(("ROS_", "RMPA_", "PYTHON"))}
-        places = {"RMPA_RUNTIME_DIR": str(self.runtime_dir), "RMPA_STATE_DIR": str(self.home / "state")}
+        places = {
+            "RMPA_RUNTIME_DIR": str(self.runtime_dir),
+            "RMPA_STATE_DIR": str(self.home / "state" / self.host.name),
+        }
         return {**kept, **places, "PYTHONUNBUFFERED": "1"}
 
     @property

@@ -46,9 +46,16 @@ def why_not() -> str:
     name = f"{_PREFIX}-{os.getpid()}-probe"
     try:
         _ip("netns", "add", name)
-        _ip("netns", "del", name)
     except NetworkError as error:
         return f"this machine allows no network namespaces ({error})"
+    # Some containers and every plain chroot let them be added but not entered: to enter one, ip mounts /sys anew.
+    try:
+        _ip("netns", "exec", name, "true")
+        _ip("-n", name, "link", "add", "probe", "type", "veth", "peer", "name", "probe-peer")
+    except NetworkError as error:
+        return f"this machine's network namespaces cannot be used ({error})"
+    finally:
+        _ip("netns", "del", name)
     return ""
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -15,6 +16,7 @@ from rmpa.core.aio.stream import Stream
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import URGENT, Outbox
 from rmpa.mesh.aio.lane import LaneSender
+from rmpa.mesh.aio.sockets import reset_at_close, unacknowledged
 from rmpa.mesh.frames import Frame, Kind
 from rmpa.mesh.handshake import Lane
 from rmpa.mesh.link import (
@@ -30,6 +32,7 @@ from rmpa.mesh.link import (
     State,
     Up,
 )
+from rmpa.mesh.path_mtu import StallWatch
 
 if TYPE_CHECKING:
     import socket
@@ -45,6 +48,9 @@ _SILENCE: Final = frozenset(
     {errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ENETDOWN, errno.ECONNRESET, errno.EPIPE}
 )
 """How a connection ends whose other side gave it up after a silence, or whose process died with bytes unread."""
+
+_ANSWERED: Final = -1
+"""In place of a probe's stamp."""
 
 OnLinkData = Callable[["MeshLink", int, int, int, memoryview], None]
 OnLinkPart = Callable[["MeshLink", int, int, int, int, memoryview], None]
@@ -72,6 +78,10 @@ class LinkOwner(Protocol):
 
     def link_quiet(self, link: MeshLink) -> None:
         """Nothing came for ``limits.GHOST_QUIET``; called again from time to time while that lasts."""
+        ...
+
+    def link_tick(self, link: MeshLink) -> None:
+        """The timer of a link that is used: once in a keepalive's interval or so."""
         ...
 
     def link_ended(self, link: MeshLink, reason: str, *, malformed: bool, was_up: bool) -> None:
@@ -114,6 +124,7 @@ class MeshLink:
         expected: Whom we believe we dialled.
         endpoint: The other end's address and port.
         lane: What we dial for; of an accepted one the other side's hello says it.
+        segment: Bytes that one packet may carry, ``None`` for as many as the kernel likes.
     """
 
     def __init__(
@@ -128,6 +139,7 @@ class MeshLink:
         endpoint: tuple[str, int],
         expected: Guid | None = None,
         lane: Lane = Lane.EXPRESS,
+        segment: int | None = None,
     ) -> None:
         self.id = link_id
         self.remote_endpoint = endpoint
@@ -159,8 +171,17 @@ class MeshLink:
         self._asked = lane
         self._bulk_before = [0, 0]
         self.sock = sock
+        self.stalls = StallWatch(segment, clock.now())
+        """Whether what is sent gets through."""
+        self._probe: int | None = None
+        self._probed_at = -math.inf
+        self._sent_before = 0
         self._stream = Stream(
-            sock, on_bytes=self._take, on_close=self._lost, outbox=Outbox(1, limits.LINK_URGENT_BYTES)
+            sock,
+            on_bytes=self._take,
+            on_close=self._lost,
+            outbox=Outbox(1, limits.LINK_URGENT_BYTES),
+            segment=segment,
         )
         self._machine = Link(
             role,
@@ -262,6 +283,11 @@ class MeshLink:
         return self._stream.pending_bytes + self.bulk.outbox.pending_bytes
 
     @property
+    def busy(self) -> bool:
+        """Whether news of the graph would wait on the express lane, and commands behind them."""
+        return self._stream.pending_bytes > 0 or self._stream.unacknowledged > limits.TELL_BACKLOG
+
+    @property
     def dropped(self) -> int:
         """Messages dropped so far because the peer took them too slowly."""
         return self.express.outbox.dropped.total() + self.bulk.outbox.dropped.total()
@@ -308,6 +334,34 @@ class MeshLink:
         finally:
             self._pings.pop(stamp, None)
 
+    def probe(self) -> None:
+        """Send a small packet now; ``take_probe`` tells when it was answered."""
+        now = self._clock.now()
+        if self.up and now - self._probed_at >= limits.STALL_SUSPECTED:
+            self._probe, self._probed_at = self._machine.ping(now), now
+            self._after()
+
+    def take_probe(self) -> bool:
+        """Whether the last ``probe`` has been answered since this was asked last."""
+        answered = self._probe == _ANSWERED
+        if answered:
+            self.forget_probe()
+        return answered
+
+    def forget_probe(self) -> None:
+        """An answer to the last ``probe`` says nothing any more."""
+        self._probe = None
+
+    def has_sent(self) -> bool:
+        """Whether bytes left by this connection since this was asked last, or were not acknowledged then."""
+        before, self._sent_before = self._sent_before, self._stream.bytes_out
+        return self._sent_before != before or unacknowledged(self.sock) > 0
+
+    def segment(self, size: int) -> None:
+        """Send in packets of at most ``size`` bytes from now on."""
+        self.stalls = StallWatch(size, self._clock.now(), self.stalls)
+        self._stream.segment(size)
+
     def close_route(self, route: int) -> int:
         """Discard what waits of a closed route; return how many messages that were. Its drop counts end too."""
         return self.express.close_route(route) + self.bulk.close_route(route)
@@ -320,6 +374,12 @@ class MeshLink:
     def abort(self, reason: str) -> None:
         """Close at once, without a word."""
         self._machine.lost(reason)
+
+    def reset(self, reason: str) -> None:
+        """Close at once, and let the other side know at once though what was sent before is lost on the way."""
+        self.silent = True
+        reset_at_close(self.sock)
+        self.abort(reason)
 
     async def ended(self) -> None:
         """Wait until the socket is closed and the owner knows."""
@@ -388,10 +448,7 @@ class MeshLink:
         elif isinstance(event, Marked):
             self._marked(event)
         elif isinstance(event, Ponged):
-            if (answer := self._pings.get(event.stamp)) is not None and not answer.done():
-                answer.set_result(event.rtt)
-            if self._takers is not None:
-                self._takers.clock(self)
+            self._ponged(event)
         elif isinstance(event, HelloReceived):
             verdict = self._owner.link_judge(self, event.hello)
             if verdict is None:
@@ -410,6 +467,14 @@ class MeshLink:
             self._owner.link_refused(self, event.refuse, by_us=event.by_us)
         elif isinstance(event, Closed):
             self._finish(event.reason)
+
+    def _ponged(self, event: Ponged) -> None:
+        if event.stamp == self._probe:
+            self._probe = _ANSWERED
+        if (answer := self._pings.get(event.stamp)) is not None and not answer.done():
+            answer.set_result(event.rtt)
+        if self._takers is not None:
+            self._takers.clock(self)
 
     def _marked(self, event: Marked) -> None:
         """A fence is answered on the express lane, whichever it came by; the rest is the takers'.
@@ -495,6 +560,8 @@ class MeshLink:
         # A large message renews the lease while it arrives, long before the machine sees a whole frame of it.
         self._machine.heard(self._stream.last_in)
         was_up = self._machine.state is State.UP
+        if was_up and self.used:
+            self._owner.link_tick(self)
         self._machine.handle_timer(self._clock.now())
         self.silent = was_up and self._machine.state is State.CLOSED
         if was_up and not self.silent and self._clock.now() - self.heard_at > limits.GHOST_QUIET:

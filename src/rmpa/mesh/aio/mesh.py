@@ -8,24 +8,27 @@ import errno
 import logging
 import os
 import random
-import socket
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import count
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
+from rmpa.core.aio.acceptor import Acceptor
 from rmpa.core.aio.clock import SystemClock
+from rmpa.core.aio.descriptors import DESCRIPTORS, Use
 from rmpa.core.backoff import Backoff
 from rmpa.core.config import LaneSettings
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.mesh.aio.link import MeshLink, Takers
-from rmpa.mesh.aio.sockets import tune_bulk, tune_express, unacknowledged
+from rmpa.mesh.aio.paths import PathMonitor
+from rmpa.mesh.aio.sockets import limit_segments, tune_bulk, tune_express, unacknowledged
+from rmpa.mesh.aio.status import LinkStatus, link_status
 from rmpa.mesh.handshake import Lane, Refusal
 from rmpa.mesh.link import Role
 from rmpa.mesh.peering import REPLACED, CloseLink, Dial, LinkDown, LinkRefused, LinkUp, Output, Peering, PeerStatus
 
 if TYPE_CHECKING:
+    import socket
     from collections.abc import Coroutine, Iterable
 
     from rmpa.core.clock import Clock
@@ -36,54 +39,11 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_ACCEPTS: Final = 16
-_NO_ROOM: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 _ORDINARY: Final = frozenset({Refusal.ALREADY_LINKED, Refusal.MYSELF, Refusal.NO_EXPRESS})
 
 OnLinkUp = Callable[[MeshLink], None]
 OnLinkDown = Callable[[MeshLink, str], None]
 OnControl = Callable[[MeshLink, bytes], None]
-
-
-@dataclass(frozen=True, slots=True)
-class LinkStatus:
-    """One connection, for the monitor. Times in monotonic seconds, sizes in bytes.
-
-    Args:
-        id: The mesh's number for it.
-        name: The other side's name, or its address before it said its name.
-        guid: The other side's, once known.
-        state: ``handshaking``, ``up``, ``closing`` or ``closed``.
-        used: Whether it is the link that is used with its peer.
-        dialled: Whether we dialled.
-        remote_endpoint: The other end.
-        since: When it came up.
-        rtt: The last round trip in seconds.
-        clock_offset: Seconds that the other side's wall clock is ahead of ours.
-        clock_error: The offset is true within ± this.
-        bytes_in: Received.
-        bytes_out: Sent.
-        queue_bytes: Waiting for the kernel.
-        dropped: Messages dropped because the peer took them too slowly.
-        bulk: Whether it is a bulk lane's connection.
-    """
-
-    id: int
-    name: str
-    guid: Guid | None
-    state: Literal["handshaking", "up", "closing", "closed"]
-    used: bool
-    dialled: bool
-    remote_endpoint: tuple[str, int]
-    since: float | None
-    rtt: float | None
-    clock_offset: float | None
-    clock_error: float | None
-    bytes_in: int
-    bytes_out: int
-    queue_bytes: int
-    dropped: int
-    bulk: bool
 
 
 class Mesh:
@@ -121,7 +81,7 @@ class Mesh:
     ) -> None:
         self.identity = identity
         self.counters = counters if counters is not None else Counters()
-        self._listen = listen_socket
+        self._acceptor = Acceptor(listen_socket, self._accepted, name="links to peers", use=Use.LINK)
         self._on_link_up = on_link_up
         self._on_link_down = on_link_down
         self._on_control = on_control
@@ -129,6 +89,8 @@ class Mesh:
         self._lanes = lanes if lanes is not None else LaneSettings()
         self._clock = clock if clock is not None else SystemClock()
         self._refusals = RefusalLog(_log, self.counters)
+        self.paths = PathMonitor(self._clock, self.counters, self._answers)
+        """What packets get through to the peers."""
         self._peering = Peering(identity, rng=rng, alive=self._alive)
         self._links: dict[int, MeshLink] = {}
         self._pending: set[int] = set()
@@ -142,29 +104,30 @@ class Mesh:
         self._ids = count(1)
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at: float | None = None
-        self._accept_timer: asyncio.TimerHandle | None = None
         self._acting = False
         self._running = False
 
     async def start(self) -> None:
         """Begin to accept and to dial; peers may have been found before."""
         self._running = True
-        self._listen.setblocking(False)
-        asyncio.get_running_loop().add_reader(self._listen.fileno(), self._acceptable)
+        self._acceptor.start()
         self._act()
 
     async def close(self) -> None:
         """Say bye on every link, wait at most ``limits.DRAIN_TIMEOUT``, and close all sockets."""
+        self._acceptor.close()
         if not self._running:
-            self._listen.close()
             return
         self._running = False
-        asyncio.get_running_loop().remove_reader(self._listen.fileno())
-        self._listen.close()
-        for timer in (self._timer, self._accept_timer):
-            if timer is not None:
-                timer.cancel()
-        dials = [*self._dials, *self._attempts, *self._bulk_dials.values(), *self._redials.values()]
+        if self._timer is not None:
+            self._timer.cancel()
+        dials = [
+            *self.paths.close(),
+            *self._dials,
+            *self._attempts,
+            *self._bulk_dials.values(),
+            *self._redials.values(),
+        ]
         for task in dials:
             task.cancel()
         await asyncio.gather(*dials, return_exceptions=True)
@@ -200,7 +163,7 @@ class Mesh:
 
     def links(self) -> list[LinkStatus]:
         """All connections, those without a handshake too."""
-        return [_status(link) for link in self._links.values()]
+        return [link_status(link) for link in self._links.values()]
 
     def link(self, guid: Guid) -> MeshLink | None:
         """The link that is used with this peer."""
@@ -256,10 +219,17 @@ class Mesh:
             task = asyncio.get_running_loop().create_task(self._redial(link), name=f"redial {link.name}")
             self._redials[link.id] = task
             task.add_done_callback(lambda _: self._redials.pop(link.id, None))
+            task.add_done_callback(_report)
+
+    def link_tick(self, link: MeshLink) -> None:
+        """See whether what a link sends gets through."""
+        if self._running:
+            self.paths.look(link)
 
     def link_ended(self, link: MeshLink, reason: str, *, malformed: bool, was_up: bool) -> None:
         """A socket is closed."""
         now = self._clock.now()
+        self.paths.ended(link)
         self._links.pop(link.id, None)
         self._pending.discard(link.id)
         if malformed:
@@ -301,6 +271,7 @@ class Mesh:
                 task = asyncio.get_running_loop().create_task(self._dial(output), name=f"dial {output.guid}")
                 self._dials.add(task)
                 task.add_done_callback(self._dials.discard)
+                task.add_done_callback(_report)
         elif isinstance(output, CloseLink):
             if (link := self._links.get(output.link_id)) is not None:
                 link.close(output.reason)
@@ -350,6 +321,7 @@ class Mesh:
             task = asyncio.get_running_loop().create_task(self._dial_bulk(link, delay), name=f"bulk {link.name}")
             self._bulk_dials[link.id] = task
             task.add_done_callback(lambda _: self._bulk_dials.pop(link.id, None))
+            task.add_done_callback(_report)
 
     async def _dial_bulk(self, link: MeshLink, delay: float) -> None:
         backoff = self._bulk_backoffs.setdefault(
@@ -364,6 +336,9 @@ class Mesh:
                 _log.debug("! %s: no bulk lane: %s", link.name, error)
                 await asyncio.sleep(backoff.delay())
                 continue
+            if _is_over(link):
+                sock.close()  # the link ended meanwhile
+                return
             self._open(sock, Role.DIALLER, link.remote_endpoint, link.guid, Lane.BULK)
             return
 
@@ -398,13 +373,16 @@ class Mesh:
     async def _redial(self, link: MeshLink) -> None:
         """Replace a link whose bytes nobody acknowledges, as soon as the peer can be reached again, on any way."""
         while link.used and not self._alive(link.id):
-            ways = dict.fromkeys([link.remote_endpoint, *self._peering.endpoints(link.guid)])
             try:
-                sock, endpoint = await self._race(ways, self._knock)
+                sock, endpoint = await self._race(self._ways(link), self._knock)
             except OSError as error:
                 _log.debug("! %s: silent, and not to be reached: %s", link.name, str(error) or "no answer")
                 await asyncio.sleep(limits.REDIAL_PAUSE)
                 continue
+            if _is_over(link):
+                # It ended meanwhile, and its socket with it: who is dialled next is decided by the peers' machine.
+                sock.close()
+                return
             if self._alive(link.id) or not unacknowledged(link.sock):
                 _log.debug("= %s: silent, but not for want of a way to it", link.name)
                 sock.close()
@@ -412,6 +390,21 @@ class Mesh:
             _log.debug("= %s: silent, but it can be reached at %s:%d: a new link", link.name, *endpoint)
             self._open(sock, Role.DIALLER, endpoint, link.guid)
             return
+
+    async def _answers(self, link: MeshLink) -> bool:
+        """Whether the peer of a link takes a new connection, on the path of this one."""
+        host = link.remote_endpoint[0]
+        ways = [link.remote_endpoint] if link.dialled else [e for e in self._ways(link) if e[0] == host]
+        try:
+            sock, _ = await self._race(ways, self._knock)
+        except OSError:
+            return False
+        sock.close()
+        return True
+
+    def _ways(self, link: MeshLink) -> list[Endpoint]:
+        """Where the peer of a link may be reached."""
+        return list(dict.fromkeys([link.remote_endpoint, *self._peering.endpoints(link.guid)]))
 
     async def _knock(self, endpoint: Endpoint) -> socket.socket:
         return await self._connect(endpoint, Lane.EXPRESS, limits.REDIAL_TIMEOUT)
@@ -464,9 +457,12 @@ class Mesh:
     async def _connect(
         self, endpoint: tuple[str, int], lane: Lane, within: float = limits.DIAL_TIMEOUT
     ) -> socket.socket:
-        sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+        sock = DESCRIPTORS.open_socket(Use.LINK, what=f"a link to {endpoint[0]}:{endpoint[1]}")
         try:
             (tune_bulk if lane is Lane.BULK else tune_express)(sock, self._lanes, self.counters)
+            if lane is Lane.EXPRESS and not endpoint[0].startswith("127."):
+                # Both ways. Not the bulk lane's: several such segments may still leave as one packet.
+                limit_segments(sock, limits.EXPRESS_SEGMENT, self.counters)
             async with asyncio.timeout(within):
                 await asyncio.get_running_loop().sock_connect(sock, endpoint)
         except BaseException:
@@ -510,35 +506,15 @@ class Mesh:
             endpoint=endpoint,
             expected=expected,
             lane=lane,
+            segment=self.paths.segment(endpoint[0]),
         )
 
-    def _acceptable(self) -> None:
-        for _ in range(_ACCEPTS):
-            try:
-                sock, address = self._listen.accept()
-            except (BlockingIOError, InterruptedError, ConnectionAbortedError):
-                return
-            except OSError as error:
-                self._accept_failed(error)
-                return
-            if not self._has_room(address[0]):
-                sock.close()
-                continue
-            sock.setblocking(False)
-            tune_express(sock, self._lanes, self.counters)
-            self._open(sock, Role.ACCEPTOR, (address[0], address[1]))
-
-    def _accept_failed(self, error: OSError) -> None:
-        """Pause when the process has no room; a listening socket stays readable and would spin the loop."""
-        text = f"cannot accept links: {error.strerror}; retrying every {limits.ACCEPT_PAUSE:g} s"
-        if error.errno in _NO_ROOM:
-            text += " (raise the limit of open files: ulimit -n, LimitNOFILE)"
-        self._refusals.refuse(self._clock.now(), "link.accept_failed", "", text)
-        loop = asyncio.get_running_loop()
-        loop.remove_reader(self._listen.fileno())
-        self._accept_timer = loop.call_later(
-            limits.ACCEPT_PAUSE, lambda: loop.add_reader(self._listen.fileno(), self._acceptable)
-        )
+    def _accepted(self, sock: socket.socket, address: tuple[str, int]) -> None:
+        if not self._has_room(address[0]):
+            sock.close()
+            return
+        tune_express(sock, self._lanes, self.counters)
+        self._open(sock, Role.ACCEPTOR, address)
 
     def _has_room(self, address: str) -> bool:
         there = sum(self._links[k].remote_endpoint[0] == address for k in self._pending)
@@ -549,34 +525,18 @@ class Mesh:
         return False
 
 
+def _is_over(link: MeshLink) -> bool:
+    """Whether a link was left or has ended; for behind an ``await``."""
+    return not link.used
+
+
+def _report(task: asyncio.Task[None]) -> None:
+    """Log what a dial failed of beyond what it expects: a bug, and no one awaits the task."""
+    if not task.cancelled() and (error := task.exception()) is not None:
+        _log.error("! %s failed", task.get_name(), exc_info=error)
+
+
 def _close_late(task: asyncio.Task[socket.socket]) -> None:
     """Somebody else was faster: close what came of an attempt all the same."""
     if not task.cancelled() and task.exception() is None:
         task.result().close()
-
-
-def _status(link: MeshLink) -> LinkStatus:
-    names: dict[str, Literal["handshaking", "up", "closing", "closed"]] = {
-        "HANDSHAKING": "handshaking",
-        "UP": "up",
-        "CLOSING": "closing",
-        "CLOSED": "closed",
-    }
-    return LinkStatus(
-        link.id,
-        link.name,
-        link.remote_guid,
-        names[link.state.name],
-        link.used,
-        link.dialled,
-        link.remote_endpoint,
-        link.since,
-        link.rtt,
-        link.clock_offset,
-        link.clock_error,
-        link.bytes_in,
-        link.bytes_out,
-        link.queue_bytes,
-        link.dropped,
-        link.lane == Lane.BULK,
-    )

@@ -13,6 +13,8 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
+from rmpa.core.aio.acceptor import Acceptor
+from rmpa.core.aio.descriptors import Use
 from rmpa.core.aio.loop import breathing
 from rmpa.core.config_values import did_you_mean
 from rmpa.core.counters import Counters, RefusalLog
@@ -52,7 +54,7 @@ class ControlServer:
         self.counters = counters if counters is not None else Counters()
         self._refusals = RefusalLog(_log, self.counters)
         self._lock: NameLock | None = None
-        self._server: asyncio.Server | None = None
+        self._acceptor: Acceptor | None = None
         self._clients: set[asyncio.Task[None]] = set()
         self.path = place / f"{name}.sock"
 
@@ -67,9 +69,8 @@ class ControlServer:
             problem = f"longer than the {limits.CONTROL_PATH_MAX} bytes that a socket's path may have"
             raise StartError(str(self.path), problem, "set RMPA_RUNTIME_DIR to a shorter directory")
         sock = await asyncio.to_thread(self._bind)
-        self._server = await asyncio.start_unix_server(
-            self._connected, sock=sock, limit=limits.CONTROL_REQUEST_MAX, backlog=limits.CONTROL_BACKLOG
-        )
+        self._acceptor = Acceptor(sock, self._connected, name="control socket", use=Use.LINK)
+        self._acceptor.start()
         _log.info("= control socket %s", self.path)
 
     def _bind(self) -> socket.socket:
@@ -78,10 +79,10 @@ class ControlServer:
             self.path.unlink()
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            sock.setblocking(False)
             # The directory is ours alone already (0700), so nobody can connect between bind and chmod.
             sock.bind(str(self.path))
             self.path.chmod(0o600)
+            sock.listen(limits.CONTROL_BACKLOG)
         except OSError as error:
             sock.close()
             raise StartError(str(self.path), f"cannot be bound: {error.strerror}") from None
@@ -89,10 +90,11 @@ class ControlServer:
 
     async def close(self) -> None:
         """End all clients, remove socket and lock; twice does no harm."""
-        served = self._server is not None
-        if self._server is not None:
-            self._server.close()
-            self._server = None
+        served = self._acceptor is not None
+        if self._acceptor is not None:
+            self._acceptor.close()
+            self._acceptor = None
+        await asyncio.sleep(0)  # a client that was accepted just now closes its socket only if its task has begun
         clients = list(self._clients)
         for task in clients:
             task.cancel()
@@ -107,10 +109,18 @@ class ControlServer:
             self._lock.release()
             self._lock = None
 
-    def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = asyncio.get_running_loop().create_task(self._serve(reader, writer))
+    def _connected(self, sock: socket.socket, _address: str) -> None:
+        task = asyncio.get_running_loop().create_task(self._open(sock))
         self._clients.add(task)
         task.add_done_callback(self._clients.discard)
+
+    async def _open(self, sock: socket.socket) -> None:
+        try:
+            reader, writer = await asyncio.open_unix_connection(sock=sock, limit=limits.CONTROL_REQUEST_MAX)
+        except BaseException:
+            sock.close()
+            raise
+        await self._serve(reader, writer)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:

@@ -36,6 +36,7 @@ from rmpa.resource.remembered import Asked, Cooling, Remembered
 from rmpa.resource.reports import ALARM_LEVELS, alarm_values, answer_to, decision_of, health, told
 from rmpa.resource.requirements import Requirement
 from rmpa.ros.diagnostic_array import ARRAY_TYPE, Level, Status, frame_array
+from rmpa.ros.messages import MessageType
 from rmpa.ros.tcpros import LENGTH, printable
 
 if TYPE_CHECKING:
@@ -125,13 +126,13 @@ class Adapter(RuntimePart):
         self._measuring = Measuring(self._runtime.resource, now)
         for name, latch in (("quality", False), ("alarms", False), ("responses", True)):
             topic = f"{node.name}/{name}"
-            self._publishers[name] = await node.advertise(topic, ARRAY_TYPE, latch=latch)
-        self._publishers["diagnostics"] = await node.advertise("/diagnostics", ARRAY_TYPE)
+            self._publishers[name] = await node.advertise(topic, MessageType(ARRAY_TYPE), latch=latch)
+        self._publishers["diagnostics"] = await node.advertise("/diagnostics", MessageType(ARRAY_TYPE))
         for name in ("profile", "decision"):
             await self._runtime.say(name, "")
         self._recall(now := self._loop.time())  # registering has taken a while
-        self._asking = await node.subscribe(f"{node.name}/requirements", ARRAY_TYPE, self._asked)
-        await node.subscribe(f"{node.name}/observed", ARRAY_TYPE, self._told_of)
+        self._asking = await node.subscribe(f"{node.name}/requirements", MessageType(ARRAY_TYPE), self._asked)
+        await node.subscribe(f"{node.name}/observed", MessageType(ARRAY_TYPE), self._told_of)
         self._bar()
         self._act(self.loop.pin(self.chosen, now, anew=False) if self.chosen else self.loop.start(now))
         self._respond()

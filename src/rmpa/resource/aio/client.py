@@ -21,6 +21,7 @@ from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.resource.answer import Answer
 from rmpa.resource.requirement_text import EXPIRES, PRIORITY
 from rmpa.ros.diagnostic_array import ARRAY_TYPE, Level
+from rmpa.ros.messages import MessageType
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
@@ -56,8 +57,12 @@ class ResourceClient:
         Raises:
             UnreachableError: The master does not answer.
         """
-        self._responses = await self._node.subscribe(f"{self.resource}/responses", ARRAY_TYPE, self._heard)
-        self._asking = await self._node.advertise(f"{self.resource}/requirements", ARRAY_TYPE, latch=True)
+        self._responses = await self._node.subscribe(
+            f"{self.resource}/responses", MessageType(ARRAY_TYPE), self._heard
+        )
+        self._asking = await self._node.advertise(
+            f"{self.resource}/requirements", MessageType(ARRAY_TYPE), latch=True
+        )
         return self
 
     async def __aexit__(
@@ -127,7 +132,7 @@ class ResourceClient:
             UnreachableError: The master does not answer.
         """
         if self._observing is None:
-            self._observing = await self._node.advertise(f"{self.resource}/observed", ARRAY_TYPE)
+            self._observing = await self._node.advertise(f"{self.resource}/observed", MessageType(ARRAY_TYPE))
         if values:
             self.report(**values)
 

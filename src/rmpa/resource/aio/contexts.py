@@ -17,6 +17,7 @@ from rmpa.resource.aio.fence import Call
 from rmpa.resource.aio.runtime import RuntimePart
 from rmpa.resource.contexts import Chooser, parse_rule
 from rmpa.resource.descriptor import topic_of
+from rmpa.ros.messages import MessageType
 from rmpa.ros.tcpros import printable
 
 if TYPE_CHECKING:
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from rmpa.resource.contexts import Reference, Scalar
     from rmpa.resource.declare import Context, Input, Output, Parameter
     from rmpa.ros.aio.topics import Received, Subscriber
-    from rmpa.ros.messages import MessageType
 
 _log = logging.getLogger(__name__)
 TOPIC: Final = "context"
@@ -111,7 +111,7 @@ class Contexts(RuntimePart):
             self.chosen = ""
         if not self._known:
             return
-        await node.subscribe(f"{node.name}/set_context", "std_msgs/String", self._heard)
+        await node.subscribe(f"{node.name}/set_context", MessageType("std_msgs/String"), self._heard)
         if self.chosen:
             try:
                 await self._switch(self.chosen)
@@ -161,7 +161,7 @@ class Contexts(RuntimePart):
     def received(self, item: Input, message: Received) -> None:
         """An input's topic may be a rule's too."""
         if item.name in self._taps:
-            self._take(self._taps[item.name], item.type, message.raw)
+            self._take(self._taps[item.name], message.kind, message.raw)
 
     def published(self, output: Output, raw: bytes, now_ns: int) -> None:  # noqa: ARG002 - as the others have it
         """An output's likewise."""

@@ -12,6 +12,7 @@ from rmpa.resource.aio.client import ResourceClient
 from rmpa.resource.aio.runtime import RuntimePart
 from rmpa.resource.descriptor import TOPIC, Descriptor
 from rmpa.ros.diagnostic_array import Level
+from rmpa.ros.messages import MessageType
 from rmpa.ros.tcpros import printable
 
 if TYPE_CHECKING:
@@ -123,7 +124,7 @@ class Demands(RuntimePart):
 
         await client.observe()
         topic = f"{name}/{TOPIC}"
-        self.listening[topic] = await self._runtime.node.subscribe(topic, "std_msgs/String", heard)
+        self.listening[topic] = await self._runtime.node.subscribe(topic, MessageType("std_msgs/String"), heard)
 
     async def _follow(self, demand: Demand, client: ResourceClient) -> None:
         said: tuple[Level, str] | None = None

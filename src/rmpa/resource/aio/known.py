@@ -13,6 +13,7 @@ from rmpa.core.errors import RmpaError
 from rmpa.resource.aio.runtime import RuntimePart
 from rmpa.resource.descriptor import TOPIC
 from rmpa.resource.sightings import Place, Sightings
+from rmpa.ros.messages import MessageType
 
 if TYPE_CHECKING:
     from rmpa.resource.aio.demands import Demands
@@ -95,7 +96,7 @@ class Known(RuntimePart):
                 break
             heard = functools.partial(self._heard, topic.removesuffix(_ENDING))
             try:
-                self._subscribers[topic] = await node.subscribe(topic, "std_msgs/String", heard)
+                self._subscribers[topic] = await node.subscribe(topic, MessageType("std_msgs/String"), heard)
             except ValueError:  # an input, or a context's rule, has it
                 _log.debug("= %s: listens to %s already", node.name, topic)
 

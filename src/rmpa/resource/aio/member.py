@@ -18,6 +18,7 @@ from rmpa.resource.aio.reconfigure import Reconfigure
 from rmpa.resource.aio.runtime import Runtime, RuntimePart
 from rmpa.resource.aio.store import Store
 from rmpa.resource.aio.tasks import Tasks
+from rmpa.resource.aio.types import learn_outputs
 from rmpa.resource.lifecycle import LifeCycle, State, Transition
 from rmpa.ros.aio.http_client import call_api
 from rmpa.ros.aio.node import Node
@@ -96,14 +97,19 @@ class Member:
         self.known = Known(self.runtime, self.demands, store)
         self.add(self.known)
 
+    async def learn(self) -> None:
+        """Wait until the types of all outputs are known; those that this machine does not know, publishers tell."""
+        await learn_outputs(self.resource, self.runtime.node.master_uri, self.runtime.node.name)
+
     async def start(self) -> None:
-        """Configure and activate it.
+        """Configure and activate it, once the types of all its outputs are known.
 
         Raises:
             PeerRefused: A node of its name is on this core already, or one of its hooks raised.
             UnreachableError: The core does not answer.
         """
         await self._refuse_twin()
+        await self.learn()
         if self.memory is not None:
             await self.memory.recall()
         try:
@@ -256,23 +262,44 @@ async def run_all(
         RmpaError: One of them cannot start; those that have are closed.
     """
     members: list[Member] = []
+    stopped = asyncio.create_task(_stopped(stop))
     try:
-        for resource in resources:
+        # One that waits for the type of an output holds up no other.
+        for resource in sorted(resources, key=lambda each: any(o.kind.known is None for o in each.outputs.values())):
             store = Store(stores / f"{resource.name}.sqlite") if stores is not None else None
             member = Member(resource, master_uri, store=store)
             if stores is not None and not members:
                 member.keep_others(Store(stores / FILE))
-            await member.start()
+            if not await _started(member, stopped):
+                return
             members.append(member)
         ready()
-        over = [asyncio.create_task(_all_ended(members)), asyncio.create_task(_stopped(stop))]
-        await asyncio.wait(over, return_when=asyncio.FIRST_COMPLETED)
-        for task in over:
-            task.cancel()
-        await asyncio.gather(*over, return_exceptions=True)
+        ended = asyncio.create_task(_all_ended(members))
+        await asyncio.wait([ended, stopped], return_when=asyncio.FIRST_COMPLETED)
+        ended.cancel()
+        await asyncio.gather(ended, return_exceptions=True)
     finally:
+        stopped.cancel()
+        await asyncio.gather(stopped, return_exceptions=True)
         for member in reversed(members):
             await member.close()
+
+
+async def _started(member: Member, stopped: asyncio.Task[None]) -> bool:
+    """Start a resource; ``False``: it still waited for a type when it was to stop.
+
+    Raises:
+        RmpaError: It cannot start.
+    """
+    types = asyncio.create_task(member.learn(), name=f"types of {member.resource.name}")
+    await asyncio.wait([types, stopped], return_when=asyncio.FIRST_COMPLETED)
+    if not types.done():
+        types.cancel()
+        await asyncio.gather(types, return_exceptions=True)
+        return False
+    await types
+    await member.start()
+    return True
 
 
 async def _all_ended(members: list[Member]) -> None:

@@ -25,6 +25,7 @@ from rmpa.resource.reconfigure import (
     from_server,
     read_config,
 )
+from rmpa.ros.messages import MessageType
 from rmpa.ros.service_types import ServiceType
 
 if TYPE_CHECKING:
@@ -75,9 +76,11 @@ class Reconfigure(RuntimePart):
     async def start(self) -> None:
         """Serve."""
         node = self._runtime.node
-        described = await node.advertise(f"{node.name}/parameter_descriptions", DESCRIPTION_TYPE, latch=True)
+        described = await node.advertise(
+            f"{node.name}/parameter_descriptions", MessageType(DESCRIPTION_TYPE), latch=True
+        )
         described.publish(described.make(description(self._known)))
-        self._updates = await node.advertise(f"{node.name}/parameter_updates", CONFIG_TYPE, latch=True)
+        self._updates = await node.advertise(f"{node.name}/parameter_updates", MessageType(CONFIG_TYPE), latch=True)
         self._adapter.listeners.append(self._acted)
         self._contexts.listeners.append(self.say)
         self.say()

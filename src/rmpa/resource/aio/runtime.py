@@ -15,10 +15,11 @@ from collections import Counter, deque
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core import limits
-from rmpa.core.errors import LocalProtocolError
+from rmpa.core.errors import LocalProtocolError, RmpaError
 from rmpa.resource.descriptor import TOPIC, describe, topic_of
 from rmpa.resource.fence import around
-from rmpa.ros.messages import MessageError
+from rmpa.ros.messages import MessageError, MessageType
+from rmpa.ros.tcpros import printable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -77,6 +78,8 @@ class Runtime:
         self._open = True
         self._refused: Counter[str] = Counter()
         """By output: messages that were refused since the outputs were closed."""
+        self._unread: set[tuple[str, str]] = set()
+        """Inputs and publishers whose definition cannot be used."""
         self.flowing: frozenset[str] | None = None
         """The only outputs whose messages leave in the present context; ``None``: all."""
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -120,7 +123,9 @@ class Runtime:
     async def say(self, name: str, text: str) -> None:
         """Publish a text on a latched topic ``std_msgs/String`` of the resource's own; the same text is said once."""
         if name not in self._texts:
-            publisher = await self.node.advertise(f"{self.node.name}/{name}", "std_msgs/String", latch=True)
+            publisher = await self.node.advertise(
+                f"{self.node.name}/{name}", MessageType("std_msgs/String"), latch=True
+            )
             self._texts[name] = (publisher, None)
         self.say_again(name, text)
 
@@ -206,12 +211,40 @@ class Runtime:
     # --- inside -------------------------------------------------------------------------------------------------
 
     async def _listen(self, item: Input) -> None:
+        topic = topic_of(item.name, self.node.name)
+
         def received(message: Received) -> None:
             for part in self.parts:
                 part.received(item, message)
 
-        topic = topic_of(item.name, self.node.name)
-        self._subscribers[item.name] = await self.node.subscribe(topic, item.type, received)
+        def learnt(message: Received) -> None:
+            if self._learn(item, message):
+                received(message)
+
+        if item.kind.known is not None:
+            self._subscribers[item.name] = await self.node.subscribe(topic, item.kind.known, received)
+            return
+        text = "is not known here; a publisher of"
+        _log.info(
+            "= %s: the type of input %s, %s, %s %s tells it", self.node.name, item.name, item.kind.name, text, topic
+        )
+        self._subscribers[item.name] = await self.node.subscribe(topic, item.kind.name, learnt)
+
+    def _learn(self, item: Input, message: Received) -> bool:
+        """Take the type of an input from its publisher's header; whether it can be used."""
+        caller = printable(message.caller_id)
+        try:
+            kind = message.kind
+        except RmpaError as error:
+            if (item.name, caller) not in self._unread:
+                self._unread.add((item.name, caller))
+                text = "its messages are dropped; this is said once"
+                _log.warning("! %s: input %s from %s: %s; %s", self.node.name, item.name, caller, error, text)
+            return False
+        if item.kind.known is None:
+            item.kind.known = kind
+            _log.info("= %s: %s is learnt from %s", self.node.name, item.kind.name, caller)
+        return True
 
     def send(self, output: Output, raw: bytes, fence: Fence | None = None) -> None:
         """Send one message of an output, or keep it while a profile is being applied.

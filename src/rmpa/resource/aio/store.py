@@ -18,21 +18,22 @@ import contextlib
 import fcntl
 import logging
 import os
-import re
 import sqlite3
 import threading
 import time
 from collections import deque
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
+from rmpa.core.aio.state_dir import module_dir, state_dir
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from pathlib import Path
 
     from rmpa.resource.remembered import Key
+
+__all__ = ["DamagedStore", "Store", "module_dir", "read_state", "state_dir"]
 
 _log = logging.getLogger(__name__)
 _VERSION: Final = 1
@@ -62,26 +63,6 @@ _KEPT: Final = {
 }
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _LOCK_LOOK: Final = 0.02
-
-
-def state_dir(environ: Mapping[str, str], setting: str | None = None) -> Path | None:
-    """Where stores lie: the setting, RMPA_STATE_DIR, or ``rmpa`` below XDG_STATE_HOME or ``~/.local/state``.
-
-    Returns:
-        ``None`` if there is no such place: no home.
-    """
-    if setting or environ.get("RMPA_STATE_DIR"):
-        return Path(setting or environ["RMPA_STATE_DIR"])
-    if environ.get("XDG_STATE_HOME"):
-        return Path(environ["XDG_STATE_HOME"]) / "rmpa"
-    if environ.get("HOME"):
-        return Path(environ["HOME"]) / ".local" / "state" / "rmpa"
-    return None
-
-
-def module_dir(directory: Path, module: str) -> Path:
-    """The folder of one module's stores; each is named as its resource, with ``.sqlite``."""
-    return directory / (re.sub(r"[^\w.-]", "_", module).lstrip(".") or "_")
 
 
 def read_state(path: Path) -> dict[Key, str]:

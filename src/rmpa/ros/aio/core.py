@@ -11,20 +11,24 @@ import os
 import uuid
 from typing import TYPE_CHECKING, Final
 
+from rmpa.core.aio.descriptors import Use
 from rmpa.core.aio.loop import breathe, breathing
 from rmpa.core.counters import Counters
+from rmpa.ros.aio.core_memory import CoreMemory
 from rmpa.ros.aio.http_server import XmlRpcServer
 from rmpa.ros.aio.liveness import Liveness
 from rmpa.ros.aio.notifier import Notifier
-from rmpa.ros.aio.rosout import Rosout
+from rmpa.ros.aio.rosout import NODE, Rosout
 from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.effects import Kind
 from rmpa.ros.master.registrations import ANY_TYPE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+    from pathlib import Path
 
     from rmpa.ros.master.effects import GraphChange, GraphState
+    from rmpa.ros.master.reachability import Unreachable
     from rmpa.ros.xmlrpc import Reply, XmlRpcValue
 
 _log = logging.getLogger(__name__)
@@ -48,6 +52,9 @@ class RosCore:
         rosout: Whether to aggregate ``/rosout``.
         counters: Where refusals, calls and notifications are counted.
         on_shutdown: ``(reason)``: a client called ``shutdown``; the owner closes the core then.
+        state: The file that keeps registrations and parameters over the core's end; ``None`` keeps nothing.
+        fresh: Begin empty, whatever the file says.
+        temporary: Whether a node of this name is not to be kept: who makes it makes it anew.
     """
 
     def __init__(
@@ -59,23 +66,38 @@ class RosCore:
         rosout: bool = True,
         counters: Counters | None = None,
         on_shutdown: Callable[[str], None] | None = None,
+        state: Path | None = None,
+        fresh: bool = False,
+        temporary: Callable[[str], bool] = lambda _: False,
     ) -> None:
         self.counters = counters if counters is not None else Counters()
         self._host = host
         self._advertised = advertised_host or (os.uname().nodename if host in {"", "0.0.0.0"} else host)  # noqa: S104
         self._on_shutdown = on_shutdown
         self._api = MasterApi("", os.getpid(), self._asked_to_end, breathing=breathing)
-        self._server = XmlRpcServer(self._answer, host, port, counters=self.counters, name="ROS core")
+        self._server = XmlRpcServer(self._answer, host, port, counters=self.counters, name="ROS core", use=Use.CORE)
         self._notifier: Notifier | None = None
         self._liveness: Liveness | None = None
         self._with_rosout = rosout
         self._rosout: Rosout | None = None
         self._callbacks: list[Callable[[GraphChange], None]] = []
+        self.memory: CoreMemory | None = None
+        """What it keeps over its end, if it keeps anything."""
+        if state is not None:
+            own = {NODE, CALLER_ID}
+            self.memory = CoreMemory(
+                state,
+                self._api,
+                fresh=fresh,
+                temporary=lambda node: node in own or temporary(node),
+                carry_out=self._carry_out,
+                counters=self.counters,
+            )
 
     # --- its life ---------------------------------------------------------------------------------------------
 
     async def start(self) -> None:
-        """Listen; set ``/run_id``, ``/rosdistro`` and ``/rosversion``; start ``/rosout``.
+        """Take up what was kept; listen; set ``/run_id``, ``/rosdistro`` and ``/rosversion``; start ``/rosout``.
 
         Raises:
             StartError: The port is taken, or the address cannot be used.
@@ -85,15 +107,25 @@ class RosCore:
             nodes_at=registrations.nodes_at, on_unreachable=self._unreachable, counters=self.counters
         )
         self._liveness = Liveness(nodes=registrations.nodes, on_dead=self._dead)
-        await self._server.start()
+        if self.memory is not None:
+            await self.memory.open()
+        try:
+            await self._server.start()
+        except BaseException:
+            await self.close()
+            raise
         self._api.uri = f"http://{self._advertised}:{self.port}/"
         # roslaunch's convention: nodes of one run find their logs by it.
-        self.call("setParam", CALLER_ID, "/run_id", str(uuid.uuid1()))
+        if not isinstance(self.call("getParam", CALLER_ID, "/run_id").value, str):
+            self.call("setParam", CALLER_ID, "/run_id", str(uuid.uuid1()))
         self.call("setParam", CALLER_ID, "/rosversion", ROS_VERSION)
         self.call("setParam", CALLER_ID, "/rosdistro", ROS_DISTRO)
         self._liveness.start()
+        if self.memory is not None:
+            self.memory.start()
         if self._with_rosout:
-            self._rosout = Rosout(self._host, self._advertised, self.uri, self.call, self.counters)
+            self._rosout = Rosout(self._host, self._advertised, self.uri, self.call, registrations, self.counters)
+            self.on_change(self._rosout.graph_changed)
             try:
                 await self._rosout.start()
             except BaseException:
@@ -102,15 +134,19 @@ class RosCore:
                 raise
 
     async def close(self) -> None:
-        """End: /rosout first, then what calls the nodes, then the server."""
+        """End: /rosout first, then what calls the nodes, then the server; what was last is kept."""
         rosout, self._rosout = self._rosout, None
         if rosout is not None:
             await rosout.close()
+        if self.memory is not None:
+            await self.memory.ask_no_more()
         if self._notifier is not None:
             await self._notifier.close()
         if self._liveness is not None:
             await self._liveness.close()
         await self._server.close()
+        if self.memory is not None:
+            await self.memory.close()
 
     @property
     def uri(self) -> str:
@@ -174,8 +210,20 @@ class RosCore:
         self._callbacks.append(callback)
 
     def notes(self) -> tuple[str, ...]:
-        """None: it is there as long as the agent is."""
-        return ()
+        """What is wrong with what it keeps: it is there itself as long as the agent is."""
+        return self.memory.notes() if self.memory is not None else ()
+
+    def remembered(self) -> str:
+        """Its file, and what became of the nodes and parameters in it."""
+        return self.memory.told() if self.memory is not None else ""
+
+    def awaited(self, topic: str) -> Mapping[str, str]:
+        """Nodes that published a topic in the run before and have not answered since, and their slave APIs."""
+        return self._api.registrations.awaited.publishers_of(topic)
+
+    def unreachable(self) -> Mapping[str, Unreachable]:
+        """The registered nodes that nothing can connect to; not to be changed."""
+        return self._liveness.unreachable if self._liveness is not None else {}
 
     def suspect(self, node: str) -> None:
         """Say that this node may be dead: it is checked now, and purged if it is."""
@@ -192,6 +240,8 @@ class RosCore:
 
     def _carry_out(self) -> None:
         effects, changes = self._api.take()
+        if self.memory is not None:
+            self.memory.look_soon()
         # Queued before anybody hears of the change: a callback that registers something must not be overtaken by
         # the list as it was before.
         if self._notifier is not None:

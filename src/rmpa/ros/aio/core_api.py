@@ -9,6 +9,7 @@ if TYPE_CHECKING:
 
     from rmpa.core.counters import Counters
     from rmpa.ros.master.effects import GraphChange, GraphState
+    from rmpa.ros.master.reachability import Unreachable
     from rmpa.ros.xmlrpc import Reply, XmlRpcValue
 
 
@@ -82,10 +83,22 @@ class Core(Protocol):
         """Call ``callback`` in the loop after each change of a registration."""
         ...
 
+    def unreachable(self) -> Mapping[str, Unreachable]:
+        """The registered nodes that nothing can connect to; not to be changed."""
+        ...
+
     def suspect(self, node: str) -> None:
         """Say that this node may be dead, or may have moved: it is looked at now."""
         ...
 
     def notes(self) -> tuple[str, ...]:
         """What the user should know: that the master does not answer, say."""
+        ...
+
+    def remembered(self) -> str:
+        """What the core keeps over its end, and took up of the run before, ready to read; empty for nothing."""
+        ...
+
+    def awaited(self, topic: str) -> Mapping[str, str]:
+        """Nodes that published a topic in the run before and have not answered since, and their slave APIs."""
         ...

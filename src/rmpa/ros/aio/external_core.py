@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
+from rmpa.core.aio.descriptors import Use
 from rmpa.core.aio.loop import breathe, breathing
 from rmpa.core.counters import Counters
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, RmpaError, StartError, UnreachableError
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from rmpa.ros.master.effects import GraphChange, GraphState
+    from rmpa.ros.master.reachability import Unreachable
 
 _log = logging.getLogger(__name__)
 
@@ -201,7 +203,7 @@ class ExternalCore:
             self._write(_Write(method, params, done))
             return await done
         await self._written.wait()
-        return await call_api(self._uri, method, *params, timeout=limits.MASTER_ASK_TIMEOUT)
+        return await call_api(self._uri, method, *params, timeout=limits.MASTER_ASK_TIMEOUT, use=Use.CORE)
 
     def state(self) -> GraphState:
         """All registrations that are known; the same object until one changes."""
@@ -218,6 +220,18 @@ class ExternalCore:
     def on_change(self, callback: Callable[[GraphChange], None]) -> None:
         """Call ``callback`` in the loop after each change that was made here or was seen."""
         self._callbacks.append(callback)
+
+    def unreachable(self) -> Mapping[str, Unreachable]:
+        """The registered nodes that nothing can connect to; not to be changed."""
+        return self._liveness.unreachable
+
+    def remembered(self) -> str:
+        """Nothing of ours: what a roscore forgets is its own."""
+        return ""
+
+    def awaited(self, topic: str) -> Mapping[str, str]:  # noqa: ARG002 - of ``Core``
+        """None, likewise."""
+        return {}
 
     def suspect(self, node: str) -> None:
         """A node may be dead, or may have moved: look at it and at the master now."""
@@ -383,7 +397,7 @@ class ExternalCore:
         if not self._request:
             calls = survey_calls(self._own_node, self._nodes, self._services)
             self._request = b"".join(breathing(call_pieces(_MULTICALL, [calls]), every=1))
-        body = await exchange(self._uri, _MULTICALL, self._request, timeout=limits.MASTER_TIMEOUT)
+        body = await exchange(self._uri, _MULTICALL, self._request, timeout=limits.MASTER_TIMEOUT, use=Use.CORE)
         if body == self._seen and self._usable:
             return False
         answer = await read_response(body)
@@ -441,7 +455,7 @@ class ExternalCore:
             try:
                 if await name_at(api) != node:
                     continue  # its port is another program's now
-                reply = await call_api(api, "getPid", self._own_node)
+                reply = await call_api(api, "getPid", self._own_node, use=Use.CORE)
             except UnreachableError:
                 return f"{node} at {api}, which does not answer"
             except RmpaError:
@@ -450,7 +464,7 @@ class ExternalCore:
         return ""
 
     async def _many(self, calls: Sequence[XmlRpcValue], within: float = 0.0) -> list[XmlRpcValue]:
-        answers = await call(self._uri, _MULTICALL, calls, timeout=within or limits.MASTER_TIMEOUT)
+        answers = await call(self._uri, _MULTICALL, calls, timeout=within or limits.MASTER_TIMEOUT, use=Use.CORE)
         if not isinstance(answers, list) or len(answers) != len(calls):
             raise RemoteProtocolError(f"{len(calls)} calls were answered with {brief(answers)}")
         return answers

@@ -19,8 +19,9 @@ from urllib.parse import urlsplit
 import h11
 
 from rmpa.core import limits
+from rmpa.core.aio.descriptors import DESCRIPTORS, OUT_OF_DESCRIPTORS, Use
 from rmpa.core.aio.loop import breathe, breathing
-from rmpa.core.errors import LimitExceeded, RemoteProtocolError, UnreachableError
+from rmpa.core.errors import LimitExceeded, OutOfDescriptors, RemoteProtocolError, UnreachableError
 from rmpa.ros.xmlrpc import Reply, ResponseReader, RosFault, XmlRpcValue, brief, call_pieces
 
 __all__ = ["RosFault", "call", "call_api", "connect", "exchange", "is_own_name", "read_response", "split_uri"]
@@ -74,10 +75,9 @@ async def _resolve(host: str, port: int) -> list[tuple[str, int]]:
     return [(address[0], port) for *_, address in found if isinstance(address[0], str)]
 
 
-async def _connect_one(address: tuple[str, int]) -> socket.socket:
-    sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+async def _connect_one(address: tuple[str, int], use: Use) -> socket.socket:
+    sock = DESCRIPTORS.open_socket(use, what=f"a connection to {address[0]}:{address[1]}")
     try:
-        sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         await asyncio.get_running_loop().sock_connect(sock, address)
         # This raises too, where the other side hung up at once.
@@ -90,22 +90,24 @@ async def _connect_one(address: tuple[str, int]) -> socket.socket:
     return sock
 
 
-async def connect(host: str, port: int) -> socket.socket:
+async def connect(host: str, port: int, use: Use = Use.DATA) -> socket.socket:
     """Connect by TCP, non-blocking and with TCP_NODELAY.
 
     Args:
         host: A number, a name of this machine (connected on loopback, without the resolver) or any other name.
         port: The port.
+        use: What for: whether it may take one of the last file descriptors.
 
     Raises:
         UnreachableError: The name does not resolve.
-        OSError: Nobody listens there (``ConnectionRefusedError``) or the network says no.
+        OSError: Nobody listens there (``ConnectionRefusedError``), the network says no, or no file descriptor is
+            left (``EMFILE``).
     """
     error: OSError = ConnectionRefusedError(errno.ECONNREFUSED, f"no address for {host}")
     addresses = await _addresses(host, port)
     for address in addresses:
         try:
-            return await _connect_one(address)
+            return await _connect_one(address, use)
         except OSError as refused:
             error = refused
     if is_own_name(host) and host != "localhost":
@@ -113,7 +115,7 @@ async def connect(host: str, port: int) -> socket.socket:
         for address in await _resolve(host, port):
             if address not in addresses:
                 try:
-                    return await _connect_one(address)
+                    return await _connect_one(address, use)
                 except OSError as refused:
                     error = refused
     raise error
@@ -162,6 +164,7 @@ async def call(
     method: str,
     *params: XmlRpcValue,
     timeout: float = limits.SLAVE_CALL_TIMEOUT,  # noqa: ASYNC109 - the message names it
+    use: Use = Use.DATA,
 ) -> XmlRpcValue:
     """Call a method of the server at ``uri``.
 
@@ -170,9 +173,11 @@ async def call(
         method: Its name.
         params: What it is called with.
         timeout: Seconds for everything: connecting, the call and its response.
+        use: What for: whether it may take one of the last file descriptors.
 
     Raises:
         UnreachableError: Nobody answers there, or not in time.
+        OutOfDescriptors: No file descriptor is left here to ask.
         RosFault: The answer is a fault.
         RemoteProtocolError: The answer is not XML-RPC, or too large.
         LocalProtocolError: A parameter cannot be said in XML-RPC.
@@ -180,7 +185,7 @@ async def call(
     if _log.isEnabledFor(logging.DEBUG):
         _log.debug("> %s %s%s", uri, method, brief(params))
     document = b"".join(breathing(call_pieces(method, params), every=1))
-    return await read_response(await exchange(uri, method, document, timeout=timeout))
+    return await read_response(await exchange(uri, method, document, timeout=timeout, use=use))
 
 
 async def exchange(
@@ -189,6 +194,7 @@ async def exchange(
     document: bytes,
     *,
     timeout: float,  # noqa: ASYNC109 - the message names it
+    use: Use = Use.DATA,
 ) -> bytes:
     """Send a ``methodCall`` document and return the response's, which nobody has looked at.
 
@@ -199,7 +205,7 @@ async def exchange(
     http, request = _request(host, port, path, document)
     try:
         async with asyncio.timeout(timeout):
-            sock = await connect(host, port)
+            sock = await connect(host, port, use)
             try:
                 await asyncio.get_running_loop().sock_sendall(sock, request)
                 return await _response_body(sock, http)
@@ -210,6 +216,8 @@ async def exchange(
             "XML-RPC server", uri, f"no answer to {method} in {timeout:g} s; is that program stopped?"
         ) from error
     except OSError as error:
+        if error.errno in OUT_OF_DESCRIPTORS:
+            raise OutOfDescriptors("XML-RPC server", uri, "`rmpa doctor` says what to do") from error
         problem = os.strerror(error.errno) if error.errno else str(error)
         raise UnreachableError("XML-RPC server", uri, f"{problem}; is that program running?") from error
     except h11.RemoteProtocolError as error:
@@ -241,6 +249,7 @@ async def call_api(
     method: str,
     *params: XmlRpcValue,
     timeout: float = limits.SLAVE_CALL_TIMEOUT,  # noqa: ASYNC109 - handed to ``call``
+    use: Use = Use.DATA,
 ) -> Reply:
     """Call a method of a ROS API, all of which answer ``[code, status, value]``.
 
@@ -248,4 +257,4 @@ async def call_api(
         RemoteProtocolError: The answer is not such a triple (roscpp's ``getBusStats`` is none).
         UnreachableError, RosFault, LocalProtocolError: As for ``call``.
     """
-    return Reply.of(await call(uri, method, *params, timeout=timeout))
+    return Reply.of(await call(uri, method, *params, timeout=timeout, use=use))

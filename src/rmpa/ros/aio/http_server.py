@@ -8,7 +8,6 @@ keeps its connections open for as long as its threads live.
 from __future__ import annotations
 
 import asyncio
-import errno
 import logging
 import socket
 from collections.abc import Awaitable, Callable, Iterator
@@ -17,10 +16,14 @@ from typing import Final
 import h11
 
 from rmpa.core import limits
+from rmpa.core.aio.acceptor import Acceptor
+from rmpa.core.aio.descriptors import DESCRIPTORS, Use
 from rmpa.core.aio.loop import breathe
 from rmpa.core.counters import Counters, RefusalLog
-from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, StartError
-from rmpa.ros.http_head import Head, plain_head
+from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
+from rmpa.ros.aio import http_eviction, http_listen
+from rmpa.ros.call_body import CallBody
+from rmpa.ros.http_head import REASONS, Head, plain_head
 from rmpa.ros.xmlrpc import CallReader, RosFault, XmlRpcValue, brief, response_pieces, serialize_fault
 
 _log = logging.getLogger(__name__)
@@ -38,6 +41,7 @@ class XmlRpcServer:
         port: 0 lets the system choose.
         counters: Where refusals (``http.*``, ``xmlrpc.*``) and calls are counted.
         name: What listens here, for messages: ``ROS core``, ``node /talker``.
+        use: What its connections are for: whether they may take the last file descriptors.
     """
 
     def __init__(
@@ -48,6 +52,7 @@ class XmlRpcServer:
         *,
         counters: Counters | None = None,
         name: str = "XML-RPC server",
+        use: Use = Use.DATA,
     ) -> None:
         self._handler = handler
         self._host = host
@@ -55,7 +60,9 @@ class XmlRpcServer:
         self._name = name
         self.counters = counters if counters is not None else Counters()
         self._refusals = RefusalLog(_log, self.counters)
-        self._server: asyncio.Server | None = None
+        self._use = use
+        self._acceptor: Acceptor | None = None
+        self._arriving: set[asyncio.Task[None]] = set()
         # In the order of their last use, so that the first idle one is the one to give up.
         self._connections: dict[_Connection, None] = {}
         self.port = 0
@@ -72,44 +79,36 @@ class XmlRpcServer:
         Raises:
             StartError: The address is in use, not ours, or not allowed.
         """
-        loop = asyncio.get_running_loop()
-        try:
-            self._server = await loop.create_server(
-                lambda: _Connection(self),
-                self._host,
-                self._wanted_port,
-                family=socket.AF_INET,
-                backlog=limits.HTTP_ACCEPTS,
-            )
-        except OSError as error:
-            raise self._start_error(error) from error
-        listening = self._server.sockets[0]
-        self.port = listening.getsockname()[1]
-        # asyncio accepts as many at once as may wait; more may wait than shall be accepted without a pause.
-        with listening.dup() as same:
-            same.listen(limits.HTTP_BACKLOG)
+        sock = await http_listen.listen(self._name, self._host, self._wanted_port, self._use)
+        self.port = sock.getsockname()[1]
+        self._acceptor = Acceptor(sock, self.adopt, name=self._name, use=self._use, at_once=limits.HTTP_ACCEPTS)
+        self._acceptor.start()
         _log.info("= %s listens at %s:%d", self._name, self._host, self.port)
 
-    def _start_error(self, error: OSError) -> StartError:
-        where = f"{self._name} at {self._host}:{self._wanted_port}"
-        match error.errno:
-            case errno.EADDRINUSE:
-                return StartError(
-                    where,
-                    f"port {self._wanted_port} is already in use",
-                    "end the program that listens there (another core?) or choose another port",
-                )
-            case errno.EACCES | errno.EPERM:
-                return StartError(where, "this user may not use that port", "choose a port above 1023")
-            case errno.EADDRNOTAVAIL:
-                return StartError(where, "this machine does not have that address", "choose one that `ip addr` shows")
-        return StartError(where, error.strerror or str(error))
+    def adopt(self, sock: socket.socket, _client: tuple[str, int]) -> None:
+        """Serve a connection that was accepted, by this server's own socket or by one that several nodes share.
+
+        Args:
+            sock: Non-blocking; owned from here on.
+        """
+        task = asyncio.get_running_loop().create_task(self._connect(sock))
+        self._arriving.add(task)
+        task.add_done_callback(self._arriving.discard)
+
+    async def _connect(self, sock: socket.socket) -> None:
+        try:
+            await asyncio.get_running_loop().connect_accepted_socket(lambda: _Connection(self), sock)
+        except BaseException:
+            sock.close()
+            raise
 
     async def close(self) -> None:
         """Stop listening, let calls that are being answered finish (``limits.DRAIN_TIMEOUT``), close the rest."""
-        if self._server is None:
-            return
-        self._server.close()
+        if self._acceptor is not None:
+            self._acceptor.close()
+            self._acceptor = None
+        if self._arriving:
+            await asyncio.wait(self._arriving)
         for connection in list(self._connections):
             connection.close_when_answered()
         gone = [connection.gone for connection in self._connections]
@@ -117,19 +116,39 @@ class XmlRpcServer:
             await asyncio.wait(gone, timeout=limits.DRAIN_TIMEOUT)
         for connection in list(self._connections):
             connection.abort()
-        self._server = None
 
     # --- what connections ask of their server -----------------------------------------------------------------
 
     def _joined(self, connection: _Connection) -> bool:
         if len(self._connections) >= limits.HTTP_CONNECTIONS_MAX:
-            idle = next((one for one in self._connections if one.idle), None)
-            if idle is None:
+            evicted = http_eviction.for_newcomer(self._connections, asyncio.get_running_loop().time())
+            if evicted is None:
                 self._refuse("http.refused.connections", connection, "all connections are busy; this one is refused")
                 return False
-            self.counters.add("http.evicted")
-            idle.abort()
+            self._give_up(evicted)
+        if not self._connections:
+            DESCRIPTORS.offer(self, self._close_idle)
         self._connections[connection] = None
+        return True
+
+    def _give_up(self, connection: _Connection) -> None:
+        """Close a connection for one that needs its place; an idle one's client connects anew without a word."""
+        if connection.idle:
+            self.counters.add("http.evicted")
+        else:
+            text = "a call that came too slowly, or an answer that was not read, gave way to others"
+            self._refuse("http.evicted.slow", connection, f"{text}; is a program stopped, or a port scanner at work?")
+        self._left(connection)
+        connection.abort()
+
+    def _reserve(self, connection: _Connection, size: int) -> bool:
+        """Whether there is room for a large call, which is set aside until it is answered."""
+        now = asyncio.get_running_loop().time()
+        while sum(one.reserved for one in self._connections) + size > limits.HTTP_BODIES_MAX:
+            slow = http_eviction.for_call(self._connections, now)
+            if slow is None or slow is connection:
+                return False
+            self._give_up(slow)
         return True
 
     def _used(self, connection: _Connection) -> None:
@@ -139,12 +158,23 @@ class XmlRpcServer:
 
     def _left(self, connection: _Connection) -> None:
         self._connections.pop(connection, None)
+        if not self._connections:
+            DESCRIPTORS.offer(self, None)
+
+    def _close_idle(self) -> bool:
+        """Close a connection whose client has had its answer, for one that waits for a descriptor elsewhere."""
+        before = asyncio.get_running_loop().time() - limits.HTTP_IDLE_MIN
+        for connection in self._connections:
+            if connection.answered is not None and connection.answered < before and connection.idle:
+                connection.abort()
+                return True
+        return False
 
     def _refuse(self, name: str, connection: _Connection, text: str) -> None:
         now = asyncio.get_running_loop().time()
         self._refusals.refuse(now, name, connection.client, f"{self._name}: {connection.client}: {text}")
 
-    def _answer(self, body: bytes, connection: _Connection) -> bytes | Awaitable[bytes]:
+    def _answer(self, body: bytes | memoryview, connection: _Connection) -> bytes | Awaitable[bytes]:
         """The response to one call, at once unless the handler has to wait, or there is much to read or write."""
         if len(body) > limits.HTTP_BODY_INLINE:
             return self._answer_large(body, connection)
@@ -158,7 +188,7 @@ class XmlRpcServer:
             return self._malformed(error, connection)
         return self._dispatch(method, params, connection)
 
-    async def _answer_large(self, body: bytes, connection: _Connection) -> bytes:
+    async def _answer_large(self, body: bytes | memoryview, connection: _Connection) -> bytes:
         # Not in a thread: one that computes takes the interpreter from the loop for milliseconds at a time.
         reader = CallReader()
         try:
@@ -243,19 +273,44 @@ class _Connection(asyncio.Protocol):
         self._head: Head | None = None
         self._plain = False
         self._transport: asyncio.Transport | None = None
-        self._body = bytearray()
+        self._body = CallBody(lambda size: server._reserve(self, size))  # noqa: SLF001 - two halves of one thing
         self._task: asyncio.Task[None] | None = None
+        self._more: asyncio.Handle | None = None
         self._closing = False
         self._deadline = 0.0
+        self.begun = self._loop.time()
         self._timer: asyncio.TimerHandle | None = None
         self._receiving = False
         self.gone: asyncio.Future[None] = self._loop.create_future()
         self.client = "?"
+        self.answered: float | None = None
+        """When the last answer was written, by the loop's clock."""
 
     @property
     def idle(self) -> bool:
         """Whether no request is on its way in and no answer on its way out."""
         return not self._receiving and self._task is None and self._transport is not None and not self._pending()
+
+    @property
+    def answering(self) -> bool:
+        """Whether a call has come and is being answered."""
+        return self._task is not None
+
+    @property
+    def reserved(self) -> int:
+        """Bytes set aside for its call."""
+        return self._body.reserved
+
+    @property
+    def received(self) -> int:
+        """Bytes of an unfinished call that have come; 0 while an answer is not read."""
+        return len(self._unread) + len(self._body) if self._receiving else 0
+
+    def _begin(self) -> None:
+        """A call has begun to come."""
+        self._receiving = True
+        self._expect(limits.HTTP_REQUEST_TIMEOUT)
+        self.begun = self._deadline - limits.HTTP_REQUEST_TIMEOUT
 
     def _pending(self) -> int:
         return self._transport.get_write_buffer_size() if self._transport is not None else 0
@@ -298,7 +353,7 @@ class _Connection(asyncio.Protocol):
             return False
         self._hand_over(end=True)
         # A client may half-close behind its request; it still gets its answer.
-        return self._task is not None
+        return self._task is not None or self._more is not None
 
     def pause_writing(self) -> None:
         if self._transport is not None:
@@ -338,14 +393,17 @@ class _Connection(asyncio.Protocol):
             if self._head is None:
                 self._hand_over()
                 return
-            self._receiving = True
-            self._expect(limits.HTTP_REQUEST_TIMEOUT)
+            self._begin()
+            if self._head.length > limits.HTTP_BODY_INLINE and not self._body.expect(self._head.length):
+                self._hand_over()
+                return
         missing = self._head.end + self._head.length - len(self._unread)
         if missing < 0:  # the next one is right behind it
             self._hand_over()
         elif missing == 0:
-            body = bytes(self._unread[self._head.end :])
-            self._unread.clear()
+            # A view, and another buffer for what comes next: to copy a large one would hold up data.
+            body = memoryview(self._unread)[self._head.end :]
+            self._unread = bytearray()
             self._closing, self._plain, self._head = self._head.close, True, None
             self._call(body)
 
@@ -374,52 +432,71 @@ class _Connection(asyncio.Protocol):
                 return
             match event:
                 case h11.Request():
-                    self._receiving = True
-                    self._expect(limits.HTTP_REQUEST_TIMEOUT)
+                    self._begin()
                     if not self._accepts(event, http):
                         return
                 case h11.Data(data=data):
-                    if len(self._body) + len(data) > limits.HTTP_BODY_MAX:
-                        self._reject(413, f"a body of more than {limits.HTTP_BODY_MAX} bytes", "http.too_large")
-                        return
-                    self._body += data
+                    self._body.add(data)
                 case h11.EndOfMessage():
-                    body = bytes(self._body)
-                    self._body.clear()
-                    self._call(body)
+                    self._take_end()
+                    if http.trailing_data[0] and self._task is None:
+                        self._more = self._loop.call_soon(self._go_on, http)
+                        return
                 case h11.ConnectionClosed():
                     self.close_when_answered()
                     return
                 case _:  # NEED_DATA or PAUSED
                     if event is h11.NEED_DATA and not self._receiving and http.trailing_data[0]:
-                        self._receiving = True
-                        self._expect(limits.HTTP_REQUEST_TIMEOUT)
+                        self._begin()
                     return
+
+    def _go_on(self, http: h11.Connection) -> None:
+        """Take the next call of those that came in one go; others had a turn before it."""
+        self._more = None
+        if not self.gone.done():
+            self._advance(http)
 
     def _accepts(self, request: h11.Request, http: h11.Connection) -> bool:
         if request.method != b"POST":
             self._reject(405, f"{request.method.decode('ascii')}: XML-RPC is called by POST only", "http.method")
             return False
         for name, value in request.headers:
-            if name == b"content-length" and int(value) > limits.HTTP_BODY_MAX:
-                self._reject(413, f"a body of {int(value)} bytes, above {limits.HTTP_BODY_MAX}", "http.too_large")
-                return False
+            if name == b"content-length":
+                self._body.expect(int(value))
+                if int(value) > limits.HTTP_DISCARDED_MAX:
+                    self._reject(413, f"a body of {int(value)} bytes, above {limits.HTTP_BODY_MAX}", "http.too_large")
+                    return False
             if name == b"content-encoding" and value.lower() != b"identity":
                 self._reject(415, "an encoded body; send it as it is", "http.encoding")
                 return False
         if http.they_are_waiting_for_100_continue:
+            if self._body.refused:
+                self._reject(413, f"a body of more than {limits.HTTP_BODY_MAX} bytes", "http.too_large")
+                return False
             self._write(http, h11.InformationalResponse(status_code=100, headers=[], reason=b"Continue"))
         return True
 
+    def _take_end(self) -> None:
+        """A body is whole."""
+        body, refusal = self._body.end()
+        if not refusal:
+            self._call(body)
+            return
+        self._receiving = False
+        self._server._used(self)  # noqa: SLF001 - two halves of one thing
+        self._server._refuse("http.too_large", self, refusal)  # noqa: SLF001
+        self._reply(200, serialize_fault(-1, refusal))
+
     # --- answers ----------------------------------------------------------------------------------------------
 
-    def _call(self, body: bytes) -> None:
+    def _call(self, body: memoryview) -> None:
         self._receiving = False
         self._server._used(self)  # noqa: SLF001
         breathe()
         answer = self._server._answer(body, self)  # noqa: SLF001
         breathe()
         if isinstance(answer, bytes):
+            self._body.answered()
             self._reply(200, answer)
             return
         if self._transport is not None:
@@ -429,6 +506,7 @@ class _Connection(asyncio.Protocol):
     async def _wait(self, answer: Awaitable[bytes]) -> None:
         body = await answer
         self._task = None
+        self._body.answered()
         self._reply(200, body)
         if self._transport is not None and not self._closing:
             self._transport.resume_reading()
@@ -440,6 +518,7 @@ class _Connection(asyncio.Protocol):
     def _reply(self, status: int, body: bytes) -> None:
         if self._transport is None or self._transport.is_closing():
             return
+        self.answered = self._loop.time()
         if self._plain or self._http is None:
             self._plain = False
             close = b"Connection: close\r\n" if self._closing else b""
@@ -461,7 +540,7 @@ class _Connection(asyncio.Protocol):
             headers.append((b"Connection", b"close"))
         self._write(
             http,
-            h11.Response(status_code=status, headers=headers, reason=_REASONS.get(status, b"Refused")),
+            h11.Response(status_code=status, headers=headers, reason=REASONS.get(status, b"Refused")),
             h11.Data(data=body),
             h11.EndOfMessage(),
         )
@@ -515,11 +594,3 @@ class _Connection(asyncio.Protocol):
 
 
 _PLAIN_REPLY: Final = b"HTTP/1.1 200 OK\r\nServer: rmpa\r\nContent-Type: text/xml\r\nContent-length: %d\r\n%s\r\n"
-_REASONS: Final = {
-    200: b"OK",
-    400: b"Bad Request",
-    405: b"Method Not Allowed",
-    413: b"Content Too Large",
-    415: b"Unsupported Media Type",
-    431: b"Request Header Fields Too Large",
-}

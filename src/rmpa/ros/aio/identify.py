@@ -7,6 +7,7 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
+from rmpa.core.aio.descriptors import Use
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.aio.http_client import call_api, connect
 from rmpa.ros.tcpros import encode_header, parse_header, subscriber_header
@@ -39,7 +40,7 @@ async def name_at(api: str, topics: Sequence[str] = ()) -> str | None:
         UnreachableError: Nobody answers there.
     """
     try:
-        reply = await call_api(api, "getName", _CALLER_ID)
+        reply = await call_api(api, "getName", _CALLER_ID, use=Use.CORE)
     except (RosFault, RemoteProtocolError):
         pass
     else:
@@ -58,7 +59,7 @@ async def name_at(api: str, topics: Sequence[str] = ()) -> str | None:
 
 
 async def _publisher_of(api: str, topic: str) -> str | None:
-    reply = await call_api(api, "requestTopic", _CALLER_ID, topic, [["TCPROS"]])
+    reply = await call_api(api, "requestTopic", _CALLER_ID, topic, [["TCPROS"]], use=Use.CORE)
     match reply:
         case (1, _, ["TCPROS", str(host), int(port)]):
             return await _callerid(host, port, topic)
@@ -67,7 +68,7 @@ async def _publisher_of(api: str, topic: str) -> str | None:
 
 async def _callerid(host: str, port: int, topic: str) -> str | None:
     loop = asyncio.get_running_loop()
-    sock = await connect(host, port)
+    sock = await connect(host, port, Use.CORE)
     try:
         await loop.sock_sendall(sock, encode_header(subscriber_header(topic, _CALLER_ID)))
         data = b""

@@ -23,20 +23,23 @@ from typing import TYPE_CHECKING, Any, Final, Self
 from rmpa.core import limits
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros.aio.http_client import call_api
+from rmpa.ros.aio.learn import find_or_learn
 from rmpa.ros.aio.local_addresses import local_addresses
-from rmpa.ros.aio.node_services import Handler, Service, ServiceClient
+from rmpa.ros.aio.node_services import Handler, Service, ServiceClient, probe
 from rmpa.ros.aio.service_client import ServiceConnection
 from rmpa.ros.aio.slave_server import SlaveNode
 from rmpa.ros.aio.topics import Publisher, Received, Subscriber
+from rmpa.ros.definitions import UnknownTypeError
 from rmpa.ros.environment import RosEnvironment, host_of, is_loopback
+from rmpa.ros.find_types import find_message_type, find_service_type
 from rmpa.ros.messages import MessageType
-from rmpa.ros.service_types import ServiceType
 from rmpa.ros.tcpros import ANY, Description
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from types import TracebackType
 
+    from rmpa.ros.service_types import ServiceType
     from rmpa.ros.xmlrpc import Reply, XmlRpcValue
 
 __all__ = ["Node", "Publisher", "Received", "Service", "ServiceClient", "Subscriber"]
@@ -154,7 +157,8 @@ class Node:
 
         Args:
             topic: Resolved in the namespace; ``~name`` is the node's own.
-            kind: The type: its name, one that was learnt, or, for raw bytes only, just a description.
+            kind: The type: its name, which ``rmpa.ros.find_types`` finds here or a publisher tells; one that was
+                found before; or, for raw bytes only, just a description.
             latch: Whether each new subscriber gets the last message.
             queue_messages: Messages that wait for one slow subscriber; the oldest is dropped beyond it.
 
@@ -165,7 +169,7 @@ class Node:
         """
         resolved = self._resolve(topic)
         if isinstance(kind, str):
-            kind = MessageType(kind)
+            kind = await find_or_learn(self.master_uri, self.name, kind, resolved)
         description = kind if isinstance(kind, Description) else kind.describe(latching=latch)
         publisher = Publisher(
             resolved,
@@ -198,7 +202,7 @@ class Node:
 
         Args:
             topic: Resolved in the namespace.
-            kind: The type; ``None`` takes any, and reads its definition from the publisher.
+            kind: The type; ``None`` takes any. The definition is the publisher's where none is found here.
             callback: Called in the loop with each message; what it raises is logged. Without one, use
                 ``async for`` on the result.
             nodelay: Whether to ask publishers for TCP_NODELAY.
@@ -211,15 +215,17 @@ class Node:
             ValueError: The node subscribes to that topic already.
         """
         resolved = self._resolve(topic)
+        type_name = kind if isinstance(kind, str) else ANY
+        if isinstance(kind, str):
+            kind = await self._known_here(kind) if kind != ANY else None
         if resolved in self._subscribers:
             raise ValueError(f"{self.name} subscribes to {resolved} already")
-        if isinstance(kind, str) and kind != ANY:
-            kind = MessageType(kind)
         subscriber = Subscriber(
             resolved,
             self.name,
-            kind if isinstance(kind, MessageType) else None,
+            kind,
             callback,
+            type_name=type_name,
             own_uri=self.uri,
             nodelay=nodelay,
             queue_messages=queue_messages,
@@ -262,7 +268,7 @@ class Node:
             ValueError: The node serves that service already.
         """
         resolved = self._resolve(name)
-        kind = ServiceType(kind) if isinstance(kind, str) else kind
+        kind = await asyncio.to_thread(find_service_type, kind) if isinstance(kind, str) else kind
         service = Service(resolved, self.name, kind, handler, timeout, self._unadvertise_service)
         self._slave.add_service(service.endpoint)
         self._services[resolved] = service
@@ -295,12 +301,21 @@ class Node:
             UnreachableError: No node serves it, or its server does not answer.
             PeerRefused: The server has another version of the type, or another service.
         """
-        kind = ServiceType(kind) if isinstance(kind, str) else kind
-        uri = await self.lookup_service(name)
-        opened = await ServiceConnection.open(
-            uri, self._resolve(name), self.name, md5sum=kind.md5sum, persistent=persistent
-        )
-        return ServiceClient(opened, kind)
+        found = await asyncio.to_thread(find_service_type, kind) if isinstance(kind, str) else kind
+        uri, resolved = await self.lookup_service(name), self._resolve(name)
+
+        async def connect(to: ServiceType) -> ServiceClient:
+            opened = await ServiceConnection.open(uri, resolved, self.name, md5sum=to.md5sum, persistent=persistent)
+            return ServiceClient(opened, to)
+
+        try:
+            return await connect(found)
+        except PeerRefused:
+            # Another version of it may be here, too: that of a workspace, and the one that comes with us.
+            other = await self._version_of(uri, resolved, found) if isinstance(kind, str) else None
+            if other is None:
+                raise
+        return await connect(other)
 
     async def call_service(
         self,
@@ -397,6 +412,28 @@ class Node:
         if not self.environment.host_given and is_loopback(host_of(self.master_uri)):
             host = "127.0.0.1"
         return host, "127.0.0.1" if is_loopback(host) else "0.0.0.0"  # noqa: S104 - as every ROS node does
+
+    async def _known_here(self, name: str) -> MessageType | None:
+        """A message type as it is found here; ``None`` where its publishers may tell it.
+
+        Raises:
+            DefinitionError: It is malformed, or of a package that comes with us, and not in it.
+        """
+        try:
+            return await asyncio.to_thread(find_message_type, name)
+        except UnknownTypeError as error:
+            if not error.learnable:
+                raise
+            return None
+
+    async def _version_of(self, uri: str, service: str, found: ServiceType) -> ServiceType | None:
+        """The version of a service type that its server has, if it is another one and found here."""
+        try:
+            said = (await probe(uri, service, self.name, limits.SERVICE_OPEN_TIMEOUT)).description
+            other = await asyncio.to_thread(find_service_type, found.name, said.md5sum)
+        except RmpaError:
+            return None
+        return other if said.type == found.name and other.md5sum != found.md5sum else None
 
     def _resolve(self, name: str) -> str:
         return self.environment.resolve(name, self.name)

@@ -13,8 +13,9 @@ import random
 from typing import TYPE_CHECKING, TypeAlias
 
 from rmpa.core import limits
+from rmpa.core.aio.descriptors import Use
 from rmpa.core.backoff import Backoff
-from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, UnreachableError
+from rmpa.core.errors import LocalProtocolError, OutOfDescriptors, RemoteProtocolError, UnreachableError
 from rmpa.ros.aio.http_client import call
 from rmpa.ros.aio.identify import name_at
 from rmpa.ros.master.effects import Effect, ParamUpdate, PublisherUpdate, Shutdown
@@ -123,6 +124,11 @@ class Notifier:
         """Send one; whether it need not be sent again."""
         try:
             await self._send(effect)
+        except OutOfDescriptors as error:
+            # Our own fault, told by who counts the descriptors: the node may be well.
+            self._counters.add("notify.failed")
+            _log.debug("! %s", error)
+            return False
         except UnreachableError as error:
             self._counters.add("notify.failed")
             _log.info("! %s", error)
@@ -140,10 +146,10 @@ class Notifier:
         match effect:
             case PublisherUpdate(api, topic, publishers):
                 _log.debug("> %s publisherUpdate %s %s", api, topic, publishers)
-                await call(api, "publisherUpdate", MASTER_ID, topic, list(publishers))
+                await call(api, "publisherUpdate", MASTER_ID, topic, list(publishers), use=Use.CORE)
             case ParamUpdate(api, key, value):
                 _log.debug("> %s paramUpdate %s", api, key)
-                await call(api, "paramUpdate", MASTER_ID, key, value)
+                await call(api, "paramUpdate", MASTER_ID, key, value, use=Use.CORE)
             case Shutdown():
                 await self._shut_down(effect)
 
@@ -157,4 +163,5 @@ class Notifier:
             self._counters.add("notify.stale")
             return
         _log.warning("> %s at %s is asked to end: another node has its name", effect.node, effect.api)
-        await call(effect.api, "shutdown", MASTER_ID, f"[{effect.node}] Reason: new node registered with same name")
+        reason = f"[{effect.node}] Reason: new node registered with same name"
+        await call(effect.api, "shutdown", MASTER_ID, reason, use=Use.CORE)

@@ -10,8 +10,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
 from rmpa.core import limits
+from rmpa.core.aio.descriptors import OUT_OF_DESCRIPTORS
 from rmpa.core.aio.stream import Stream
-from rmpa.core.errors import LocalProtocolError, PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.core.errors import (
+    LocalProtocolError,
+    OutOfDescriptors,
+    PeerRefused,
+    RemoteProtocolError,
+    RmpaError,
+    UnreachableError,
+)
 from rmpa.core.outbox import Outbox
 from rmpa.ros.aio.http_client import connect
 from rmpa.ros.aio.inbound import keep_alive
@@ -126,6 +134,9 @@ class ServiceConnection:
             where = f"{uri} within {timeout:g} s"
             raise UnreachableError(f"server of service {service}", where) from None
         except OSError as error:
+            if error.errno in OUT_OF_DESCRIPTORS:
+                remedy = "`rmpa doctor` says what to do"
+                raise OutOfDescriptors(f"server of service {service}", uri, remedy) from error
             raise UnreachableError(f"server of service {service}", f"{uri} ({error})") from error
         return made
 

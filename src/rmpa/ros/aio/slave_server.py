@@ -16,13 +16,14 @@ from rmpa.ros.tcpros import ANY
 from rmpa.ros.xmlrpc import RosFault
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Awaitable, Callable, Iterable, Sequence
 
     from rmpa.ros.aio.publication import Publication
     from rmpa.ros.aio.service_server import ServiceEndpoint
+    from rmpa.ros.aio.shared_listener import SharedListener
     from rmpa.ros.aio.subscription import PublisherConnection, Subscription
     from rmpa.ros.slave import Connection
-    from rmpa.ros.xmlrpc import XmlRpcValue
+    from rmpa.ros.xmlrpc import Reply, XmlRpcValue
 
 _log = logging.getLogger(__name__)
 
@@ -38,7 +39,7 @@ def _not_followed(_key: str, _value: XmlRpcValue) -> bool:
 class SlaveNode:
     """Serves the topics of one node; registering them at a master is its owner's work.
 
-    Light: two listening sockets and no task, so that an agent can have hundreds of them.
+    Light: no task, and two listening sockets, or none where many nodes share a listener. An agent can have thousands.
 
     Args:
         name: The node's global name.
@@ -46,10 +47,13 @@ class SlaveNode:
         master_uri: What ``getMasterUri`` answers.
         advertised_host: What others are told to connect to, where it differs from ``host``.
         port: Of the XML-RPC server; 0 lets the system choose.
+        listener: Started; accepts for this node in place of sockets of its own, and gives it its address: ``host``,
+            ``advertised_host`` and ``port`` mean nothing then.
         counters: Where refusals are counted.
         on_shutdown: ``(reason)``: the master wants this node to end; its owner closes it.
         on_param_update: ``(key, value) -> whether the node follows that key``.
         on_publisher_update: ``(topic, uris)``, behind the node's own subscriptions.
+        on_kill: ``(caller id, reason) -> reply``: answers ``shutdown`` in place of ``on_shutdown``, when it can.
         taps: Connections to publishers that the owner made by itself, for ``getBusInfo`` and its like.
     """
 
@@ -61,21 +65,25 @@ class SlaveNode:
         *,
         advertised_host: str = "",
         port: int = 0,
+        listener: SharedListener | None = None,
         counters: Counters | None = None,
         on_shutdown: Callable[[str], None] = _ignore,
         on_param_update: Callable[[str, XmlRpcValue], bool] = _not_followed,
         on_publisher_update: Callable[[str, Sequence[str]], None] = _ignore,
+        on_kill: Callable[[str, str], Awaitable[Reply]] | None = None,
         taps: Callable[[], Iterable[PublisherConnection]] = tuple,
     ) -> None:
         self.name = name
         self.counters = counters if counters is not None else Counters()
         self._host = host
+        self._listener = listener
         self._advertised = advertised_host or host
         self._publications: dict[str, Publication] = {}
         self._subscriptions: dict[str, Subscription] = {}
         self._services: dict[str, ServiceEndpoint] = {}
         self._numbers = itertools.count(1)
         self._on_shutdown = on_shutdown
+        self._on_kill = on_kill
         self._on_param_update = on_param_update
         self._on_publisher_update = on_publisher_update
         self._taps = taps
@@ -96,6 +104,12 @@ class SlaveNode:
         Raises:
             StartError: The address cannot be used.
         """
+        if self._listener is not None:
+            self._advertised = self._listener.attach(self.name, self._http.adopt, self._tcpros.adopt)
+            self._http.port, tcpros_port = self._listener.ports
+            self._tcpros.address = (self._advertised, tcpros_port)
+            self._api.uri = f"http://{self._advertised}:{self._http.port}/"
+            return
         await self._http.start()
         try:
             self._tcpros.start(self._host)
@@ -114,13 +128,16 @@ class SlaveNode:
         subscriptions, self._subscriptions = self._subscriptions, {}
         for subscription in subscriptions.values():
             subscription.close()
+        if self._listener is not None and self.uri:
+            self._listener.detach(self._advertised)
+            self._listener = None  # what is closed twice must not free the next node's address
         self._tcpros.close()
         await self._http.close()
         await asyncio.gather(*(endpoint.closed() for endpoint in services))
         for subscription in subscriptions.values():
             await subscription.closed()
         # We and our servers know each other, and wait for the collector; what our owner knows must not.
-        self._on_shutdown, self._on_publisher_update = _ignore, _ignore
+        self._on_shutdown, self._on_publisher_update, self._on_kill = _ignore, _ignore, None
         self._on_param_update, self._taps = _not_followed, tuple
 
     def next_number(self) -> int:
@@ -216,7 +233,17 @@ class SlaveNode:
         _log.info("< %s: asked to shut down: %s", self.name, reason)
         self._on_shutdown(reason)
 
-    def _call(self, method: str, params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
+    def _call(
+        self, method: str, params: tuple[XmlRpcValue, ...], _client: str
+    ) -> XmlRpcValue | Awaitable[XmlRpcValue]:
         if method not in METHODS:
             raise RosFault(-1, f"{self.name} has no method {method}")
-        return list(self._api.dispatch(method, params))
+        reply = self._api.dispatch(method, params)
+        if method == "shutdown" and reply.code == 1 and self._on_kill is not None:
+            caller, reason = [*map(str, params), ""][:2]
+            return self._answer(self._on_kill(caller, reason))
+        return list(reply)
+
+    @staticmethod
+    async def _answer(reply: Awaitable[Reply]) -> XmlRpcValue:
+        return list(await reply)

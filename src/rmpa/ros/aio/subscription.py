@@ -8,15 +8,17 @@ import random
 from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.core import limits
+from rmpa.core.aio.descriptors import is_shortage
 from rmpa.core.aio.stream import Stream
 from rmpa.core.backoff import Backoff
-from rmpa.core.errors import RemoteProtocolError, RmpaError
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
 from rmpa.core.outbox import URGENT, Outbox
 from rmpa.ros.aio.http_client import call_api, connect
 from rmpa.ros.aio.inbound import keep_alive
 from rmpa.ros.slave import INBOUND, TCPROS, Connection
 from rmpa.ros.tcpros import (
     ANY,
+    LENGTH,
     check_publisher,
     encode_header,
     parse_header,
@@ -55,6 +57,9 @@ class PartsTaker(Protocol):
         ...
 
 
+OUT_OF_FILES: Final = "the subscribing side has no file descriptor left for it; `rmpa doctor` there says what to do"
+
+
 class PublisherConnection:
     """Connects to one publisher of one topic, and connects again until it is closed or refused for good.
 
@@ -74,6 +79,8 @@ class PublisherConnection:
         on_refused: ``(text)``: the publisher said no, or has another md5 sum; nothing more will happen.
         on_lost: ``(reason)``: the publisher could not be reached or is gone; it is tried again after a while.
             Half a message is dropped.
+        on_oversized: ``(size)``: a message of that many bytes, more than ``limits.TCPROS_MESSAGE_MAX``, begins to
+            come; it is read and left out, and those behind it come as usual.
         type_name: The type to ask for.
         md5sum: The md5 sum to ask for; with ``*`` whatever comes is taken.
         definition: The definition to send along, if known.
@@ -93,6 +100,7 @@ class PublisherConnection:
         on_header: Callable[[Header], None] = _ignore,
         on_refused: Callable[[str], None] = _ignore,
         on_lost: Callable[[str], None] = _ignore,
+        on_oversized: Callable[[int], None] = _ignore,
         type_name: str = ANY,
         md5sum: str = ANY,
         definition: str = "",
@@ -106,6 +114,10 @@ class PublisherConnection:
         """The publisher's reply header; empty while there is no connection."""
         self.messages = 0
         self.bytes = 0
+        self.oversized = 0
+        """Messages left out because they are too long."""
+        self.malformed = False
+        """Whether the last connection ended because of what the publisher sent."""
         self.number = number
         self.refused: str | None = None
         """Why the publisher does not fit, once it said so."""
@@ -120,6 +132,8 @@ class PublisherConnection:
         self._on_message = on_message
         self._parts = on_parts
         self._left = 0
+        self._skipping = 0
+        self._on_oversized = on_oversized
         self._on_header = on_header
         self._on_refused = on_refused
         self._on_lost = on_lost
@@ -193,7 +207,7 @@ class PublisherConnection:
         except TimeoutError:
             return f"no TCPROS server answers in {limits.TCPROS_CONNECT_TIMEOUT:g} s"
         except (OSError, RmpaError) as error:
-            return str(error)
+            return OUT_OF_FILES if is_shortage(error) else str(error)
         loop = asyncio.get_running_loop()
         self._ended = loop.create_future()
         try:
@@ -207,6 +221,7 @@ class PublisherConnection:
         finally:
             silent.cancel()
             self._drop()
+        self.malformed = isinstance(ended, RemoteProtocolError)
         return str(ended) if ended is not None else "the publisher closed the connection"
 
     async def _request_topic(self) -> tuple[str, int]:
@@ -232,17 +247,15 @@ class PublisherConnection:
 
     def _take(self, data: memoryview) -> tuple[int, int]:
         start = 0
-        if self._left and self._parts is not None:
-            start = self._take_part(self._parts, data)
-            if self._left:
-                return start, 0
-        if not self.fields:
-            fields, start, wanted = parse_header(data)
-            if fields is None:
-                return 0, wanted
-            if not self._believe(fields):
-                return len(data), 0
-        messages, consumed, wanted = split_messages(data[start:])
+        if self._skipping or self._left or not self.fields:
+            start, wanted = self._go_on(data)
+            if wanted >= 0:
+                return start, wanted
+        try:
+            messages, consumed, wanted = split_messages(data[start:])
+        except LimitExceeded as error:
+            self._leave_out(error.claimed)
+            return self._take_behind(data, start)
         for message in messages:
             if self._closed:
                 break
@@ -256,7 +269,49 @@ class PublisherConnection:
             if self._left:  # it may have closed us
                 self._take_part(self._parts, data[start:])
             return len(data), 0
+        if wanted == LENGTH.size and len(data) - start >= LENGTH.size:
+            return self._take_behind(data, start)  # a message that is too long
         return start, wanted
+
+    def _go_on(self, data: memoryview) -> tuple[int, int]:
+        """Take what comes before further messages: the rest of one, or the header.
+
+        Returns:
+            What was taken, and what ``_take`` is to return for wanted; less than 0: messages may follow.
+        """
+        start = 0
+        if self._skipping:
+            start = self._skip(data)
+        elif self._left and self._parts is not None:
+            start = self._take_part(self._parts, data)
+        if self._skipping or self._left or self._closed:
+            return start, 0
+        if not self.fields:
+            fields, start, wanted = parse_header(data)
+            if fields is None:
+                return 0, wanted
+            if not self._believe(fields):
+                return len(data), 0
+        return start, -1
+
+    def _take_behind(self, data: memoryview, start: int) -> tuple[int, int]:
+        if self._closed:
+            return len(data), 0
+        consumed, wanted = self._take(data[start:])
+        return start + consumed, wanted
+
+    def _leave_out(self, size: int) -> None:
+        """A message that is too long begins: its bytes are read, and not kept."""
+        self._skipping = LENGTH.size + size
+        self.oversized += 1
+        self._on_oversized(size)
+
+    def _skip(self, data: memoryview) -> int:
+        """Leave out what has come of such a message; return how many bytes that were."""
+        count = min(self._skipping, len(data))
+        self._skipping -= count
+        self.bytes += count
+        return count
 
     def _take_part(self, parts: PartsTaker, data: memoryview) -> int:
         """Hand on what has come of a large message; return how many bytes that were."""
@@ -291,6 +346,7 @@ class PublisherConnection:
 
     def _drop(self) -> None:
         self.fields = {}
+        self._skipping = 0
         if self._left and self._parts is not None:
             self._left = 0
             self._parts.abort()
@@ -395,6 +451,7 @@ class Subscription:
             self._caller_id,
             on_message=lambda framed: self._on_message(link, framed),
             on_refused=lambda text: self._on_refused(link, text),
+            on_oversized=lambda size: self._oversized(link, size),
             type_name=self.type_name,
             md5sum=self._md5sum,
             definition=self._definition,
@@ -403,6 +460,17 @@ class Subscription:
         )
         self._links[uri] = link
         link.start()
+
+    def _oversized(self, link: PublisherConnection, size: int) -> None:
+        if link.oversized == 1:
+            limit = limits.TCPROS_MESSAGE_MAX
+            _log.warning(
+                "! %s: a message of %d bytes of %s is left out: more than %d; others come as usual",
+                self.topic,
+                size,
+                link.uri,
+                limit,
+            )
 
     def _leave(self, uri: str) -> None:
         link = self._links.pop(uri)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-import errno
 import itertools
 import logging
 import socket
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from rmpa.core import limits
+from rmpa.core.aio.acceptor import Acceptor
 from rmpa.core.aio.clock import SystemClock
+from rmpa.core.aio.descriptors import DESCRIPTORS, Use, is_shortage
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import StartError
+from rmpa.core.open_files import remedy
 from rmpa.ros.aio.inbound import Inbound
 from rmpa.ros.tcpros import check_request, printable
 
@@ -25,7 +27,6 @@ if TYPE_CHECKING:
     from rmpa.ros.tcpros import Header
 
 _log = logging.getLogger(__name__)
-_OUT_OF_FILES: Final = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
 class TcprosServer:
@@ -56,12 +57,10 @@ class TcprosServer:
         self._refusals = RefusalLog(_log, counters if counters is not None else Counters())
         self._numbers = numbers if numbers is not None else itertools.count(1)
         self._clock = clock if clock is not None else SystemClock()
-        self._socket: socket.socket | None = None
-        self._listening = False
+        self._acceptor: Acceptor | None = None
         self._waiting: dict[Inbound, asyncio.TimerHandle] = {}
         self._accepted: set[Inbound] = set()
         self._forget_at = 16
-        self._resume: asyncio.TimerHandle | None = None
         self.address: tuple[str, int] = ("", 0)
         """Where the socket listens."""
 
@@ -72,64 +71,41 @@ class TcprosServer:
             StartError: The address cannot be used.
         """
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        sock = socket.socket(family, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
+        where = f"TCPROS server of {self._name} at {host}:{port}"
+        try:
+            sock = DESCRIPTORS.open_socket(Use.DATA, family, what=f"TCPROS server of {self._name}")
+        except OSError as error:
+            if is_shortage(error):
+                raise StartError(where, "no file descriptors left", remedy()) from error
+            raise StartError(where, str(error)) from error
         try:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             sock.bind((host, port))
             sock.listen(limits.TCPROS_BACKLOG)
         except OSError as error:
             sock.close()
-            raise StartError(f"TCPROS server of {self._name} at {host}:{port}", str(error)) from error
-        self._socket = sock
+            raise StartError(where, str(error)) from error
         self.address = sock.getsockname()[:2]
-        self._listen()
+        self._acceptor = Acceptor(sock, self.adopt, name=f"TCPROS server of {self._name}")
+        self._acceptor.start()
 
     def close(self) -> None:
         """Stop listening, and close what has not reached a publication; the rest is the publications' own."""
-        self._pause()
-        if self._resume is not None:
-            self._resume.cancel()
-            self._resume = None
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
+        if self._acceptor is not None:
+            self._acceptor.close()
+            self._acceptor = None
         waiting, self._waiting = self._waiting, {}
         for link, timer in waiting.items():
             timer.cancel()
             link.close()
         self._accepted.clear()  # they know us: a cycle otherwise, with all that the publications know
 
-    def _listen(self) -> None:
-        self._resume = None
-        if self._socket is not None and not self._listening:
-            asyncio.get_running_loop().add_reader(self._socket.fileno(), self._acceptable)
-            self._listening = True
+    def adopt(self, sock: socket.socket, _client: tuple[str, int]) -> None:
+        """Serve a connection that was accepted, by this server's own socket or by one that several nodes share.
 
-    def _pause(self) -> None:
-        if self._socket is not None and self._listening:
-            asyncio.get_running_loop().remove_reader(self._socket.fileno())
-            self._listening = False
-
-    def _acceptable(self) -> None:
-        for _ in range(limits.TCPROS_BACKLOG):
-            if self._socket is None:
-                return
-            try:
-                sock, _address = self._socket.accept()
-            except (BlockingIOError, InterruptedError):
-                return
-            except OSError as error:
-                if error.errno in _OUT_OF_FILES:
-                    self._refuse("accept", "", f"cannot accept connections for a moment: {error}")
-                    self._pause()
-                    loop = asyncio.get_running_loop()
-                    self._resume = loop.call_later(limits.TCPROS_ACCEPT_PAUSE, self._listen)
-                    return
-                continue  # that one left before it was accepted
-            self._take(sock)
-
-    def _take(self, sock: socket.socket) -> None:
-        sock.setblocking(False)
+        Args:
+            sock: Non-blocking; owned from here on.
+        """
         try:
             link = Inbound(sock, next(self._numbers), on_header=self._header, on_end=self._ended)
         except OSError:  # it is gone already

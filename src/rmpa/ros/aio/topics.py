@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Any
 from rmpa.core import limits
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import LocalProtocolError
+from rmpa.ros.aio.header_types import type_of_header
 from rmpa.ros.aio.publication import Publication
 from rmpa.ros.aio.subscription import Subscription
-from rmpa.ros.messages import MessageType
 from rmpa.ros.tcpros import ANY, LENGTH, frame_message, printable
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 
     from rmpa.ros.aio.subscription import PublisherConnection
-    from rmpa.ros.messages import Plain
+    from rmpa.ros.messages import MessageType, Plain
     from rmpa.ros.tcpros import Buffer, Description
 
 _log = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ class Received:
         Raises:
             DefinitionError: The publisher's definition cannot be used.
         """
-        return self._kind if self._kind is not None else MessageType.from_header(self.header)
+        return self._kind if self._kind is not None else type_of_header(self.header)
 
     @cached_property
     def message(self) -> Any:
@@ -162,6 +162,7 @@ class Subscriber:
         kind: MessageType | None,
         callback: Callable[[Received], None] | None,
         *,
+        type_name: str = ANY,
         own_uri: str,
         nodelay: bool,
         queue_messages: int,
@@ -170,7 +171,7 @@ class Subscriber:
     ) -> None:
         self.topic = topic
         self.kind = kind
-        self.type_name = kind.name if kind is not None else ANY
+        self.type_name = kind.name if kind is not None else type_name
         self.dropped = 0
         """Messages that the ``async for`` was too slow for."""
         self.refusals: dict[str, str] = {}

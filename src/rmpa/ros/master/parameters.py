@@ -70,6 +70,11 @@ class Parameters:
     def __init__(self) -> None:
         self._tree: Tree = {}
 
+    @property
+    def tree(self) -> Tree:
+        """The whole of it, not to be changed; the same object, and parts of it, until something in them changes."""
+        return self._tree
+
     def get(self, key: str) -> XmlRpcValue:
         """The value or the namespace at ``key``; ``/`` is the whole tree. Not to be changed.
 

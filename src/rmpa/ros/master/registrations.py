@@ -1,14 +1,19 @@
 """Who publishes, subscribes and serves what: the master's tables, in the order that rosmaster keeps.
 
-Semantics are those of ros_comm's rosmaster 1.15, its order of lists included, because tools print them.
+Semantics are those of ros_comm's rosmaster 1.15, its order of lists included, because tools print them. Beside the
+tables stand the nodes of the run before (``awaited``): no question shows them until they have answered themselves.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
+from rmpa.ros.master.awaited import Awaited, NodeRecord
 from rmpa.ros.master.effects import Effect, GraphChange, GraphState, Kind, PublisherUpdate, Shutdown
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 ANY_TYPE: Final = "*"
 _NOBODY: Final[dict[str, str]] = {}
@@ -44,6 +49,11 @@ class Registrations:
         # The URI that each node's name was last taken from, while the name is in use.
         self._evicted: dict[str, str] = {}
         self._state: GraphState | None = None
+        self.awaited = Awaited()
+        self._taken_up: set[str] = set()
+        self._count = 0
+        self.marks: dict[str, int] = {}
+        """Of each node that is registered or awaited: a number that is another one after each change of it."""
         self.effects: list[Effect] = []
         self.changes: list[GraphChange] = []
 
@@ -155,13 +165,14 @@ class Registrations:
         Returns:
             Whether it was there.
         """
+        withdrawn = self._withdraw(kind, key, node, api)
         found = self._tables[kind].get(key, {}).get(node) == api
         if found:
             self._remove(kind, key, node, api)
-            if kind is Kind.PUBLISHER:
-                self._tell_subscribers(key)
+        if kind is Kind.PUBLISHER and (found or withdrawn):
+            self._tell_subscribers(key)
         self._forget_if_empty(node)
-        return found
+        return found or withdrawn
 
     def unregister_service(self, service: str, uri: str, node: str) -> bool:
         """Take a service away, if its provider still is this node with this ``rosrpc://`` URI.
@@ -173,6 +184,9 @@ class Registrations:
         found = api is not None and self._service_uris.get(service) == uri
         if api is not None and found:
             self._remove(Kind.SERVICE, service, node, api)
+        record = self.awaited.get(node)
+        if record is not None and record.services.get(service) == uri:
+            found = self._withdraw(Kind.SERVICE, service, node, record.api)
         self._forget_if_empty(node)
         return found
 
@@ -189,19 +203,114 @@ class Registrations:
         self._empty(node)
         self._nodes.pop(node, None)
         self._evicted.pop(node, None)
+        self._touch(node)
         for topic in topics:
             self._tell_subscribers(topic)
         return True
+
+    # --- nodes of the run before ------------------------------------------------------------------------------
+
+    def record(self, node: str) -> NodeRecord | None:
+        """Everything that a node has registered, and what an awaited one had."""
+        found, awaited = self._nodes.get(node), self.awaited.get(node)
+        if found is None:
+            return awaited
+        types = self._types
+        record = NodeRecord(
+            found.api,
+            {topic: types.get(topic, ANY_TYPE) for topic in found.keys[Kind.PUBLISHER]},
+            {topic: types.get(topic, ANY_TYPE) for topic in found.keys[Kind.SUBSCRIBER]},
+            {name: uri for name in found.keys[Kind.SERVICE] if (uri := self._services.get(name, {}).get(node))},
+            dict(found.keys[Kind.PARAM]),
+        )
+        if awaited is not None:
+            for kind in Kind:
+                record.of(kind).update(awaited.of(kind))  # type: ignore[arg-type] # both of one kind
+        return record
+
+    def await_node(self, node: str, record: NodeRecord) -> None:
+        """Remember a node of the run before; nothing shows it. Its topics have their types again."""
+        self.awaited.add(node, record)
+        for topic, topic_type in [*record.publishers.items(), *record.subscribers.items()]:
+            self._types.setdefault(topic, topic_type)
+        self._state = None
+        self._touch(node)
+
+    def take_up(self, node: str) -> tuple[list[str], list[str]]:
+        """Show an awaited node, which has answered. What others registered meanwhile stays theirs.
+
+        Returns:
+            The topics that it publishes and those that it subscribes to: ``announce`` and ``tell`` them.
+        """
+        record = self.awaited.pop(node)
+        if record is None:
+            return [], []
+        self._taken_up.add(node)
+        for topic in record.publishers:
+            self._register(Kind.PUBLISHER, topic, node, record.api)
+        for topic in record.subscribers:
+            self._register(Kind.SUBSCRIBER, topic, node, record.api)
+        for service, uri in record.services.items():
+            if service not in self._service_uris:
+                self.register_service(service, uri, node, record.api)
+        for key in record.params:
+            self._register(Kind.PARAM, key, node, record.api)
+        self._touch(node)
+        return list(record.publishers), list(record.subscribers)
+
+    def tell(self, topic: str, node: str) -> None:
+        """Tell one subscriber who publishes a topic."""
+        api = self.at(Kind.SUBSCRIBER, topic).get(node)
+        if api is not None:
+            publishers = self._publishers(topic, awaited=node in self._taken_up)
+            self.effects.append(PublisherUpdate(api, topic, publishers))
+
+    def give_up(self, node: str) -> None:
+        """Forget an awaited node, and tell those that may be connected to it."""
+        record = self.awaited.pop(node)
+        if record is not None:
+            self._touch(node)
+            for topic in record.publishers:
+                self._tell_subscribers(topic, self._taken_up.__contains__)
+
+    def announce(self, topic: str) -> None:
+        """Tell the subscribers of a topic that do not know those of its publishers that were taken up."""
+        self._tell_subscribers(topic, lambda node: node not in self._taken_up)
+
+    def _withdraw(self, kind: Kind, key: str, node: str, api: str) -> bool:
+        """Take a registration of an awaited node away; whether it was there."""
+        if not self.awaited.withdraw(kind, key, node, api):
+            return False
+        record = self.awaited.get(node)
+        if record is not None and not any(record.of(kind) for kind in Kind):
+            self.awaited.pop(node)
+        self._touch(node)
+        return True
+
+    def _touch(self, node: str) -> None:
+        """What is to be kept of a node has changed."""
+        if node in self._nodes or self.awaited.get(node) is not None:
+            self._count += 1
+            self.marks[node] = self._count
+        else:
+            self.marks.pop(node, None)
+            self._taken_up.discard(node)
 
     # --- the tables -------------------------------------------------------------------------------------------
 
     def _seat(self, node: str, api: str) -> _Node:
         """The node's record; a node of the same name at another URI is pushed out with all it had."""
+        awaited = self.awaited.get(node)
+        if awaited is not None and awaited.api != api:
+            self.effects.append(Shutdown(awaited.api, node, tuple(awaited.publishers)))
+            self._evicted[node] = awaited.api
+            self.give_up(node)
         found = self._nodes.get(node)
         if found is not None and found.api != api:
             self.effects.append(Shutdown(found.api, node, tuple(found.keys[Kind.PUBLISHER])))
             self._empty(node)
             self._evicted[node] = found.api
+            self._taken_up.discard(node)
             found = None
             # Its place in the order of nodes stays, as rosmaster has it.
         if found is None:
@@ -209,7 +318,10 @@ class Registrations:
         return found
 
     def _register(self, kind: Kind, key: str, node: str, api: str, *, retyped: bool = False) -> None:
-        self._seat(node, api).keys[kind][key] = None
+        keys = self._seat(node, api).keys[kind]
+        if retyped or key not in keys:
+            keys[key] = None
+            self._touch(node)
         providers = self.at(kind, key)
         new = node not in providers
         if providers.get(node) != api:
@@ -228,6 +340,7 @@ class Registrations:
                 del self._service_uris[key]
                 del self._services[key]
         self._nodes[node].keys[kind].pop(key, None)
+        self._touch(node)
         self._changed(kind, key, node, api, added=False)
 
     def _empty(self, node: str) -> None:
@@ -243,6 +356,7 @@ class Registrations:
             del self._nodes[node]
             self._evicted.pop(node, None)
             self._state = None
+            self._touch(node)
 
     def _changed(self, kind: Kind, key: str, node: str, api: str, *, added: bool) -> None:
         self._state = None
@@ -250,8 +364,23 @@ class Registrations:
             topic_type = "" if kind is Kind.SERVICE else self._types.get(key, "")
             self.changes.append(GraphChange(kind, added, key, node, api, topic_type))
 
-    def _tell_subscribers(self, topic: str) -> None:
-        publishers = tuple(self.apis(Kind.PUBLISHER, topic))
-        # Nodelets of one process share an API: it is told once.
-        for api in dict.fromkeys(self.apis(Kind.SUBSCRIBER, topic)):
-            self.effects.append(PublisherUpdate(api, topic, publishers))
+    def _publishers(self, topic: str, *, awaited: bool) -> tuple[str, ...]:
+        """The slave APIs of a topic's publishers, with or without those of the run before."""
+        apis = self.apis(Kind.PUBLISHER, topic)
+        more = self.awaited.publishers(topic) if awaited else ()
+        return tuple(dict.fromkeys([*apis, *more])) if more else tuple(apis)
+
+    def _tell_subscribers(self, topic: str, which: Callable[[str], bool] | None = None) -> None:
+        """Tell the subscribers of a topic who publishes it, or only those nodes for which ``which`` says so.
+
+        Who was taken up is connected to publishers that have not answered yet, and would hang up on them.
+        """
+        known = self._publishers(topic, awaited=False)
+        old = self._publishers(topic, awaited=True)
+        told: dict[str, tuple[str, ...]] = {}
+        for node, api in self.at(Kind.SUBSCRIBER, topic).items():
+            if api not in told and (
+                which is None or which(node)
+            ):  # nodelets of one process share an API: it is told once
+                told[api] = old if node in self._taken_up else known
+        self.effects += [PublisherUpdate(api, topic, publishers) for api, publishers in told.items()]

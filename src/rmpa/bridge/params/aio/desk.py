@@ -34,10 +34,12 @@ class ParamDesk:
         core: The local core.
         policy: What peers may do.
         asks: Gets the handlers.
+        most: How many parameters one peer may follow.
     """
 
-    def __init__(self, core: ParamCore, policy: ParamPolicy, asks: Asks) -> None:
+    def __init__(self, core: ParamCore, policy: ParamPolicy, asks: Asks, most: int = limits.FOLLOWED_MAX) -> None:
         self._core = core
+        self.most = most
         self.policy = policy
         self._asks = asks
         self._transfers: dict[int, transfer.Transfers] = defaultdict(transfer.Transfers)
@@ -147,14 +149,16 @@ class ParamDesk:
     async def _follow(self, attached: Attached, args: dict[str, Any]) -> dict[str, object]:
         """From now on a peer follows these keys, and none of those that it did before."""
         keys = args.get("keys")
-        if not isinstance(keys, list) or len(keys) > limits.FOLLOWERS_KEYS_MAX:
-            raise RmpaError(f"keys is not a list of at most {limits.FOLLOWERS_KEYS_MAX} parameters")
+        if not isinstance(keys, list) or len(keys) > limits.FOLLOW_RULES_MAX:
+            raise RmpaError(f"keys is not a list of at most {limits.FOLLOW_RULES_MAX} parameters")
         refused: dict[str, str] = {}
         wanted: set[str] = set()
         for given in keys:
             problem = key_problem(given)
             key = str(given).rstrip("/") or "/"
             why = problem or self.policy.why_not_follow(key)
+            if not why and key not in wanted and len(wanted) >= self.most:
+                why = f"more parameters than limits.params = {self.most} over there; raise it, or follow a namespace"
             if why:
                 refused[str(given)[: limits.CROSSING_NAME_MAX]] = why
             else:

@@ -35,11 +35,19 @@ class Params(Part):
         bridge: Its node is told of changes, its asks carry the questions; add this part to it.
         params: What peers may do, and what is followed.
         time: Whether time is shared, and whose is followed.
+        most: How many parameters one peer may follow here.
     """
 
-    def __init__(self, core: Core, bridge: Bridge, params: ParamSettings, time: TimeSettings) -> None:
+    def __init__(
+        self,
+        core: Core,
+        bridge: Bridge,
+        params: ParamSettings,
+        time: TimeSettings,
+        most: int = limits.FOLLOWED_MAX,
+    ) -> None:
         self._core = ParamCore(core, bridge.node)
-        self._desk = ParamDesk(self._core, ParamPolicy(params, time), bridge.asks)
+        self._desk = ParamDesk(self._core, ParamPolicy(params, time), bridge.asks, most)
         self._follower = ParamFollower(
             self._core, bridge.asks, bridge.attached, follow_rules(params, time), bridge.counters
         )
@@ -60,6 +68,7 @@ class Params(Part):
         """Other rules hold from now on; what they do not concern goes on untouched."""
         params, time = settings.params, settings.time
         self._desk.policy = ParamPolicy(params, time)
+        self._desk.most = settings.limits.params
         self._desk.judge_again()
         self._follower.change(follow_rules(params, time))
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import deque
+from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
@@ -28,6 +28,7 @@ from rmpa.bridge.messages import (
     encode,
 )
 from rmpa.bridge.naming import Names
+from rmpa.bridge.pacing import Pacing
 from rmpa.bridge.policy import Policy, is_own
 from rmpa.bridge.services.aio.calls import Budgets, Caller, CallStats
 from rmpa.bridge.services.aio.serving import Serving
@@ -45,6 +46,7 @@ from rmpa.bridge.services.imports import (
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.core import limits
 from rmpa.core.aio.loop import breathe, breathing
+from rmpa.core.config import LimitSettings
 from rmpa.core.counters import RefusalLog
 from rmpa.ros.aio.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.master.effects import GraphChange, Kind
@@ -103,16 +105,18 @@ class Services(Part):
         core: The local core.
         bridge: Whose part this is.
         rules: What may cross, under which names, and for how long.
+        most: How much of one peer is taken, and how much is offered.
     """
 
-    def __init__(self, core: Core, bridge: Bridge, rules: ServiceRules) -> None:
+    def __init__(self, core: Core, bridge: Bridge, rules: ServiceRules, most: LimitSettings | None = None) -> None:
+        self._most = most if most is not None else LimitSettings()
         self._core = core
         self._bridge = bridge
         self.rules = rules
         """What may cross, for the monitor too."""
-        self.exports = ServiceExports(rules)
+        self.exports = ServiceExports(rules, self._most)
         """The outbound plan, for the monitor."""
-        self.imports = ServiceImports(rules)
+        self.imports = ServiceImports(rules, self._most)
         """The inbound plan, for the monitor."""
         self._refusals = RefusalLog(_log, bridge.counters)
         self._attached: dict[int, Attached] = {}
@@ -121,8 +125,9 @@ class Services(Part):
         self._callers: dict[tuple[int, int], Shown] = {}
         self._serving = Serving(core, self.exports, self._attached, self._budgets, self._act)
         self._grace: dict[int, asyncio.TimerHandle] = {}
-        self._changed: dict[str, None] = {}
+        self._changed: OrderedDict[str, None] = OrderedDict()
         self._rejudging: Iterator[list[ExportAction] | list[ImportAction]] | None = None
+        self._pacing = Pacing()
         self._lessons: deque[tuple[int, AdvertiseServices]] = deque()
         self._actions: deque[ExportAction | ImportAction] = deque()
         self._acting = False
@@ -147,12 +152,13 @@ class Services(Part):
     def reload(self, settings: Settings) -> None:
         """Other settings hold from now on."""
         policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.peers)
+        self._most = settings.limits
         self.obey(ServiceRules(settings.services, policy, names))
 
     def obey(self, rules: ServiceRules) -> None:
         """Other rules hold from now on; what they do not touch goes on."""
         self.rules = rules
-        self._rejudging = chain(self.exports.obey(rules), self.imports.obey(rules))
+        self._rejudging = chain(self.exports.obey(rules, self._most), self.imports.obey(rules, self._most))
         for shown in breathing(list(self._shown.values()), every=16):
             timeout, endpoint = rules.timeout(shown.service), shown.endpoint
             if endpoint is not None and endpoint.timeout != timeout:
@@ -212,6 +218,7 @@ class Services(Part):
         self._act(self.imports.unlinked(attached.peer))
         self._attached.pop(attached.peer, None)
         self._budgets.pop(attached.peer, None)
+        self._pacing.forget(attached.peer)
 
     def _stay_away(self, peer: int) -> None:
         if (grace := self._grace.pop(peer, None)) is not None:
@@ -280,17 +287,29 @@ class Services(Part):
         self._rescan = None
         services = self._core.state().services
         for _ in range(min(len(self._changed), limits.RESCANNED_AT_ONCE)):
-            service = next(iter(self._changed))
-            del self._changed[service]
+            service, _ = self._changed.popitem(last=False)
             breathe()
             self._look_at(service, services.get(service, {}))
-        self._act(self.exports.tell())
+        told = self.exports.tell(self._may_tell)
+        self._act(told)
         if self._lessons:
             self._learn()
         if self._rejudging is not None:
             self._rejudge(self._rejudging)
-        if self._changed or self._lessons or self._rejudging is not None or self.exports.untold:
+        if self._changed or self._lessons or self._rejudging is not None or (told and self.exports.untold):
             self._schedule()
+        elif self.exports.untold:
+            self._scan_later()
+
+    def _scan_later(self) -> None:
+        """Peers have to be told more, but what they were told is still on its way."""
+        if self._rescan is None and not self._closed:
+            self._rescan = self._loop.call_later(limits.TELL_PAUSE, self._scan)
+
+    def _may_tell(self, peer: int) -> bool:
+        attached = self._attached.get(peer)
+        busy = attached is not None and attached.link.busy
+        return self._pacing.ready(peer, self._loop.time(), busy=busy)
 
     def _rejudge(self, rest: Iterator[list[ExportAction] | list[ImportAction]]) -> None:
         """Judge a portion by rules that have changed."""
@@ -307,7 +326,13 @@ class Services(Part):
         local = next((LocalService(node, uri) for node, uri in providers.items() if not is_own(node)), None)
         # That it is taken is known before it is told on: nobody may be shown two of a name.
         self._act(self.imports.local(service, local.node if local is not None else None))
-        self._act(self.exports.graph(service, local or self._to_relay(service, providers)))
+        offered = local if local is not None and not self._withdrawn(service, local.node) else None
+        self._act(self.exports.graph(service, offered or self._to_relay(service, providers)))
+
+    def _withdrawn(self, service: str, node: str) -> bool:
+        """Whether nothing can connect to a server; one that a peer has open answers, whatever the core found."""
+        found = self._core.unreachable().get(node)
+        return found is not None and found.withdrawn and not self.exports.callers(service)
 
     def _to_relay(self, service: str, providers: Mapping[str, str]) -> LocalService | None:
         """What of a service is passed on for another module."""

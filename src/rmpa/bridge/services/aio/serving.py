@@ -175,7 +175,11 @@ class Serving:
 def _listening() -> tuple[set[int] | None, frozenset[str], float]:
     """Ports that somebody listens at, this machine's addresses, and the processor's seconds; for a thread."""
     began = time.thread_time()
-    return listening_ports(), frozenset(local_addresses()), time.thread_time() - began
+    try:
+        ports, here = listening_ports(), frozenset(local_addresses())
+    except OSError:  # no file descriptor is left to ask the kernel: nothing is known this time
+        ports, here = None, frozenset()
+    return ports, here, time.thread_time() - began
 
 
 def _is_deaf(server: LocalService, ports: set[int] | None, here: Collection[str]) -> bool:

@@ -1,0 +1,85 @@
+"""A connected TCP socket that sends in small segments, whatever the kernel believes of the path."""
+
+from __future__ import annotations
+
+import socket
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+Buffer = bytes | bytearray | memoryview
+
+
+class SegmentedSocket:
+    """Cuts what is sent into pieces that the kernel neither joins nor sends as one large packet (MSG_EOR).
+
+    TCP_MAXSEG cannot do this: it has no effect on a connected socket, and where the interface is to segment by itself
+    (a virtual network never does) several segments still leave the machine as one packet. It costs a system call for
+    each segment, so it is for connections that need it.
+
+    Args:
+        sock: Connected, non-blocking.
+        size: Bytes in one segment.
+    """
+
+    def __init__(self, sock: socket.socket, size: int) -> None:
+        self._sock = sock
+        self.size = size
+        self._begun = 0
+        """Bytes of a piece that the socket took in part: the kernel appends to it what comes next."""
+
+    def sendmsg(self, parts: Sequence[Buffer]) -> int:
+        """Send as much as the socket takes now; return how many bytes that were.
+
+        Raises:
+            BlockingIOError: It takes nothing.
+            OSError: The connection is gone.
+        """
+        sent = 0
+        for piece, size in self._pieces(parts):
+            try:
+                took = self._sock.sendmsg(piece, (), socket.MSG_EOR)
+            except OSError:
+                if sent:
+                    return sent  # an error comes again with the next call
+                raise
+            sent += took
+            if took < size:
+                self._begun += took
+                return sent
+            self._begun = 0
+        return sent
+
+    def _pieces(self, parts: Sequence[Buffer]) -> Iterator[tuple[list[Buffer], int]]:
+        """The bytes in pieces, as lists of views; the first one completes what was taken in part before."""
+        if self._begun >= self.size:  # the size has shrunk below what was taken: no more is joined to that packet
+            self._begun = 0
+        room = self.size - self._begun
+        piece: list[Buffer] = []
+        filled = 0
+        for part in parts:
+            view = memoryview(part)
+            start = 0
+            while start < len(view):
+                cut = view[start : start + room - filled]
+                piece.append(cut)
+                filled += len(cut)
+                start += len(cut)
+                if filled == room:
+                    yield piece, filled
+                    piece, filled, room = [], 0, self.size
+        if piece:
+            yield piece, filled
+
+    def recv_into(self, buffer: memoryview) -> int:
+        """As a socket's."""
+        return self._sock.recv_into(buffer)
+
+    def shutdown(self, how: int) -> None:
+        """As a socket's."""
+        self._sock.shutdown(how)
+
+    def close(self) -> None:
+        """As a socket's."""
+        self._sock.close()

@@ -1,0 +1,258 @@
+"""Finds path-MTU black holes: paths that drop large packets without a word (RFC 2923), and remembers them.
+
+Where a tunnel or a firewall drops what is too large for it, and the ICMP message that should say so is lost, a TCP
+connection stands still with its first large segment, while small ones still go through. Linux's own remedy
+(``net.ipv4.tcp_mtu_probing``, RFC 4821) is off by default, and no socket can switch it on for itself. So both lanes
+of a link are watched. Data that stands still while the other lane carries a small packet there and back is the
+evidence; from then on messages to that address go in smaller segments.
+
+Pure: samples of TCP_INFO and ``now`` in, judgements out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Final
+
+from rmpa.core import limits
+
+_REMEDY: Final = (
+    "give the interface or tunnel on the way its true MTU (`ip link set dev NAME mtu N`), or let ICMP 'fragmentation "
+    "needed' through"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class TcpSample:
+    """What the kernel tells of one connection, from ``TCP_INFO`` and ``SIOCOUTQ``.
+
+    Args:
+        queued: Bytes sent and not acknowledged, those that have not left yet included.
+        retransmits: Time-outs of the oldest segment in a row.
+        acked: Bytes acknowledged since the connection began.
+        delivered: Segments that arrived since then.
+        rtt: Round trip as the kernel knows it, seconds.
+    """
+
+    queued: int
+    retransmits: int
+    acked: int
+    delivered: int
+    rtt: float
+
+
+class Progress(Enum):
+    """How a connection's data gets on."""
+
+    FLOWING = auto()
+    """Nothing waits, or what waits is being acknowledged."""
+    WAITING = auto()
+    """Something was repeated and has not been acknowledged yet: worth another look soon."""
+    STALLED = auto()
+    """Large segments are repeated in vain; a small packet by another way tells whether it is their size."""
+    BLACK_HOLE = auto()
+    """A small packet went there and back, and what was repeated behind it was lost all the same."""
+
+
+class StallWatch:
+    """Judges one connection by the samples of it.
+
+    Args:
+        segment: Bytes that a segment has at the most, or ``None`` for as many as the kernel likes.
+        now: Monotonic seconds.
+        before: The watch of the same connection until now, when its segments had another size.
+    """
+
+    def __init__(self, segment: int | None, now: float, before: StallWatch | None = None) -> None:
+        self.segment = segment
+        self._least = smaller(segment) or segment or 0
+        """Bytes of a segment that would pass where these do not; of the smallest ones their own."""
+        self._since = now
+        self._acked, self._delivered = before.counted if before is not None else (0, 0)
+        self._begun = self._acked
+        self._passed = False
+        self._retransmits = 0
+        self._proof: int | None = None
+        """Of the stall: time-outs when a small packet had been answered."""
+        self._repeated: float | None = None
+        """When something had been repeated behind that."""
+
+    @property
+    def counted(self) -> tuple[int, int]:
+        """Bytes acknowledged, and segments that arrived, since the connection began."""
+        return self._acked, self._delivered
+
+    @property
+    def acked(self) -> int:
+        """Bytes acknowledged so far, with segments of this size."""
+        return self._acked - self._begun
+
+    @property
+    def waiting(self) -> bool:
+        """Whether something was repeated, and has not been acknowledged."""
+        return self._retransmits > 0
+
+    def idle(self, now: float) -> None:
+        """Nothing waits."""
+        self._since = now
+        self._retransmits = 0
+        self._proof = self._repeated = None
+
+    def look(self, sample: TcpSample, now: float) -> Progress:
+        """Take the next sample.
+
+        Where segments above the size that would come next have passed once, it is not the path's MTU that holds up
+        the rest. Such a connection ends by its time-out, and the next one is judged anew.
+
+        A cable that is in again lets a small packet pass before TCP repeats the large ones, ever more rarely. So only
+        what was repeated behind the small packet's answer counts.
+        """
+        acked, delivered = sample.acked - self._acked, sample.delivered - self._delivered
+        self._acked, self._delivered = sample.acked, sample.delivered
+        if acked > 0 or not sample.queued:
+            self._passed = self._passed or acked > self._least * max(delivered, 1)
+            self.idle(now)
+            return Progress.FLOWING
+        self._retransmits = sample.retransmits
+        if not sample.retransmits:
+            return Progress.FLOWING
+        if self._passed or sample.queued < self._least:
+            return Progress.WAITING
+        if self._proof is None:
+            return Progress.STALLED if now - self._since >= limits.STALL_SUSPECTED else Progress.WAITING
+        if self._repeated is None:
+            self._repeated = now if sample.retransmits > self._proof else None
+            return Progress.WAITING
+        late = now - self._repeated >= max(limits.STALL_ANSWER, 1.5 * sample.rtt)
+        return Progress.BLACK_HOLE if late else Progress.WAITING
+
+    def small_passed(self) -> None:
+        """A small packet that left during the stall was answered by the peer."""
+        if self.waiting and self._proof is None:
+            self._proof = self._retransmits
+
+    @property
+    def suspected(self) -> bool:
+        """Whether a connection that ends now did so for a black hole, though there was no time to be sure.
+
+        With a long round trip the lease is over before TCP repeats a segment often enough.
+        """
+        return self._repeated is not None
+
+
+def smaller(segment: int | None) -> int | None:
+    """The next smaller size of segments, in bytes; ``None`` if there is none."""
+    return next((size for size in limits.SEGMENT_BYTES if segment is None or size < segment), None)
+
+
+@dataclass(frozen=True, slots=True)
+class PathProblem:
+    """What is wrong with a path, ready to read.
+
+    Args:
+        text: What was seen.
+        remedy: What to do.
+    """
+
+    text: str
+    remedy: str
+
+    def __str__(self) -> str:
+        """Both, for the log."""
+        return f"{self.text}; {self.remedy}"
+
+
+class PathState(Enum):
+    """What is known of the path to an address."""
+
+    TRYING = auto()
+    """Large packets seem to be lost; smaller ones are tried."""
+    BLACK_HOLE = auto()
+    """Large packets are lost, and smaller ones arrive."""
+    NO_HELP = auto()
+    """Smaller ones did not arrive either: something else is wrong."""
+
+
+@dataclass(slots=True)
+class _Path:
+    segment: int | None
+    state: PathState
+    until: float
+
+
+class PathTable:
+    """The addresses to which large packets do not get through; forgotten after a while, and then tried again."""
+
+    def __init__(self) -> None:
+        self._paths: dict[str, _Path] = {}
+
+    def segment(self, address: str, now: float) -> int | None:
+        """Bytes that a segment to an address may have; ``None`` for as many as the kernel likes."""
+        path = self._paths.get(address)
+        if path is not None and now >= path.until:
+            del self._paths[address]
+            path = None
+        return path.segment if path is not None else None
+
+    def black_hole(self, address: str, segment: int | None, now: float) -> PathState | None:
+        """A connection with segments of at most ``segment`` bytes has met a black hole.
+
+        Returns:
+            ``TRYING`` if the next connection takes smaller ones, ``NO_HELP`` if there are none, and ``None`` if that
+            was known.
+        """
+        known = self.segment(address, now)
+        path = self._paths.get(address)
+        if path is not None and path.state is PathState.NO_HELP:
+            return None
+        if known is not None and (segment is None or known < segment):
+            return PathState.TRYING  # another connection to the same address has met it before
+        size = smaller(segment)
+        state = PathState.NO_HELP if size is None else PathState.TRYING
+        self._paths.pop(address, None)
+        while len(self._paths) >= limits.PATHS_MAX:
+            del self._paths[next(iter(self._paths))]
+        kept = limits.PATH_NO_HELP if size is None else limits.PATH_REMEMBERED
+        self._paths[address] = _Path(size, state, now + kept)
+        return state
+
+    def flowed(self, address: str, segment: int | None, acked: int) -> bool:
+        """A connection with segments of at most ``segment`` bytes has had ``acked`` bytes acknowledged.
+
+        Returns:
+            Whether that is news: the smaller segments are what it took.
+        """
+        path = self._paths.get(address)
+        if path is None or path.state is not PathState.TRYING or segment is None or path.segment != segment:
+            return False
+        if acked < segment * limits.PATH_PROVEN_SEGMENTS:
+            return False
+        path.state = PathState.BLACK_HOLE
+        return True
+
+    def problem(self, address: str, segment: int | None, now: float) -> PathProblem | None:
+        """What is wrong with the path to an address; ``None`` if nothing is known.
+
+        Args:
+            address: Numeric.
+            segment: That of a connection which stands, and outlives what is remembered.
+            now: Monotonic seconds.
+        """
+        self.segment(address, now)
+        path = self._paths.get(address)
+        if path is not None and path.state is PathState.NO_HELP:
+            text = f"large messages to {address} are not acknowledged, small ones are, and small packets do not help"
+            return PathProblem(
+                text, f"`ping -M do -s 1372 {address}` tries a large packet; see the firewalls between"
+            )
+        size = path.segment if path is not None and path.segment is not None else segment
+        if size is None:
+            return None
+        if path is not None and path.state is PathState.TRYING:
+            return PathProblem(f"large packets to {address} are not acknowledged, small ones are", _REMEDY)
+        return PathProblem(
+            f"large packets do not get through to {address} (a path-MTU black hole): messages go in packets of at "
+            f"most {size + limits.TCP_HEADERS} bytes",
+            _REMEDY,
+        )

@@ -1,0 +1,101 @@
+"""Nodes that were registered when the core ended, and have not been asked yet whether they are still there."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from rmpa.ros.master.effects import Kind
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+class NodeRecord(msgspec.Struct, omit_defaults=True):
+    """Everything that one node registered.
+
+    Attributes:
+        api: The URI of its slave API.
+        publishers: Topics that it publishes, with their types.
+        subscribers: Topics that it subscribes to, with their types.
+        services: Services that it provides, with their ``rosrpc://`` URIs.
+        params: Parameters that it subscribed to; each ends in ``/``.
+    """
+
+    api: str
+    publishers: dict[str, str] = msgspec.field(default_factory=dict)
+    subscribers: dict[str, str] = msgspec.field(default_factory=dict)
+    services: dict[str, str] = msgspec.field(default_factory=dict)
+    params: dict[str, None] = msgspec.field(default_factory=dict)
+
+    def serialize(self) -> bytes:
+        """As JSON."""
+        return msgspec.json.encode(self)
+
+    def of(self, kind: Kind) -> dict[str, str] | dict[str, None]:
+        """What it registered of one kind."""
+        match kind:
+            case Kind.PUBLISHER:
+                return self.publishers
+            case Kind.SUBSCRIBER:
+                return self.subscribers
+            case Kind.SERVICE:
+                return self.services
+            case Kind.PARAM:
+                return self.params
+
+
+class Awaited:
+    """The records of nodes that are awaited, and the publishers among them by topic."""
+
+    def __init__(self) -> None:
+        self._records: dict[str, NodeRecord] = {}
+        self._publishers: dict[str, dict[str, str]] = {}
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._records)
+
+    def get(self, node: str) -> NodeRecord | None:
+        """What an awaited node had registered; not to be changed."""
+        return self._records.get(node)
+
+    def add(self, node: str, record: NodeRecord) -> None:
+        """Await a node; the record is ours from now on."""
+        self._records[node] = record
+        for topic in record.publishers:
+            self._publishers.setdefault(topic, {})[node] = record.api
+
+    def pop(self, node: str) -> NodeRecord | None:
+        """Await a node no longer."""
+        record = self._records.pop(node, None)
+        for topic in record.publishers if record is not None else ():
+            self._forget_publisher(topic, node)
+        return record
+
+    def withdraw(self, kind: Kind, key: str, node: str, api: str) -> bool:
+        """Take one registration away, if ``api`` is that node's; whether it was there."""
+        record = self._records.get(node)
+        if record is None or record.api != api or key not in record.of(kind):
+            return False
+        del record.of(kind)[key]
+        if kind is Kind.PUBLISHER:
+            self._forget_publisher(key, node)
+        return True
+
+    def publishers_of(self, topic: str) -> dict[str, str]:
+        """The awaited publishers of a topic, and their slave APIs."""
+        return dict(self._publishers.get(topic, {}))
+
+    def publishers(self, topic: str) -> list[str]:
+        """The slave APIs of awaited publishers of a topic."""
+        return list(self._publishers.get(topic, {}).values())
+
+    def _forget_publisher(self, topic: str, node: str) -> None:
+        nodes = self._publishers[topic]
+        del nodes[node]
+        if not nodes:
+            del self._publishers[topic]

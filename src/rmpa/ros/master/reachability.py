@@ -1,0 +1,64 @@
+"""Which registered nodes nothing can connect to: an address without a route, a host name that does not resolve.
+
+Such a node is not dead for sure: its network may be down for a moment. It stays registered, as at roscore, but after
+``limits.NODE_UNREACHABLE_AFTER`` it is *withdrawn*: peers are no longer offered what nothing could fetch. Pure: the
+time is an argument.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from rmpa.core import limits
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+@dataclass(frozen=True, slots=True)
+class Unreachable:
+    """A node that cannot be connected to.
+
+    Args:
+        api: The slave API's URI that it registered with.
+        problem: What the last attempt said, ready to read.
+        since: When the first attempt failed, in seconds of the monotonic clock.
+        withdrawn: Whether that is so long ago that peers are not offered its topics and services any more.
+    """
+
+    api: str
+    problem: str
+    since: float
+    withdrawn: bool = False
+
+
+class Reachability:
+    """The nodes that could not be reached when they were last tried."""
+
+    def __init__(self) -> None:
+        self._nodes: dict[str, Unreachable] = {}
+
+    @property
+    def unreachable(self) -> Mapping[str, Unreachable]:
+        """By node; not to be changed."""
+        return self._nodes
+
+    def failed(self, node: str, api: str, problem: str, now: float) -> bool:
+        """Say that an attempt to connect failed, otherwise than by a refusal; whether the node is withdrawn by it."""
+        known = self._nodes.get(node)
+        if known is None or known.api != api:
+            known = Unreachable(api, problem, now)
+        withdrawn = now - known.since >= limits.NODE_UNREACHABLE_AFTER
+        self._nodes[node] = replace(known, problem=problem, withdrawn=withdrawn)
+        return withdrawn and not known.withdrawn
+
+    def reached(self, node: str) -> bool:
+        """Say that a node can be connected to; whether it was withdrawn before."""
+        known = self._nodes.pop(node, None)
+        return known is not None and known.withdrawn
+
+    def keep(self, nodes: Mapping[str, str]) -> None:
+        """Forget all but these nodes at these slave APIs."""
+        if self._nodes:
+            self._nodes = {node: known for node, known in self._nodes.items() if nodes.get(node) == known.api}

@@ -1,0 +1,181 @@
+"""Nodes across modules, in whole agents: listed, described, asked and ended."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import pytest
+
+from rmpa.core import limits
+from rmpa.core.config import NodeSettings
+from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.ros.aio.http_client import call_api
+from rmpa.ros.aio.node import Node
+from rmpa.ros.nodes import NodeEnd, NodeFacts, NodePing, PeerNodes
+from tests.agent.test_agent import node, running, settings, until
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from rmpa.agent import Agent
+    from rmpa.core.config import Settings
+
+__all__ = ["settings"]
+
+
+async def ask(agent: Agent, kind: Any, what: str, name: str = "", peer: str | None = "b") -> Any:
+    return msgspec.convert(msgspec.to_builtins(await agent._node({"what": what, "peer": peer, "node": name})), kind)
+
+
+@asynccontextmanager
+async def mortal(name: str, agent: Agent) -> AsyncIterator[tuple[Node, asyncio.Event]]:
+    """A node that ends when it is told to, as a program does."""
+    ready, told, ended = asyncio.Event(), asyncio.Event(), asyncio.Event()
+    made = Node(name, master_uri=agent.core.uri, on_shutdown=lambda _: told.set())
+
+    async def live() -> None:
+        async with made:
+            ready.set()
+            await told.wait()
+        ended.set()
+
+    life = asyncio.create_task(live())
+    await asyncio.wait_for(ready.wait(), 20)
+    try:
+        yield made, ended
+    finally:
+        told.set()
+        await life
+
+
+def proxy(agent: Agent, name: str) -> str:
+    """The slave API of what stands for a node of b."""
+    return agent.core.state().nodes.get(f"/rmpa/b/{name}", "")
+
+
+async def test_they_are_listed_described_and_asked(settings: Callable[..., Settings]) -> None:
+    async with (
+        running(settings("a"), settings("b")) as (a, b),
+        node("talker", b) as talker,
+        node("hearer", b) as hearer,
+    ):
+        await talker.advertise("/chatter", "std_msgs/String")
+        await hearer.subscribe("/chatter", "std_msgs/String", lambda _: None)
+        (told,) = await ask(a, tuple[PeerNodes, ...], "node.list", peer=None)
+        assert (told.peer, told.problem) == ("b", "")
+        assert [line.name for line in told.nodes] == ["/hearer", "/rosout", "/talker"]
+        assert told == (await ask(a, tuple[PeerNodes, ...], "node.list"))[0]
+        talks = told.nodes[2]
+        assert (talks.publications, talks.subscriptions, talks.problem) == (1, 0, "")
+
+        facts = await ask(a, NodeFacts, "node.info", "/talker")
+        assert facts.uri == b.core.state().nodes["/talker"]
+        assert facts.pid
+        assert facts.publications["/chatter"] == "std_msgs/String"
+        assert not facts.problem
+        pong = await ask(a, NodePing, "node.ping", "/talker")
+        assert (pong.uri, pong.pid) == (facts.uri, facts.pid)
+        assert 0 < pong.time < 20
+
+        with pytest.raises(PeerRefused, match="b has no node /tolker; did you mean /talker"):
+            await ask(a, NodePing, "node.ping", "/tolker")
+        with pytest.raises(PeerRefused, match="/rmpa is no node of b: it is its agent"):
+            await ask(a, NodeEnd, "node.kill", "/rmpa")
+        with pytest.raises(PeerRefused, match="names no node"):
+            await ask(a, NodeEnd, "node.kill", "no name")
+        with pytest.raises(UnreachableError, match="linked peer"):
+            await ask(a, NodeEnd, "node.kill", "/x", peer="c")
+        with pytest.raises(RmpaError, match=r"did you mean node\.kill"):
+            await ask(a, NodeEnd, "node.kil", "/x")
+
+
+async def test_an_agent_that_does_not_know_the_question(settings: Callable[..., Settings]) -> None:
+    """An older release: what stands here is shown, and the rest says why not."""
+    async with running(settings("a"), settings("b")) as (a, b), node("talker", b) as talker:
+        await talker.advertise("/chatter", "std_msgs/String")
+        await until(lambda: proxy(a, "talker"))
+        for what in [what for what in b.bridge.asks._handlers if what.startswith("node.")]:
+            del b.bridge.asks._handlers[what]
+        (told,) = await ask(a, tuple[PeerNodes, ...], "node.list")
+        assert [line.name for line in told.nodes] == ["/talker"]
+        assert "does not know the question 'node.list'" in told.problem
+        with pytest.raises(PeerRefused, match="install the same release on both"):
+            await ask(a, NodePing, "node.ping", "/talker")
+        reply = await call_api(proxy(a, "talker"), "shutdown", "/rosnode", "user request")
+        assert (reply.code, "does not know" in reply.status) == (0, True)
+
+
+async def test_to_kill_a_proxy_ends_its_node(settings: Callable[..., Settings]) -> None:
+    async with running(settings("a"), settings("b")) as (a, b), mortal("talker", b) as (talker, ended):
+        await talker.advertise("/chatter", "std_msgs/String")
+        await until(lambda: proxy(a, "talker"))
+        assert await call_api(proxy(a, "talker"), "shutdown", "/rosnode", "user request") == (1, "shutdown", 0)
+        await asyncio.wait_for(ended.wait(), 20)
+        await until(lambda: not proxy(a, "talker"))
+        assert "/talker" not in b.core.state().nodes
+
+
+async def test_a_node_is_ended_by_name(settings: Callable[..., Settings]) -> None:
+    async with running(settings("a"), settings("b")) as (a, b), mortal("talker", b) as (talker, ended):
+        await talker.advertise("/chatter", "std_msgs/String")
+        assert (await ask(a, NodeEnd, "node.kill", "/talker")).gone
+        await asyncio.wait_for(ended.wait(), 20)
+        assert "/talker" not in b.core.state().nodes
+
+
+async def test_what_a_module_does_not_allow_lives_on(settings: Callable[..., Settings]) -> None:
+    b_settings = replace(settings("b"), nodes=NodeSettings(kill=("/demo/**",)))
+    async with running(settings("a"), b_settings) as (a, b), mortal("talker", b) as (talker, ended):
+        await talker.advertise("/chatter", "std_msgs/String")
+        await until(lambda: proxy(a, "talker"))
+        reply = await call_api(proxy(a, "talker"), "shutdown", "/rosnode", "user request")
+        refusal = "no glob of nodes.kill in the rmpa.toml of b fits /talker"
+        assert (reply.code, refusal in reply.status) == (0, True)
+        with pytest.raises(PeerRefused, match=refusal):
+            await ask(a, NodeEnd, "node.kill", "/talker")
+        assert not ended.is_set()
+        b._take(replace(b_settings, nodes=NodeSettings()))
+        assert (await ask(a, NodeEnd, "node.kill", "/talker")).gone
+
+
+async def test_a_node_that_does_not_end(settings: Callable[..., Settings], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "NODE_KILL_WAIT", 0.3)
+    async with running(settings("a"), settings("b")) as (a, b), node("stubborn", b) as stubborn:
+        await stubborn.advertise("/chatter", "std_msgs/String")
+        await until(lambda: proxy(a, "stubborn"))
+        monkeypatch.setattr(stubborn._slave, "_on_shutdown", lambda _: None)
+        assert not (await ask(a, NodeEnd, "node.kill", "/stubborn")).gone
+        reply = await call_api(proxy(a, "stubborn"), "shutdown", "/rosnode", "user request")
+        assert reply == (0, "it was asked, and is still there after 0.3 s", 0)
+
+
+async def test_kill_all_ends_the_nodes_of_this_module_alone(settings: Callable[..., Settings]) -> None:
+    async with running(settings("a"), settings("b")) as (a, b), mortal("talker", b) as (talker, ended):
+        await talker.advertise("/chatter", "std_msgs/String")
+        await until(lambda: proxy(a, "talker"))
+        nodes = a.core.state().nodes
+        for name in sorted(nodes):  # as `rosnode kill -a` does
+            await call_api(nodes[name], "shutdown", "/rosnode", "user request")
+        assert not ended.is_set()
+        assert a.core.state().nodes["/rmpa"] == nodes["/rmpa"], "the agent's own node stays"
+        assert proxy(a, "talker") == nodes["/rmpa/b/talker"]
+        await until(lambda: a.core.state().nodes.get("/rosout", nodes["/rosout"]) != nodes["/rosout"])
+        # It was that caller's wish alone.
+        assert (await call_api(proxy(a, "talker"), "shutdown", "/rqt", "user request")).code == 1
+        await asyncio.wait_for(ended.wait(), 20)
+
+
+async def test_a_master_that_takes_the_name_of_a_proxy_ends_no_node_elsewhere(
+    settings: Callable[..., Settings],
+) -> None:
+    async with running(settings("a"), settings("b")) as (a, b), mortal("talker", b) as (talker, ended):
+        await talker.advertise("/chatter", "std_msgs/String")
+        await until(lambda: proxy(a, "talker"))
+        reason = "[/rmpa/b/talker] Reason: new node registered with same name"
+        assert await call_api(proxy(a, "talker"), "shutdown", "/master", reason) == (1, "shutdown", 0)
+        assert (await ask(a, NodePing, "node.ping", "/talker")).pid
+        assert not ended.is_set()

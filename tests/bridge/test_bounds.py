@@ -1,0 +1,462 @@
+"""What of a peer is beyond ``[limits]``: hidden, counted, told, and shown as soon as there is room."""
+
+from __future__ import annotations
+
+from itertools import islice
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rmpa.bridge.actions import Action, Publish, Retract, Send, Warn
+from rmpa.bridge.bounds import Beyond, NodePlaces, Surplus, from_json, to_json
+from rmpa.bridge.imports import Imports
+from rmpa.bridge.messages import Advertise, AdvertiseServices, Offer, ServiceOffer, Source
+from rmpa.bridge.naming import Names
+from rmpa.bridge.policy import Policy
+from rmpa.bridge.services.exports import LocalService, ServiceExports
+from rmpa.bridge.services.imports import ImportAction, Provide, ServiceImports, Withdraw
+from rmpa.core.config import LimitSettings, PolicySettings, ServiceSettings
+from rmpa.core.contract import Contracts
+from tests.bridge.services.test_rules import obey, rules
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+def offers(nodes: range, topics: int = 1) -> tuple[Offer, ...]:
+    return tuple(Offer(f"/n{n}/t{t}", f"/n{n}", "a/B") for n in nodes for t in range(topics))
+
+
+def imports(*, nodes: int = 100, topics: int = 100) -> Imports:
+    made = Imports(Policy(PolicySettings(deny=("/secret",))), lambda: 1.0, most=LimitSettings(nodes, topics))
+    made.link_up(1, "far")
+    return made
+
+
+def shown(made: Imports) -> set[str]:
+    return {source.node for _, source, entry in made if entry.shown}
+
+
+def published(actions: list[Action]) -> list[str]:
+    return [action.source.topic for action in actions if isinstance(action, Publish)]
+
+
+def test_nodes_beyond_the_limit_are_hidden_counted_and_named() -> None:
+    made = imports(nodes=2)
+    actions = made.advertised(1, Advertise(added=offers(range(4), topics=3)))
+    assert shown(made) == {"/n0", "/n1"}
+    warnings = [action for action in actions if isinstance(action, Warn)]
+    assert {(one.kind, one.who) for one in warnings} == {("nodes.too_many", "far")}
+    assert "limits.nodes = 2" in warnings[0].text
+    assert {node: len(sources) for node, sources in made.crowded(1).items()} == {"/n2": 3, "/n3": 3}
+    entry = made.get(1, Source("/n2/t0", "/n2"))
+    assert entry is not None
+    assert entry.crowded
+    assert "limits.nodes = 2 of this module" in entry.hidden
+    more = Offer("/late", "/n0", "a/B")
+    assert published(made.advertised(1, Advertise(added=(more,)))) == ["/late"], "its node has a place"
+
+
+def test_a_node_that_leaves_gives_its_place_to_the_one_that_waits_for_longest() -> None:
+    made = imports(nodes=2)
+    made.advertised(1, Advertise(added=offers(range(4), topics=2)))
+    assert published(made.advertised(1, Advertise(removed=(Source("/n0/t0", "/n0"),)))) == []
+    actions = made.advertised(1, Advertise(removed=(Source("/n0/t1", "/n0"),)))
+    assert [type(action) for action in actions] == [Retract, Publish, Publish]
+    assert published(actions) == ["/n2/t0", "/n2/t1"]
+    assert set(made.crowded(1)) == {"/n3"}
+    made.advertised(1, Advertise(removed=tuple(offer.source for offer in offers(range(3, 4), topics=2))))
+    assert not made.crowded(1), "one that is gone waits no more"
+
+
+def test_what_policy_hides_takes_no_place() -> None:
+    made = imports(nodes=1)
+    secret = Offer("/secret", "/other", "a/B")
+    assert made.advertised(1, Advertise(added=(secret,))) == []
+    assert published(made.advertised(1, Advertise(added=offers(range(1))))) == ["/n0/t0"]
+    assert not made.crowded(1)
+
+
+def test_topics_beyond_the_limit_come_when_there_is_room() -> None:
+    made = imports(topics=2)
+    actions = made.advertised(1, Advertise(added=offers(range(4))))
+    assert published(actions) == ["/n0/t0", "/n1/t0"]
+    assert [a.kind for a in actions if isinstance(a, Warn)] == ["topics.too_many"] * 2
+    assert made.beyond(1) == Beyond("topics", 2, 2)
+    assert [offer.topic for _, _, offer in made.left_out()] == ["/n2/t0", "/n3/t0"]
+    made.advertised(1, Advertise(removed=(Source("/n2/t0", "/n2"),)))
+    assert made.beyond(1).hidden == 1
+    assert published(made.advertised(1, Advertise(removed=(Source("/n0/t0", "/n0"),)))) == ["/n3/t0"]
+    assert made.beyond(1).hidden == 0
+
+
+@pytest.mark.parametrize("kind", ["nodes", "topics"])
+def test_a_limit_that_is_raised_and_lowered_holds_at_once(kind: str) -> None:
+    def reload(value: int) -> list[Action]:
+        most = LimitSettings(**{kind: value})
+        policy = Policy(PolicySettings(deny=("/secret",)))
+        return [a for some in made.rules(policy, Contracts(), Names(), 0.0, most) for a in some]
+
+    made = imports(**{kind: 2})
+    made.advertised(1, Advertise(added=offers(range(5))))
+    assert published(reload(4)) == ["/n2/t0", "/n3/t0"]
+    assert published(reload(5)) == ["/n4/t0"]
+    assert not made.crowded(1)
+    assert made.beyond(1).hidden == 0
+    if kind == "nodes":
+        assert [a.source.node for a in reload(1) if isinstance(a, Retract)] == ["/n1", "/n2", "/n3", "/n4"]
+        assert shown(made) == {"/n0"}
+        assert published(reload(5)) == ["/n1/t0", "/n2/t0", "/n3/t0", "/n4/t0"]
+
+
+def test_a_peer_that_comes_back_begins_anew() -> None:
+    made = imports(nodes=1, topics=3)
+    made.advertised(1, Advertise(added=offers(range(5))))
+    actions, waits = made.link_away(1)
+    assert published(actions) == [], "nobody takes a place of a peer that is away"
+    assert not waits
+    list(made.link_down(1))
+    made.link_up(1, "far")
+    assert (len(made.crowded(1)), made.beyond(1).hidden) == (0, 0)
+    made.advertised(1, Advertise(added=offers(range(5)), full=True))
+    assert (len(made.crowded(1)), made.beyond(1).hidden) == (2, 2)
+
+
+def test_a_link_that_was_away_for_a_moment_keeps_who_stands_and_who_waits() -> None:
+    made = imports(nodes=1, topics=3)
+    made.advertised(1, Advertise(added=offers(range(5))))
+    made.link_away(1, briefly=True)
+    made.link_up(1, "far")
+    for portion in made.portions(1, Advertise(added=offers(range(5)), full=True)):
+        assert published(made.advertised(1, portion)) == []
+    assert shown(made) == {"/n0"}
+    assert (len(made.crowded(1)), made.beyond(1).hidden) == (2, 2)
+
+
+_events = st.lists(st.tuples(st.booleans(), st.integers(0, 6), st.integers(0, 2)), max_size=60)
+
+
+@given(_events, st.integers(1, 4), st.integers(1, 12))
+def test_whatever_comes_and_goes_the_limits_hold_and_no_place_stays_empty(
+    events: list[tuple[bool, int, int]], nodes: int, topics: int
+) -> None:
+    made = imports(nodes=nodes, topics=topics)
+    there: set[Source] = set()
+    for comes, node, topic in events:
+        offer = Offer(f"/n{node}/t{topic}", f"/n{node}", "a/B")
+        if comes:
+            there.add(offer.source)
+            made.advertised(1, Advertise(added=(offer,)))
+        else:
+            there.discard(offer.source)
+            made.advertised(1, Advertise(removed=(offer.source,)))
+        known = {source: entry for _, source, entry in made}
+        assert len(known) == min(topics, len(there))
+        assert made.beyond(1).hidden == len(there) - len(known)
+        standing = {source.node for source, entry in known.items() if entry.shown}
+        assert len(standing) == min(nodes, len({source.node for source in known}))
+        assert all(entry.shown is (source.node in standing) for source, entry in known.items())
+        waiting = {source for sources in made.crowded(1).values() for source in sources}
+        assert waiting == {source for source, entry in known.items() if not entry.shown}
+
+
+def reload_nodes(made: Imports, nodes: int, *denied: str) -> Iterator[list[Action]]:
+    """One reload: another limit of nodes, and all topics of some nodes denied."""
+    policy = Policy(PolicySettings(deny=tuple(f"{node}/*" for node in denied)))
+    return made.rules(policy, Contracts(), Names(), 0.0, LimitSettings(nodes=nodes))
+
+
+def of_nodes(nodes: str, *topics: str) -> tuple[Offer, ...]:
+    """Topic by topic."""
+    return tuple(Offer(f"/{node}/{topic}", f"/{node}", "a/B") for topic in topics for node in nodes)
+
+
+@pytest.mark.timeout(10)
+def test_a_node_that_a_reload_both_crowds_out_and_makes_room_for_stays_whole() -> None:
+    made = imports(nodes=10)
+    made.advertised(1, Advertise(added=of_nodes("abc", "t1", "t2")))
+    steps = list(islice(reload_nodes(made, 2, "/a", "/b"), 50))
+    assert len(steps) == 6
+    assert {source.topic for _, source, entry in made if entry.shown} == {"/c/t1", "/c/t2"}
+    assert made.crowded(1) == {}
+
+
+@pytest.mark.timeout(10)
+def test_a_node_keeps_its_place_when_just_as_many_leave_as_are_too_many() -> None:
+    made = imports(nodes=10)
+    made.advertised(1, Advertise(added=of_nodes("abc", "t1", "t2")))
+    list(islice(reload_nodes(made, 2, "/a"), 50))
+    assert {source.topic for _, source, entry in made if entry.shown} == {"/b/t1", "/b/t2", "/c/t1", "/c/t2"}
+    assert made.crowded(1) == {}
+
+
+@pytest.mark.timeout(10)
+def test_a_reload_that_lowers_the_limit_and_denies_leaves_no_place_empty() -> None:
+    made = imports(nodes=10)
+    made.advertised(1, Advertise(added=of_nodes("abcd", "t1")))
+    list(islice(reload_nodes(made, 3, "/a", "/b"), 50))
+    assert shown(made) == {"/c", "/d"}
+    assert made.crowded(1) == {}
+
+
+@pytest.mark.timeout(10)
+def test_nodes_that_leave_while_a_reload_is_under_way_give_their_places_to_those_in_surplus() -> None:
+    made = imports(nodes=10)
+    made.advertised(1, Advertise(added=of_nodes("abcd", "t1", "t2")))
+    under_way = reload_nodes(made, 2)
+    list(islice(under_way, 3))
+    assert {node: len(sources) for node, sources in made.crowded(1).items()} == {"/c": 1}
+    actions = made.advertised(1, Advertise(removed=tuple(offer.source for offer in of_nodes("a", "t1", "t2"))))
+    assert published(actions) == ["/c/t1"]
+    list(islice(under_way, 50))
+    assert shown(made) == {"/b", "/c"}
+    assert {node: len(sources) for node, sources in made.crowded(1).items()} == {"/d": 2}
+
+
+_comes_or_goes = st.tuples(st.booleans(), st.integers(0, 6), st.integers(0, 2))
+_reloads = st.tuples(st.integers(1, 6), st.sets(st.integers(0, 6)))
+_steps = st.lists(_comes_or_goes | _reloads | st.integers(1, 9), max_size=40)
+_Step = tuple[bool, int, int] | tuple[int, set[int]] | int
+
+
+@pytest.mark.timeout(60)
+@given(st.lists(st.sampled_from(offers(range(7), 3)), unique=True), _steps)
+def test_whatever_is_reloaded_while_nodes_come_and_go_the_places_are_taken_and_the_rest_is_counted(
+    first: list[Offer], steps: list[_Step]
+) -> None:
+    made = imports(nodes=6)
+    made.advertised(1, Advertise(added=tuple(first)))
+    limit, denied = 6, set[int]()
+    under_way: Iterator[list[Action]] = iter(())
+    for step in steps:
+        if isinstance(step, int):
+            list(islice(under_way, step))
+        elif len(step) == 2:
+            limit, denied = step
+            under_way = reload_nodes(made, limit, *(f"/n{node}" for node in denied))
+        else:
+            comes, node, topic = step
+            offer = Offer(f"/n{node}/t{topic}", f"/n{node}", "a/B")
+            message = Advertise(added=(offer,)) if comes else Advertise(removed=(offer.source,))
+            made.advertised(1, message)
+    assert len(list(islice(under_way, 100))) < 100
+    allowed = {source for _, source, _ in made if source.node not in {f"/n{node}" for node in denied}}
+    visible = {source for _, source, entry in made if entry.shown}
+    standing = shown(made)
+    assert len(standing) == min(limit, len({source.node for source in allowed}))
+    assert visible == {source for source in allowed if source.node in standing}
+    assert {source for sources in made.crowded(1).values() for source in sources} == allowed - visible
+
+
+# --- services -----------------------------------------------------------------------------------------------------
+
+
+def provided(*names: str, node: str = "/n", removed: tuple[str, ...] = ()) -> AdvertiseServices:
+    return AdvertiseServices(tuple(ServiceOffer(name, node) for name in names), removed)
+
+
+def services(*, nodes: int = 100, count: int = 100) -> ServiceImports:
+    made = ServiceImports(rules(), LimitSettings(nodes=nodes, services=count))
+    made.link_up(1, "far", 10)
+    return made
+
+
+def test_services_of_nodes_beyond_the_limit_wait_for_a_place() -> None:
+    made = services(nodes=1)
+    made.advertised(1, provided("/a", node="/first"))
+    assert made.advertised(1, provided("/b", "/c", node="/second")) == []
+    remote = made.get(1, "/b")
+    assert remote is not None
+    assert "limits.nodes = 1 of this module" in remote.hidden
+    assert {node: set(names) for node, names in made.crowded(1).items()} == {"/second": {"/b", "/c"}}
+    actions = made.advertised(1, provided(removed=("/a",)))
+    assert [type(action) for action in actions] == [Withdraw, Provide, Provide]
+    assert not made.crowded(1)
+
+
+def test_another_peer_provides_what_one_has_no_place_for() -> None:
+    made = services(nodes=1)
+    made.link_up(2, "other", 20)
+    made.advertised(1, provided("/a", node="/first"))
+    made.advertised(1, provided("/b", node="/second"))
+    assert made.advertised(2, provided("/b")) == [Provide(2, "/b", "/n")]
+
+
+def test_services_beyond_the_limit_come_when_there_is_room() -> None:
+    made = services(count=2)
+    actions = made.advertised(1, provided("/a", "/b", "/c"))
+    assert [type(action) for action in actions] == [Provide, Provide, Warn]
+    assert made.beyond(1) == Beyond("services", 2, 1)
+    assert made.advertised(1, provided(removed=("/a",)))[-1] == Provide(1, "/c", "/n")
+    assert made.beyond(1).hidden == 0
+
+
+def test_the_services_limits_are_reloaded() -> None:
+    made = services(nodes=1, count=2)
+    made.advertised(1, provided("/a", node="/first"))
+    made.advertised(1, provided("/b", "/c", node="/second"))
+    changed = [a for some in made.obey(rules(), LimitSettings(nodes=2, services=3)) for a in some]
+    assert changed == [Provide(1, "/b", "/second"), Provide(1, "/c", "/second")]
+
+
+def reload_services(made: ServiceImports, nodes: int, *denied: str) -> Iterator[list[ImportAction]]:
+    settings = ServiceSettings(deny=tuple(f"{node}/*" for node in denied))
+    return made.obey(rules(settings), LimitSettings(nodes=nodes))
+
+
+@pytest.mark.timeout(10)
+def test_a_reload_that_denies_services_and_lowers_the_limit_leaves_no_place_empty() -> None:
+    made = services(nodes=10)
+    for service in ("s1", "s2"):
+        for node in "abcd":
+            made.advertised(1, provided(f"/{node}/{service}", node=f"/{node}"))
+    list(islice(reload_services(made, 2, "/a", "/b"), 50))
+    assert {remote.name for _, remote in made if remote.shown} == {"/c/s1", "/c/s2", "/d/s1", "/d/s2"}
+    assert made.crowded(1) == {}
+
+
+def test_a_place_that_becomes_free_costs_who_takes_it_and_not_all_who_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = services(nodes=8, count=1000)
+    for number in range(200):
+        made.advertised(1, provided(f"/s{number}", node=f"/n{number}"))
+    chosen: list[str] = []
+    choose = made._choose
+
+    def counted(service: str) -> list[ImportAction]:
+        chosen.append(service)
+        return choose(service)
+
+    monkeypatch.setattr(made, "_choose", counted)
+    actions = made.advertised(1, provided(removed=tuple(f"/s{number}" for number in range(8))))
+    assert [one.service for one in actions if isinstance(one, Provide)] == [f"/s{n}" for n in range(8, 16)]
+    assert chosen == [f"/s{number}" for number in range(8, 16)]
+    assert len(made.crowded(1)) == 184
+
+
+_services_come_or_go = st.tuples(st.booleans(), st.integers(0, 5), st.integers(0, 1), st.integers(1, 2))
+
+
+@pytest.mark.timeout(60)
+@given(st.lists(_services_come_or_go | _reloads | st.integers(1, 9), max_size=40))
+def test_whatever_is_reloaded_each_service_has_one_provider_and_no_place_stays_empty(
+    steps: list[tuple[bool, int, int, int] | tuple[int, set[int]] | int],
+) -> None:
+    made = services(nodes=3)
+    made.link_up(2, "other", 20)
+    limit, denied = 3, set[int]()
+    under_way: Iterator[list[ImportAction]] = iter(())
+    for step in steps:
+        if isinstance(step, int):
+            list(islice(under_way, step))
+        elif len(step) == 2:
+            limit, denied = step
+            under_way = reload_services(made, limit, *(f"/n{node}" for node in denied))
+        else:
+            comes, node, service, peer = step
+            name = f"/n{node}/s{service}"
+            made.advertised(peer, provided(name, node=f"/n{node}") if comes else provided(removed=(name,)))
+    assert len(list(islice(under_way, 200))) < 200
+    visible = [remote.name for _, remote in made if remote.shown]
+    assert len(visible) == len(set(visible))
+    for peer in (1, 2):
+        standing = {remote.node for number, remote in made if number == peer and remote.shown}
+        assert len(standing) <= limit
+        assert len(standing) == limit or not made.crowded(peer)
+        assert not standing & set(made.crowded(peer))
+    for peer, remote in made:
+        waits = remote.name in made.crowded(peer).get(remote.node, ())
+        if remote.node in {f"/n{node}" for node in denied}:
+            assert not remote.shown
+            assert not waits
+        elif not remote.shown:
+            assert waits or remote.name in visible
+
+
+def test_our_own_services_beyond_the_limit_are_offered_when_there_is_room() -> None:
+    made = ServiceExports(rules(), LimitSettings(services=1))
+    made.link_up(1, "far")
+    add, mul = LocalService("/adder", "rosrpc://127.0.0.1:5"), LocalService("/multiplier", "rosrpc://127.0.0.1:6")
+    assert made.graph("/add", add) == []
+    (warning,) = made.graph("/mul", mul)
+    assert isinstance(warning, Warn)
+    assert "limits.services = 1" in warning.text
+    assert made.beyond == Beyond("services", 1, 1)
+    made.graph("/add", None)
+    assert dict(made.offered) == {"/mul": mul}
+    assert made.beyond.hidden == 0
+    told = [action.message for action in made.tell() if isinstance(action, Send)]
+    assert told == [AdvertiseServices(added=(ServiceOffer("/mul", "/multiplier"),))]
+    made.graph("/add", add)
+    assert obey(made, rules()) == []
+    assert set(made.offered) == {"/add", "/mul"}, "the default limit is higher"
+
+
+# --- what is told -------------------------------------------------------------------------------------------------
+
+COUNTS = st.integers(0, (1 << 32) - 1)
+
+
+@given(st.lists(st.builds(Beyond, st.sampled_from(["nodes", "topics", "services"]), COUNTS, COUNTS, COUNTS, COUNTS)))
+def test_what_is_told_arrives(found: list[Beyond]) -> None:
+    unique = {one.kind: one for one in found if one.hidden}
+    assert set(from_json(to_json(tuple(unique.values())))) == set(unique.values())
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        {"nodes": 5}, {"nodes": [1, 2]}, {"nodes": ["1", 2, 3, 4]}, {"nodes": [1, -2, 3, 4]},
+        {"nodes": [1, True, 3, 4]}, {"nodes": [1, 0, 3, 4]}, {"nodes": [1, 1 << 80, 3, 4]}, {"doors": [1, 2, 3, 4]},
+        {"nodes": None},
+    ],
+)  # fmt: skip
+def test_news_that_are_none_tell_nothing(args: dict[str, object]) -> None:
+    assert from_json(args) == ()
+
+
+def test_the_text_counts_in_words() -> None:
+    assert Beyond("nodes", 256, 744, 3720, 744).what == "744 nodes with 3720 topics and 744 services"
+    assert Beyond("nodes", 256, 1, 2).what == "1 node with 2 topics"
+    assert Beyond("topics", 5, 2).what == "2 topics"
+
+
+def test_a_surplus_remembers_as_many_as_its_limit_and_counts_the_rest() -> None:
+    surplus: Surplus[str] = Surplus(2)
+    for name in ("a", "b", "c", "d", "a"):
+        surplus.add(name, name.upper())
+    assert (len(surplus), list(surplus), "c" in surplus) == (4, ["A", "B"], False)
+    surplus.discard("c")
+    assert len(surplus) == 3
+    assert [surplus.pop(), surplus.pop(), surplus.pop()] == ["A", "B", None]
+    surplus.clear()
+    assert len(surplus) == 0
+
+
+def test_places_of_a_lower_limit_are_left_by_those_that_came_last() -> None:
+    places: NodePlaces[str] = NodePlaces(3)
+    for node in ("/a", "/b", "/c"):
+        places.show(node)
+    places.bound(1)
+    assert [places.free(node) for node in ("/a", "/b", "/c", "/d")] == [True, False, False, False]
+    places.hide("/c")
+    places.bound(3)
+    assert [places.free(node) for node in ("/a", "/b", "/c", "/d")] == [True, True, True, True]
+
+
+def test_a_place_of_a_node_that_leaves_is_kept_by_the_first_one_in_surplus() -> None:
+    places: NodePlaces[str] = NodePlaces(9)
+    for node in ("/a", "/b", "/c", "/d"):
+        places.show(node)
+    places.bound(2)
+    places.wait("/z", "/z/t")
+    places.wait("/c", "/c/t")
+    assert list(islice(places.next_in(), 5)) == [], "none of them has a place"
+    places.hide("/a")
+    assert [places.free(node) for node in ("/b", "/c", "/d", "/z")] == [True, True, False, False]
+    assert list(islice(places.next_in(), 5)) == [("/c/t",)], "what it was to lose comes back"
+    places.hide("/b")
+    assert places.free("/d")
+    places.hide("/d")
+    assert list(islice(places.next_in(), 5)) == [("/z/t",)]

@@ -1,0 +1,133 @@
+"""Limits with real nodes and stock tools: what is beyond them is told, and nothing else suffers."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from rmpa.experiments.bed.processes import eventually
+from tests.interop.ros import PYTHON
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from rmpa.experiments.bed.agents import Agent
+    from tests.interop.conftest import AgentFactory, ShellFactory
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
+
+SET_HUGE = """
+import rospy
+try:
+    rospy.set_param("/huge", "x" * 80_000_000)
+except Exception as error:
+    print(error)
+"""
+HEAD = b"POST /RPC2 HTTP/1.1\r\nHost: x\r\nContent-Type: text/xml\r\nContent-Length: 5000\r\n\r\n"
+
+
+def beyond(agent: Agent, peer: str) -> list[dict[str, Any]]:
+    code, output = agent.rmpa("peer", "info", peer, "--json")
+    assert code == 0, output
+    found: list[dict[str, Any]] = json.loads(output)["beyond"]
+    return found
+
+
+def test_nodes_beyond_the_limit_are_told_at_both_ends_and_come_with_a_reload(
+    agent: AgentFactory, shell: ShellFactory
+) -> None:
+    far = agent(name="far")
+    near = agent(name="near", config="[limits]\nnodes = 2\n")
+    far.wait_peer("near")
+    there, here = shell(port=far.core_port), shell(port=near.core_port)
+    for number in range(4):
+        there.start("rostopic", "pub", "-r", "10", f"/t{number}", "std_msgs/String", f"data: number {number}")
+
+    def listed() -> set[str]:
+        return {line for line in here.tool("rostopic", "list").splitlines() if line.startswith("/t")}
+
+    def hides() -> bool:
+        return len(listed()) == 2 and bool(beyond(near, "far") and beyond(far, "near"))
+
+    eventually(hides, 60.0, what="two nodes are shown, and both ends tell of the others")
+    (hidden,), (told,) = beyond(near, "far"), beyond(far, "near")
+    assert (hidden["kind"], hidden["limit"], hidden["hidden"], hidden["here"]) == ("nodes", 2, 2, True)
+    assert (told["kind"], told["limit"], told["hidden"], told["here"]) == ("nodes", 2, 2, False)
+    missing = ({f"/t{number}" for number in range(4)} - listed()).pop()
+    code, text = near.rmpa("why", f"far:{missing}")
+    assert code == 1
+    assert "it stops at: limit" in text
+    assert "raise limits.nodes" in text
+    assert "of this module stay hidden at near" in far.rmpa("peer", "list")[1]
+
+    (near.home / "near.toml").write_text("[limits]\nnodes = 4\n", encoding="utf-8")
+    assert "limits" in near.rmpa("reload")[1]
+    eventually(lambda: len(listed()) == 4, 30.0, what="all of them are here")
+    assert missing in listed()
+    eventually(lambda: not beyond(far, "near"), 30.0, what="nothing is hidden any more")
+    assert here.tool("rostopic", "echo", "-n1", missing).startswith("data:")
+
+
+@pytest.fixture
+def dribblers() -> Iterator[list[int]]:
+    """Seven hundred connections to the port that is put into the list, each with a byte now and then."""
+    ports: list[int] = []
+    stop = threading.Event()
+
+    def dial() -> socket.socket:
+        made = socket.socket()
+        made.setblocking(False)
+        made.connect_ex(("127.0.0.1", ports[0]))
+        return made
+
+    def dribble() -> None:
+        while not ports and not stop.wait(0.01):
+            pass
+        begun: dict[socket.socket, bool] = {dial(): False for _ in range(700)} if ports else {}
+        while not stop.wait(0.5):
+            for one, more in list(begun.items()):
+                try:
+                    one.send(b"x" if more else HEAD)
+                    begun[one] = True
+                except BlockingIOError:
+                    pass
+                except OSError:
+                    one.close()
+                    del begun[one]
+                    begun[dial()] = False
+        for one in begun:
+            one.close()
+
+    thread = threading.Thread(target=dribble)
+    thread.start()
+    yield ports
+    stop.set()
+    thread.join()
+
+
+def test_slow_connections_and_large_parameters(
+    agent: AgentFactory, shell: ShellFactory, dribblers: list[int], tmp_path: Path
+) -> None:
+    made = agent(name="core")
+    ros = shell(port=made.core_port)
+    (tmp_path / "map.yaml").write_text("map: '" + "x" * 12_000_000 + "'\n", encoding="utf-8")
+    ros.tool("rosparam", "load", str(tmp_path / "map.yaml"), "/large")
+    assert "large" in ros.tool("rosparam", "list")
+    text = ros.tool(str(PYTHON), "-c", SET_HUGE)
+    assert "setParam /huge: 80000" in text, text[:500]
+    assert "64 MiB" in text
+
+    dribblers.append(made.core_port)
+    eventually(lambda: "gave way to others" in made.process.output, 60.0, what="all places are taken")
+    slowest = 0.0
+    for _ in range(5):
+        begin = time.monotonic()
+        assert "/rosout" in ros.tool("rostopic", "list")
+        slowest = max(slowest, time.monotonic() - begin)
+    assert slowest < 10.0, "it was refused, or waited for 10 s"

@@ -1,0 +1,94 @@
+"""Types of a user's own packages: built on the robot alone, and used by a computer that does not have them."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from rmpa.experiments.bed.agents import RMPA
+from rmpa.experiments.bed.processes import run
+from rmpa.ros.definitions import known_text
+from tests.interop.ros import PYTHON
+from tests.ros.workspaces import package
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.interop.conftest import ModuleFactory
+    from tests.interop.modules import Module
+
+pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
+
+LONG: Final = 40.0
+GENPY: Final = "/usr/lib/genpy/genmsg_py.py"
+TWICE: Final = """\
+from rmpa.resource import Resource
+twice = Resource("twice", role="controlling")
+path = twice.input("/path", "my_msgs/Path")
+answer = twice.output("/answer", "my_msgs/Path", latch=True)
+@twice.profile(offers={"rate": 1})
+def plain(): pass
+@twice.task(on=path)
+def repeat(message):
+    answer.publish(poses=[{"x": 2 * pose.x, "name": pose.name} for pose in message.poses])
+"""
+
+
+def workspace(folder: Path) -> dict[str, str]:
+    """A package with nested types, and what genpy makes of it; the environment that a user sources."""
+    made = package(
+        folder / "src" / "stack" / "my_msgs",
+        msg_Path="# Where to.\nHeader header\nmy_msgs/Pose[] poses\n",
+        msg_Pose="float64 x  # m\nstring name\nuint8 FAST=1\nstring SAID= # not a comment\n",
+    )
+    header = known_text("std_msgs/Header")
+    assert header is not None
+    std = package(folder / "std_msgs", msg_Header=header)  # Debian has its package without the definitions
+    python = folder / "devel" / "python"
+    for command in (["Path.msg", "Pose.msg"], []):
+        target = python / "my_msgs" / "msg"
+        files = [str(made / "msg" / name) for name in command] or ["--initpy"]
+        include = [f"-Imy_msgs:{made / 'msg'}", f"-Istd_msgs:{std / 'msg'}"]
+        run([PYTHON, GENPY, "-p", "my_msgs", "-o", str(target), *include, *files], timeout=LONG)
+    (python / "my_msgs" / "__init__.py").touch()
+    return {"PYTHONPATH": str(python), "ROS_PACKAGE_PATH": str(folder / "src")}
+
+
+def hears(module: Module, topic: str, text: str, env: dict[str, str]) -> None:
+    """The stock ``rostopic echo`` hears a message of the user's type."""
+    echo = module.ros.start("rostopic", "echo", "-n", "1", topic, env=env)
+    assert echo.wait(LONG) == 0, echo.output
+    assert re.search(text, echo.output), echo.output
+
+
+def test_a_computer_without_the_package_works_with_the_robots_types(modules: ModuleFactory, tmp_path: Path) -> None:
+    robot, pc = modules("robot", "pc")
+    env = workspace(tmp_path / "ws")
+    said = "{header: auto, poses: [{x: 1.5, name: dock}]}"
+    code, output = pc.agent.rmpa("topic", "pub", "-1", "/goal", "my_msgs/Path", said)
+    assert code == 1
+    assert "message type my_msgs/Path: is not known here; looked in ROS_PACKAGE_PATH (not set)" in output
+
+    # A file of the computer waits until somebody, here or at a peer, publishes the type.
+    file = tmp_path / "twice.py"
+    file.write_text(TWICE)
+    resource = pc.ros.start(RMPA, "run", file, "--master", pc.ros.uri, "--no-state", env=pc.agent.env)
+    resource.wait_for("/twice waits for the type of output /answer", LONG)
+    robot.ros.start("rostopic", "pub", "-r", "10", "/path", "my_msgs/Path", said, env=env)
+    resource.wait_for("active on", LONG)
+    hears(robot, "/answer", "x: 3.0\n +name: .dock", env)
+
+    code, output = pc.agent.rmpa("topic", "echo", "robot:/path/poses", "-n", "1", timeout=LONG)
+    assert (code, 'name: "dock"' in output) == (0, True), output
+    goal = pc.ros.start(RMPA, "topic", "pub", "/goal", "my_msgs/Path", said, env=pc.agent.env)
+    hears(robot, "/goal", "x: 1.5\n +name: .dock", env)
+    assert "md5" not in goal.output
+
+    # On the robot its workspace is enough, built or not.
+    for known in env:
+        topic = f"/{known.lower()}"
+        argv = (RMPA, "topic", "pub", topic, "my_msgs/Path", said, "--master", robot.ros.uri)
+        robot.ros.start(*argv, env=robot.agent.env | {known: env[known]})
+        hears(robot, topic, "x: 1.5\n +name: .dock", env)

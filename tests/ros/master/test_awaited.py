@@ -1,0 +1,148 @@
+"""Nodes of the run before in the master's tables: hidden until taken up, replaced by whoever registers anew."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+
+from rmpa.ros.master.api import MasterApi
+from rmpa.ros.master.awaited import NodeRecord
+from rmpa.ros.master.effects import Effect, PublisherUpdate, Shutdown
+
+TALKER, HEARER, NEW = "http://h:1/", "http://h:2/", "http://h:3/"
+STRING = "std_msgs/String"
+
+
+class Master(MasterApi):
+    def __init__(self) -> None:
+        super().__init__("http://h:11311/", 1, lambda _: None)
+
+    def effects(self) -> list[Effect]:
+        return self.take()[0]
+
+
+@pytest.fixture
+def master() -> Master:
+    made = Master()
+    made.registrations.await_node(
+        "/talker", NodeRecord(TALKER, {"/t": STRING}, services={"/s": "rosrpc://h:9"}, params={"/p/": None})
+    )
+    made.registrations.await_node("/hearer", NodeRecord(HEARER, {}, {"/t": STRING}))
+    return made
+
+
+def test_nothing_shows_an_awaited_node(master: Master) -> None:
+    assert master.call("getSystemState", ["/x"]).value == [[], [], []]
+    assert master.call("lookupNode", ["/x", "/talker"]).code == -1
+    assert master.call("lookupService", ["/x", "/s"]).code == -1
+    assert master.call("registerSubscriber", ["/x", "/t", STRING, NEW]).value == []
+    assert master.state().nodes == {"/x": NEW}
+    assert not [effect for effect in master.effects() if isinstance(effect, Shutdown)]
+
+
+def test_a_node_that_is_taken_up_has_everything_again(master: Master) -> None:
+    assert master.registrations.take_up("/talker") == (["/t"], [])
+    assert master.registrations.take_up("/hearer") == ([], ["/t"])
+    assert master.call("getSystemState", ["/x"]).value == [
+        [["/t", ["/talker"]]],
+        [["/t", ["/hearer"]]],
+        [["/s", ["/talker"]]],
+    ]
+    assert master.call("lookupService", ["/x", "/s"]).value == "rosrpc://h:9"
+    assert master.call("getTopicTypes", ["/x"]).value == [["/t", STRING]]
+    assert master.registrations.param_subscribers() == {"/p/": {"/talker": TALKER}}
+    changes = master.take()[1]
+    assert [(change.name, change.type) for change in changes if change.added] == [
+        ("/t", STRING),
+        ("/s", ""),
+        ("/t", STRING),
+    ]
+    assert master.registrations.take_up("/talker") == ([], [])
+
+
+def test_a_subscriber_is_told_of_publishers_that_it_may_be_connected_to(master: Master) -> None:
+    master.registrations.take_up("/hearer")
+    master.call("registerPublisher", ["/proxy", "/t", STRING, NEW])
+    # roscpp hangs up on whom the list leaves out: the talker has not answered yet, and is still connected.
+    assert master.effects() == [PublisherUpdate(HEARER, "/t", (NEW, TALKER))]
+    master.registrations.tell("/t", "/hearer")
+    assert master.effects() == [PublisherUpdate(HEARER, "/t", (NEW, TALKER))]
+    master.registrations.give_up("/talker")
+    assert master.effects() == [PublisherUpdate(HEARER, "/t", (NEW,))]
+
+
+def test_a_new_subscriber_is_told_of_nobody_who_has_not_answered(master: Master) -> None:
+    master.call("registerSubscriber", ["/new", "/t", STRING, NEW])
+    master.call("registerPublisher", ["/proxy", "/t", STRING, "http://h:4/"])
+    assert master.effects() == [PublisherUpdate(NEW, "/t", ("http://h:4/",))]
+    master.registrations.take_up("/talker")
+    master.registrations.take_up("/hearer")
+    master.registrations.announce("/t")
+    assert master.effects() == [PublisherUpdate(NEW, "/t", ("http://h:4/", TALKER))]
+
+
+def test_a_node_that_registers_at_another_address_takes_the_name(master: Master) -> None:
+    master.registrations.take_up("/hearer")
+    master.call("registerPublisher", ["/talker", "/t", STRING, NEW])
+    assert master.effects() == [
+        Shutdown(TALKER, "/talker", ("/t",)),
+        PublisherUpdate(HEARER, "/t", ()),
+        PublisherUpdate(HEARER, "/t", (NEW,)),
+    ]
+    assert master.registrations.take_up("/talker") == ([], [])
+    assert master.state().publishers == {"/t": {"/talker": NEW}}
+    assert master.call("lookupService", ["/x", "/s"]).code == -1
+    # The old one's late words do not hit the new one.
+    assert master.call("unregisterPublisher", ["/talker", "/t", TALKER]).value == 0
+
+
+def test_a_service_that_another_provides_meanwhile_stays_his(master: Master) -> None:
+    master.call("registerService", ["/other", "/s", "rosrpc://h:7", NEW])
+    master.registrations.take_up("/talker")
+    assert master.call("lookupService", ["/x", "/s"]).value == "rosrpc://h:7"
+    assert master.state().publishers == {"/t": {"/talker": TALKER}}
+
+
+def test_what_a_node_withdraws_before_it_is_taken_up_does_not_come_back(master: Master) -> None:
+    master.registrations.take_up("/hearer")
+    assert master.call("unregisterPublisher", ["/talker", "/t", TALKER]).value == 1
+    assert master.effects() == [PublisherUpdate(HEARER, "/t", ())]
+    assert master.call("unregisterService", ["/talker", "/s", "rosrpc://h:9"]).value == 1
+    assert list(master.registrations.awaited) == ["/talker"]
+    master.call("unsubscribeParam", ["/talker", TALKER, "/p"])
+    assert list(master.registrations.awaited) == []
+
+
+def test_a_node_that_registers_more_is_recorded_with_both(master: Master) -> None:
+    before = master.registrations.marks["/talker"]
+    master.call("registerPublisher", ["/talker", "/more", STRING, TALKER])
+    assert master.registrations.marks["/talker"] != before
+    record = master.registrations.record("/talker")
+    assert record is not None
+    assert record.publishers == {"/more": STRING, "/t": STRING}
+    master.registrations.take_up("/talker")
+    assert master.registrations.record("/talker") == record
+
+
+def test_marks_change_with_what_is_to_be_kept_and_with_nothing_else(master: Master) -> None:
+    registrations = master.registrations
+    registrations.take_up("/talker")
+    marks = copy.copy(registrations.marks)
+    master.call("registerPublisher", ["/talker", "/t", STRING, TALKER])
+    master.call("getSystemState", ["/x"])
+    master.call("unregisterPublisher", ["/stranger", "/t", NEW])
+    assert registrations.marks == marks
+    for call in (
+        ["registerPublisher", "/talker", "/t", "std_msgs/Int32", TALKER],
+        ["registerSubscriber", "/talker", "/u", STRING, TALKER],
+        ["registerService", "/talker", "/s", "rosrpc://h:5", TALKER],
+        ["subscribeParam", "/talker", TALKER, "/q"],
+        ["unregisterSubscriber", "/talker", "/u", TALKER],
+    ):
+        master.call(call[0], call[1:])
+        assert registrations.marks["/talker"] > marks["/talker"], call
+        marks = copy.copy(registrations.marks)
+    registrations.purge("/talker", TALKER)
+    registrations.give_up("/hearer")
+    assert registrations.marks == {}
