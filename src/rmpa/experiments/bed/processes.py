@@ -105,10 +105,10 @@ class Process:
         with self._news:
             return "\n".join(self.lines)
 
-    def events(self, kind: str) -> list[Event]:
-        """The events of one kind so far."""
+    def events(self, kind: str, *, since: int = 0) -> list[Event]:
+        """The events of one kind so far, from a mark on."""
         with self._news:
-            return [event for event in self._events if event["event"] == kind]
+            return [event for event in self._events[since:] if event["event"] == kind]
 
     def mark(self) -> int:
         """The number of lines so far, as ``since`` of a later wait."""
