@@ -22,13 +22,13 @@ from bench import plot, profile, results, schedule
 from bench.bed import Bed
 from bench.tables import Target, dash, show_targets, us
 from rmpa.experiments import samples
-from rmpa.resource.adaptation import AdaptationSettings, Apply, Reacted
-from rmpa.resource.aio.client import ResourceClient
-from rmpa.resource.aio.member import Member
-from rmpa.resource.declare import Resource, at_most
-from rmpa.ros.aio.core import RosCore
-from rmpa.ros.aio.node import Node
-from rmpa.ros.aio.topics import Received
+from rmpa.resource.decide.adaptation import AdaptationSettings, Apply, Reacted
+from rmpa.resource.declare.resource import Resource, at_most
+from rmpa.resource.run.client import ResourceClient
+from rmpa.resource.run.member import Member
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.node.node import Node
+from rmpa.ros.node.topics import Received
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from rmpa.resource.adaptation import Action
+    from rmpa.resource.decide.adaptation import Action
 
 _BATCH: Final = 1000
 """Messages between two looks at the clock of the processor."""

@@ -18,10 +18,10 @@ from rich.table import Table
 from bench import plot, results
 from bench.tables import Target, show_targets, us
 from rmpa.experiments import samples
-from rmpa.resource.attributes import Attribute, Direction, Scale
-from rmpa.resource.decision import Decider
-from rmpa.resource.profiles import Profile
-from rmpa.resource.requirements import Bound, Requirement, bound, merge
+from rmpa.resource.decide.decision import Decider
+from rmpa.resource.declare.attributes import Attribute, Direction, Scale
+from rmpa.resource.declare.profiles import Profile
+from rmpa.resource.declare.requirements import Bound, Requirement, bound, merge
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from rmpa.resource.attributes import Value
+    from rmpa.resource.declare.attributes import Value
 
 _SIZES: Final = ((5, 5, 2), (20, 10, 10), (100, 20, 50))
 """Profiles, attributes, clients; the last one is to be reached."""

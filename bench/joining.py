@@ -24,7 +24,7 @@ from bench.tables import Target, show_targets
 from rmpa.core.errors import RmpaError
 from rmpa.experiments.bed.agents import last_link
 from rmpa.experiments.usage import Meter
-from rmpa.monitor.aio.control_client import ControlClient
+from rmpa.observe.io.control_client import ControlClient
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from rmpa.experiments.bed.agents import Agent
-    from rmpa.monitor.snapshot import Snapshot
+    from rmpa.observe.snapshot import Snapshot
 
 _MESH_WITHIN: Final = 2.0
 _MIRRORED_WITHIN: Final = 1.0

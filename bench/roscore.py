@@ -18,11 +18,11 @@ from rich.table import Table
 from bench import results
 from bench.bed import Bed
 from bench.tables import Target, show_targets
-from rmpa.core.aio.loop import AgentLoop
 from rmpa.experiments.usage import Meter
-from rmpa.ros.aio.external_core import ExternalCore
-from rmpa.ros.aio.http_client import call
+from rmpa.ros.core.external import ExternalCore
+from rmpa.ros.http.client import call
 from rmpa.ros.master.survey import one_call
+from rmpa.runtime.event_loop import AgentLoop
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from rmpa.experiments.bed.processes import Process
-    from rmpa.ros.xmlrpc import XmlRpcValue
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 GRAPHS: Final = ((10, 50, 20), (50, 500, 100), (200, 4000, 800))
 """Nodes, topics with a publisher and a subscriber each, services."""

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from rmpa.resource import Resource
-from rmpa.resource.tasks import TaskFigures
+from rmpa.resource.run.schedule import TaskFigures
 
 resource = Resource("rated", role="sensing", physical=False)
 output = resource.output("/rated/resource", "std_msgs/UInt8MultiArray")

@@ -12,8 +12,8 @@ import sys
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from rmpa.ros.aio.node import Node
-from rmpa.ros.messages import MessageType
+from rmpa.ros.node.node import Node
+from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Coroutine

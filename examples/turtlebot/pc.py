@@ -24,14 +24,14 @@ import table
 from module import arguments, joined, run
 from rate import Rate
 from rmpa.core.errors import RmpaError
-from rmpa.monitor.aio.control_client import ControlClient, choose_agent
+from rmpa.observe.io.control_client import ControlClient, choose_agent
 from watch import HERE, MODULES, TOPICS, PoseView, View, Watch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rmpa.monitor.snapshot import Snapshot
-    from rmpa.ros.aio.node import Node, Received
+    from rmpa.observe.snapshot import Snapshot
+    from rmpa.ros.node.node import Node, Received
 
 PROFILE = "std_msgs/String"
 """The type of a resource's topic that says which profile it runs."""

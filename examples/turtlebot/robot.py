@@ -9,7 +9,7 @@ from mapping import MAX_SPEED, MAX_TURN, limited
 from unicycle import Pose
 
 if TYPE_CHECKING:
-    from rmpa.ros.messages import Plain
+    from rmpa.ros.types.messages import Plain
 
 ORDER_TIMEOUT = 0.5
 """Seconds: a robot that hears no order for this long stops."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from rmpa.core.stats import Summary
+    from rmpa.core.stats import SampleSummary
 
 WIDTH, HEIGHT = 32, 11
 """The trail's drawing, in characters."""
@@ -78,7 +78,7 @@ def _delay(view: View) -> Text:
     return Text(f"CMD→VEL at the pc: {_spread(view.command_to_velocity)}, {view.unanswered} unanswered")
 
 
-def _spread(summary: Summary) -> str:
+def _spread(summary: SampleSummary) -> str:
     mean, sd, p99 = ms(summary.mean), ms(summary.sd), ms(summary.p99)
     return f"mean {mean}, sd {sd}, p99 {p99}" if summary.count else "nothing yet"
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 
-from rmpa.core.stats import Ring, Summary
+from rmpa.core.stats import SampleRing, SampleSummary
 
 RECENT = 100
 """Samples behind the live figures."""
@@ -62,8 +62,8 @@ class TopicView:
 
     messages: int
     rate: float
-    period: Summary
-    latency: Summary | None
+    period: SampleSummary
+    latency: SampleSummary | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,7 @@ class View:
     seconds: float
     modules: dict[str, ModuleView]
     topics: dict[str, TopicView]
-    command_to_velocity: Summary
+    command_to_velocity: SampleSummary
     unanswered: int
     """Commands without an order in time."""
     pose: PoseView | None
@@ -119,14 +119,14 @@ class View:
 
 @dataclass(slots=True)
 class _Samples:
-    recent: Ring = field(default_factory=lambda: Ring(RECENT))
-    whole: Ring = field(default_factory=lambda: Ring(WHOLE))
+    recent: SampleRing = field(default_factory=lambda: SampleRing(RECENT))
+    whole: SampleRing = field(default_factory=lambda: SampleRing(WHOLE))
 
     def add(self, sample: float) -> None:
         self.recent.add(sample)
         self.whole.add(sample)
 
-    def summary(self, *, whole: bool) -> Summary:
+    def summary(self, *, whole: bool) -> SampleSummary:
         return (self.whole if whole else self.recent).summary()
 
 

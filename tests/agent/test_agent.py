@@ -13,20 +13,20 @@ import pytest
 
 from rmpa.agent import Agent
 from rmpa.bridge.proxy_names import proxied_node
+from rmpa.config.settings import PolicySettings, Settings
 from rmpa.core import limits
-from rmpa.core.config import PolicySettings, Settings
 from rmpa.core.errors import StartError, UnreachableError
-from rmpa.monitor.aio.control_client import ControlClient
-from rmpa.ros.aio.http_client import call_api
-from rmpa.ros.aio.node import Node
-from rmpa.ros.aio.slave_server import SlaveNode
+from rmpa.observe.io.control_client import ControlClient
+from rmpa.ros.http.client import call_api
+from rmpa.ros.node.node import Node
+from rmpa.ros.node.slave_node import SlaveNode
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
     from pathlib import Path
 
-    from rmpa.monitor.snapshot import Snapshot
-    from rmpa.ros.aio.topics import Publisher, Received, Subscriber
+    from rmpa.observe.snapshot import Snapshot
+    from rmpa.ros.node.topics import Publisher, Received, Subscriber
 
 DEADLINE = 20.0
 

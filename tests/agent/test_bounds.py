@@ -6,10 +6,10 @@ import asyncio
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from rmpa.config.settings import LimitSettings
 from rmpa.core import limits
-from rmpa.core.config import LimitSettings
-from rmpa.monitor.aio.control_client import ControlClient
-from rmpa.monitor.diagnosis import Diagnosis
+from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.why.diagnosis import Diagnosis
 from tests.agent.test_agent import node, running, until
 from tests.agent.test_diagnostics import Statuses, settings
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import pytest
 
     from rmpa.agent import Agent
-    from rmpa.monitor.snapshot import BoundInfo, Snapshot
+    from rmpa.observe.snapshot import BoundInfo, Snapshot
 
 
 async def snapshot(name: str, place: Path) -> Snapshot:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from rmpa.core.config import TimeSettings
+from rmpa.config.settings import TimeSettings
 from tests.agent.test_agent import node, running, settings, until
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.core.config import Settings
+    from rmpa.config.settings import Settings
 
 __all__ = ["settings"]
 

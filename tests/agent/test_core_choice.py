@@ -5,10 +5,10 @@ import socket
 import pytest
 
 from rmpa.agent import core_choice
-from rmpa.core.config import Settings
+from rmpa.config.settings import Settings
 from rmpa.core.errors import ConfigError
-from rmpa.ros.aio.core import RosCore
-from rmpa.ros.aio.external_core import ExternalCore
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.core.external import ExternalCore
 
 EVERYWHERE = "0.0.0.0"
 HERE = "127.0.0.1"

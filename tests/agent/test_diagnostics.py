@@ -6,22 +6,22 @@ import asyncio
 import os
 from typing import TYPE_CHECKING
 
-from rmpa.agent.diagnostics import TOPIC
-from rmpa.core.config import Settings
-from rmpa.core.contract import Rule
-from rmpa.monitor.aio.control_client import ControlClient
-from rmpa.monitor.snapshot import Snapshot
-from rmpa.ros.diagnostic_array import ARRAY_MD5, ARRAY_TYPE
+from rmpa.config.settings import Settings
+from rmpa.core.contract import ContractRule
+from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.io.diagnostics import TOPIC
+from rmpa.observe.snapshot import Snapshot
+from rmpa.ros.types.diagnostic_array import ARRAY_MD5, ARRAY_TYPE
 from tests.agent.test_agent import node, running, until
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rmpa.monitor.snapshot import RouteInfo
-    from rmpa.ros.aio.topics import Publisher, Received
+    from rmpa.observe.snapshot import RouteInfo
+    from rmpa.ros.node.topics import Publisher, Received
 
 
-def settings(name: str, place: Path, contracts: tuple[Rule, ...] = ()) -> Settings:
+def settings(name: str, place: Path, contracts: tuple[ContractRule, ...] = ()) -> Settings:
     return Settings(
         name=name,
         core_port=0,
@@ -65,7 +65,7 @@ class Statuses:
 
 
 async def test_figures_of_a_topic_that_crosses(tmp_path: Path) -> None:
-    rule = Rule(("/chatter",), (), {"deadline": 30.0})
+    rule = ContractRule(("/chatter",), (), {"deadline": 30.0})
     async with (
         running(settings("a", tmp_path), settings("b", tmp_path, (rule,))) as (a, b),
         node("talker", a) as talker,

@@ -18,39 +18,39 @@ from typing import TYPE_CHECKING
 import psutil
 import pytest
 
-from rmpa.bridge.aio import proxy_nodes
+from rmpa.bridge.session import proxy_nodes
 from rmpa.core import limits
-from rmpa.core.aio import descriptors
-from rmpa.core.aio.descriptors import DESCRIPTORS, Use
 from rmpa.core.counters import Counters
 from rmpa.core.errors import StartError, UnreachableError
-from rmpa.monitor.aio.control_client import ControlClient
-from rmpa.monitor.aio.control_server import ControlServer
-from rmpa.ros.aio import liveness
-from rmpa.ros.aio.core import RosCore
-from rmpa.ros.aio.http_client import call_api
-from rmpa.ros.aio.publication import Publication
-from rmpa.ros.aio.shared_listener import SharedListener
-from rmpa.ros.aio.subscription import PublisherConnection
-from rmpa.ros.aio.tcpros_server import TcprosServer
-from rmpa.ros.tcpros import Description, encode_header, subscriber_header
-from rmpa.ros.xmlrpc import serialize_call
+from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.io.control_server import ControlServer
+from rmpa.ros.core import liveness
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.http.client import call_api
+from rmpa.ros.node.publication import Publication
+from rmpa.ros.node.shared_listener import SharedListener
+from rmpa.ros.node.subscription import PublisherConnection
+from rmpa.ros.node.tcpros_server import TcprosServer
+from rmpa.ros.wire.tcpros import TopicDescription, encode_header, subscriber_header
+from rmpa.ros.wire.xmlrpc import serialize_call
+from rmpa.runtime import descriptors
+from rmpa.runtime.descriptors import DESCRIPTORS, Use
 from tests.agent.test_agent import node, running, settings, until
-from tests.core.aio.descriptors_left import descriptors_left
+from tests.runtime.descriptors_left import descriptors_left
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from rmpa.agent import Agent
-    from rmpa.core.config import Settings
-    from rmpa.monitor.snapshot import FilesInfo, RouteInfo, Snapshot
+    from rmpa.config.settings import Settings
+    from rmpa.observe.snapshot import FilesInfo, RouteInfo, Snapshot
 
 __all__ = ["settings"]
 
 HARD = 64
 NODES = 40
-STRING = Description("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n")
+STRING = TopicDescription("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n")
 
 
 @pytest.fixture
@@ -251,7 +251,7 @@ def routes(agent: Agent) -> list[RouteInfo]:
 
 def test_the_soft_limit_is_raised_to_the_hard_one() -> None:
     program = (
-        "import resource\nfrom rmpa.core.aio.descriptors import raise_file_limit\n"
+        "import resource\nfrom rmpa.runtime.descriptors import raise_file_limit\n"
         "resource.setrlimit(resource.RLIMIT_NOFILE, (100, 200))\n"
         "print(raise_file_limit(), resource.getrlimit(resource.RLIMIT_NOFILE))"
     )

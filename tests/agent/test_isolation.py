@@ -24,18 +24,18 @@ from urllib.parse import urlsplit
 import pytest
 
 from rmpa.agent import Agent
+from rmpa.config.settings import PeerRule, PolicySettings, Settings
 from rmpa.core import limits
-from rmpa.core.aio import loop as loop_module
-from rmpa.core.aio.loop import AgentLoop, DirectSelector, breathe
-from rmpa.core.config import PeerRule, PolicySettings, Settings
 from rmpa.core.errors import UnreachableError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.discovery.beacon import Beacon, BeaconKind
-from rmpa.monitor.aio.control_client import ControlClient
-from rmpa.monitor.diagnosis import Diagnosis
-from rmpa.ros.aio.core import RosCore
-from rmpa.ros.aio.external_core import ExternalCore
+from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.why.diagnosis import Diagnosis
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.core.external import ExternalCore
+from rmpa.runtime import event_loop as loop_module
+from rmpa.runtime.event_loop import AgentLoop, DirectSelector, yield_to_data
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
@@ -426,7 +426,7 @@ def test_the_watch_sees_work_that_does_not_breathe() -> None:
             while time.thread_time() < until:
                 pass
             if breathing:
-                breathe()
+                yield_to_data()
 
     async def main() -> None:
         work(breathing=True)

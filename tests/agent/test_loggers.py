@@ -3,7 +3,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from rmpa.ros.aio.service_client import ServiceConnection
+from rmpa.ros.node.service_client import ServiceConnection
 from tests.agent.test_agent import running, settings
 
 if TYPE_CHECKING:
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
     import pytest
 
-    from rmpa.core.config import Settings
+    from rmpa.config.settings import Settings
 
 __all__ = ["settings"]  # a fixture, used by its name
 

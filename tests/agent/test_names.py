@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core.config import PeerRule, PolicySettings, Remap, Settings
-from rmpa.core.contract import Rule
+from rmpa.config.settings import PeerRule, PolicySettings, Remap, Settings
+from rmpa.core.contract import ContractRule
 from tests.agent.test_agent import Sink, node, running, settings, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.agent import Agent
-    from rmpa.bridge.imports import Import
-    from rmpa.monitor.snapshot import TopicInfo
+    from rmpa.bridge.topics.imports import RemoteTopic
+    from rmpa.observe.snapshot import TopicInfo
 
 __all__ = ["settings"]  # the fixture
 
@@ -39,7 +39,7 @@ def info(agent: Agent, topic: str) -> TopicInfo:
     return next(found for found in agent._view.snapshot().topics if found.name == topic)
 
 
-def imported(agent: Agent, topic: str) -> Import:
+def imported(agent: Agent, topic: str) -> RemoteTopic:
     """A topic of the other module."""
     return next(entry for _, source, entry in agent.bridge.imports if source.topic == topic)
 
@@ -120,7 +120,7 @@ async def test_what_a_reload_is_not_about_keeps_its_route_and_its_connections(
                 agent._settings,
                 policy=PolicySettings(deny=(f"{prefix}denied",)),
                 peers=(far_rule if far else near_rule,),
-                contracts=(Rule((f"{prefix}tuned",), (), {"depth": 3}),),
+                contracts=(ContractRule((f"{prefix}tuned",), (), {"depth": 3}),),
             )
         )
         for number in range(20, 40):

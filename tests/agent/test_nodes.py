@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
+from rmpa.config.settings import NodeSettings
 from rmpa.core import limits
-from rmpa.core.config import NodeSettings
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
-from rmpa.ros.aio.http_client import call_api
-from rmpa.ros.aio.node import Node
-from rmpa.ros.nodes import NodeEnd, NodeFacts, NodePing, PeerNodes
+from rmpa.ros.http.client import call_api
+from rmpa.ros.node.node import Node
+from rmpa.ros.node_info import NodeEnd, NodeFacts, NodePing, PeerNodes
 from tests.agent.test_agent import node, running, settings, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.agent import Agent
-    from rmpa.core.config import Settings
+    from rmpa.config.settings import Settings
 
 __all__ = ["settings"]
 

@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from rmpa.agent import Agent
+from rmpa.config.settings import Settings
 from rmpa.core import limits
-from rmpa.core.aio.realtime import Wish
-from rmpa.core.config import Settings
-from rmpa.monitor.aio.control_client import ControlClient
-from rmpa.ros.aio.http_client import call_api
-from rmpa.ros.aio.node import Node
+from rmpa.observe.io.control_client import ControlClient
+from rmpa.ros.http.client import call_api
+from rmpa.ros.node.node import Node
+from rmpa.runtime.realtime import SchedulingRequest
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
     from pathlib import Path
 
-    from rmpa.monitor.snapshot import Snapshot
+    from rmpa.observe.snapshot import Snapshot
 
 DEADLINE: Final = 20.0
 MESSAGES: Final = 20_000
@@ -142,8 +142,10 @@ async def test_the_collector_is_the_interpreters_again_when_the_agent_ends(
 
 async def test_the_snapshot_shows_what_was_granted(settings: Callable[[str], Settings], tmp_path: Path) -> None:
     wishes = (
-        Wish("SCHED_FIFO", True, "priority 50"),
-        Wish("memory lock", False, "Operation not permitted", "put LimitMEMLOCK=infinity into the systemd unit"),
+        SchedulingRequest("SCHED_FIFO", True, "priority 50"),
+        SchedulingRequest(
+            "memory lock", False, "Operation not permitted", "put LimitMEMLOCK=infinity into the systemd unit"
+        ),
     )
     agent = Agent(settings("a"), wishes)
     await agent.start()

@@ -17,9 +17,9 @@ import pytest
 
 from rmpa.agent import reload
 from rmpa.agent.reload import Hangups, Reloader
-from rmpa.core.config import HostPort, PeerRule, PolicySettings, Settings
-from rmpa.core.config_sources import Flags, Loaded, load_settings
-from rmpa.core.contract import Rule
+from rmpa.config.settings import HostPort, PeerRule, PolicySettings, Settings
+from rmpa.config.sources import Flags, Loaded, load_settings
+from rmpa.core.contract import ContractRule
 from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ NEW = replace(
     OLD,
     policy=PolicySettings(deny=("/secret",)),
     peers=(PeerRule("b", "/b"),),
-    contracts=(Rule(("/a",), (), {"depth": 3}),),
+    contracts=(ContractRule(("/a",), (), {"depth": 3}),),
     log_level="debug",
     port=40001,
     seeds=(HostPort("10.0.0.1", 7),),

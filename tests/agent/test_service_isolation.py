@@ -9,12 +9,12 @@ from typing import Final
 
 import pytest
 
-from rmpa.core.aio.loop import AgentLoop
-from rmpa.ros.aio.service_client import ServiceConnection, ServiceFailed
-from rmpa.ros.aio.service_server import ServiceEndpoint
-from rmpa.ros.aio.slave_server import SlaveNode
-from rmpa.ros.services import ServiceDescription, client_header
-from rmpa.ros.tcpros import encode_header
+from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
+from rmpa.ros.node.service_server import ServiceEndpoint
+from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.ros.wire.services import ServiceDescription, client_header
+from rmpa.ros.wire.tcpros import encode_header
+from rmpa.runtime.event_loop import AgentLoop
 from tests.agent.test_isolation import BOUND, DEADLINE, STRAYS, Watched, watched
 
 __all__ = ["watched"]  # a fixture, used by its name

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.config.settings import PeerRule, ServiceRule, ServiceSettings, Settings
 from rmpa.core import limits
-from rmpa.core.config import PeerRule, ServiceRule, ServiceSettings, Settings
 from rmpa.core.errors import PeerRefused
-from rmpa.ros.aio.service_client import ServiceConnection
-from rmpa.ros.aio.service_server import ServiceCall, ServiceEndpoint
-from rmpa.ros.aio.slave_server import SlaveNode
-from rmpa.ros.services import ServiceDescription
+from rmpa.ros.node.service_client import ServiceConnection
+from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
+from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.ros.wire.services import ServiceDescription
 from tests.agent.test_agent import running, settings, until
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.core.aio.loop import AgentLoop
-from rmpa.core.config import PeerRule, ServiceSettings
+from rmpa.config.settings import PeerRule, ServiceSettings
+from rmpa.runtime.event_loop import AgentLoop
 from tests.agent.test_isolation import NODES, STRAYS, Watched, World, call, calls, watched, worlds
 from tests.agent.test_services import connect, serving
 

@@ -9,18 +9,18 @@ import pytest
 
 from rmpa.core import limits
 from rmpa.core.errors import UnreachableError
-from rmpa.ros.aio import http_client
-from rmpa.ros.aio.publication import Publication
-from rmpa.ros.aio.slave_server import SlaveNode
-from rmpa.ros.tcpros import Description
+from rmpa.ros.http import client
+from rmpa.ros.node.publication import Publication
+from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.ros.wire.tcpros import TopicDescription
 from tests.agent.test_agent import node, running, settings, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.agent import Agent
-    from rmpa.core.config import Settings
-    from rmpa.monitor.diagnosis import Diagnosis
+    from rmpa.config.settings import Settings
+    from rmpa.observe.why.diagnosis import Diagnosis
 
 __all__ = ["settings"]
 NAME = "nosuchhost.invalid"
@@ -45,7 +45,7 @@ class Resolver:
 @pytest.fixture
 def resolver(monkeypatch: pytest.MonkeyPatch) -> Resolver:
     made = Resolver()
-    monkeypatch.setattr(http_client, "_resolve", made)
+    monkeypatch.setattr(client, "_resolve", made)
     monkeypatch.setattr(limits, "NODE_CHECK_INTERVAL", 0.05)
     monkeypatch.setattr(limits, "NODE_UNREACHABLE_AFTER", 0.3)
     monkeypatch.setattr(limits, "RECONCILE_INTERVAL", 0.1)
@@ -57,7 +57,7 @@ async def registered_by_name(agent: Agent) -> AsyncIterator[None]:
     """A node that publishes and serves, and tells the core a host name that nobody knows."""
     cam = SlaveNode("/cam", "127.0.0.1", agent.core.uri, advertised_host=NAME)
     await cam.start()
-    cam.add_publication(Publication("/image", "/cam", Description("std_msgs/String", MD5, "string data\n")))
+    cam.add_publication(Publication("/image", "/cam", TopicDescription("std_msgs/String", MD5, "string data\n")))
     call, shoot = agent.core.call, cam.service_uri
     call("registerPublisher", "/cam", "/image", "std_msgs/String", cam.uri)
     call("registerService", "/cam", "/shoot", shoot, cam.uri)

@@ -13,7 +13,7 @@ import pytest
 
 from bench.bed import NODES
 from rmpa.experiments.bed.agents import last_link
-from rmpa.monitor.snapshot import AgentInfo, LinkInfo, PeerInfo, Snapshot
+from rmpa.observe.snapshot import AgentInfo, LinkInfo, PeerInfo, Snapshot
 
 
 def snapshot(**links: float | None) -> Snapshot:

@@ -19,10 +19,10 @@ STRACE = """% time     seconds  usecs/call     calls    errors syscall
 100.00    0.312472          46      2284         2 total
 """
 STACKS = """\
-main (rmpa:1);Loop.run_forever (asyncio/base_events.py:593);Stream._uncork (rmpa/core/aio/stream.py:269) 6
-main (rmpa:1);Loop.run_forever (asyncio/base_events.py:593);Stream._deliver (rmpa/core/aio/stream.py:391) 2
+main (rmpa:1);Loop.run_forever (asyncio/base_events.py:593);Stream._uncork (rmpa/runtime/stream.py:269) 6
+main (rmpa:1);Loop.run_forever (asyncio/base_events.py:593);Stream._deliver (rmpa/runtime/stream.py:391) 2
 main (rmpa:1);Loop.run_forever (asyncio/base_events.py:593);Link.receive (rmpa/mesh/link.py:258) 2
-main (rmpa:1);Loop.run_forever (asyncio/base_events.py:593);DirectSelector.select (rmpa/core/aio/loop.py:1) 90
+main (rmpa:1);Loop.run_forever (asyncio/base_events.py:593);DirectSelector.select (rmpa/runtime/event_loop.py:1) 90
 Thread._bootstrap (threading.py:1002);_worker (concurrent/futures/thread.py:81) 50
 """
 
@@ -43,8 +43,8 @@ def test_strace_most_calls_first_and_no_total() -> None:
 
 def test_stacks_without_what_only_waits() -> None:
     functions, modules = parse_stacks(STACKS)
-    assert functions["Stream._uncork (rmpa/core/aio/stream.py:269)"] == 60.0
-    assert modules == {"rmpa/core/aio/stream.py": 80.0, "rmpa/mesh/link.py": 20.0}
+    assert functions["Stream._uncork (rmpa/runtime/stream.py:269)"] == 60.0
+    assert modules == {"rmpa/runtime/stream.py": 80.0, "rmpa/mesh/link.py": 20.0}
     assert parse_stacks("") == ({}, {})
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from bench.bed import NODES
-from rmpa.ros.aio.core import RosCore
+from rmpa.ros.core.embedded import RosCore
 
 if TYPE_CHECKING:
     from types import ModuleType

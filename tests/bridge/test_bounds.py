@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 
 from rmpa.bridge.actions import Action, Publish, Retract, Send, Warn
 from rmpa.bridge.bounds import Beyond, NodePlaces, Surplus, from_json, to_json
-from rmpa.bridge.imports import Imports
-from rmpa.bridge.messages import Advertise, AdvertiseServices, Offer, ServiceOffer, Source
+from rmpa.bridge.messages import Advertise, AdvertiseServices, ServiceOffer, Source, TopicOffer
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.exports import LocalService, ServiceExports
 from rmpa.bridge.services.imports import ImportAction, Provide, ServiceImports, Withdraw
-from rmpa.core.config import LimitSettings, PolicySettings, ServiceSettings
+from rmpa.bridge.topics.imports import Imports
+from rmpa.config.settings import LimitSettings, PolicySettings, ServiceSettings
 from rmpa.core.contract import Contracts
 from tests.bridge.services.test_rules import obey, rules
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
-def offers(nodes: range, topics: int = 1) -> tuple[Offer, ...]:
-    return tuple(Offer(f"/n{n}/t{t}", f"/n{n}", "a/B") for n in nodes for t in range(topics))
+def offers(nodes: range, topics: int = 1) -> tuple[TopicOffer, ...]:
+    return tuple(TopicOffer(f"/n{n}/t{t}", f"/n{n}", "a/B") for n in nodes for t in range(topics))
 
 
 def imports(*, nodes: int = 100, topics: int = 100) -> Imports:
@@ -55,7 +55,7 @@ def test_nodes_beyond_the_limit_are_hidden_counted_and_named() -> None:
     assert entry is not None
     assert entry.crowded
     assert "limits.nodes = 2 of this module" in entry.hidden
-    more = Offer("/late", "/n0", "a/B")
+    more = TopicOffer("/late", "/n0", "a/B")
     assert published(made.advertised(1, Advertise(added=(more,)))) == ["/late"], "its node has a place"
 
 
@@ -73,7 +73,7 @@ def test_a_node_that_leaves_gives_its_place_to_the_one_that_waits_for_longest() 
 
 def test_what_policy_hides_takes_no_place() -> None:
     made = imports(nodes=1)
-    secret = Offer("/secret", "/other", "a/B")
+    secret = TopicOffer("/secret", "/other", "a/B")
     assert made.advertised(1, Advertise(added=(secret,))) == []
     assert published(made.advertised(1, Advertise(added=offers(range(1))))) == ["/n0/t0"]
     assert not made.crowded(1)
@@ -145,7 +145,7 @@ def test_whatever_comes_and_goes_the_limits_hold_and_no_place_stays_empty(
     made = imports(nodes=nodes, topics=topics)
     there: set[Source] = set()
     for comes, node, topic in events:
-        offer = Offer(f"/n{node}/t{topic}", f"/n{node}", "a/B")
+        offer = TopicOffer(f"/n{node}/t{topic}", f"/n{node}", "a/B")
         if comes:
             there.add(offer.source)
             made.advertised(1, Advertise(added=(offer,)))
@@ -168,9 +168,9 @@ def reload_nodes(made: Imports, nodes: int, *denied: str) -> Iterator[list[Actio
     return made.rules(policy, Contracts(), Names(), 0.0, LimitSettings(nodes=nodes))
 
 
-def of_nodes(nodes: str, *topics: str) -> tuple[Offer, ...]:
+def of_nodes(nodes: str, *topics: str) -> tuple[TopicOffer, ...]:
     """Topic by topic."""
-    return tuple(Offer(f"/{node}/{topic}", f"/{node}", "a/B") for topic in topics for node in nodes)
+    return tuple(TopicOffer(f"/{node}/{topic}", f"/{node}", "a/B") for topic in topics for node in nodes)
 
 
 @pytest.mark.timeout(10)
@@ -224,7 +224,7 @@ _Step = tuple[bool, int, int] | tuple[int, set[int]] | int
 @pytest.mark.timeout(60)
 @given(st.lists(st.sampled_from(offers(range(7), 3)), unique=True), _steps)
 def test_whatever_is_reloaded_while_nodes_come_and_go_the_places_are_taken_and_the_rest_is_counted(
-    first: list[Offer], steps: list[_Step]
+    first: list[TopicOffer], steps: list[_Step]
 ) -> None:
     made = imports(nodes=6)
     made.advertised(1, Advertise(added=tuple(first)))
@@ -238,7 +238,7 @@ def test_whatever_is_reloaded_while_nodes_come_and_go_the_places_are_taken_and_t
             under_way = reload_nodes(made, limit, *(f"/n{node}" for node in denied))
         else:
             comes, node, topic = step
-            offer = Offer(f"/n{node}/t{topic}", f"/n{node}", "a/B")
+            offer = TopicOffer(f"/n{node}/t{topic}", f"/n{node}", "a/B")
             message = Advertise(added=(offer,)) if comes else Advertise(removed=(offer.source,))
             made.advertised(1, message)
     assert len(list(islice(under_way, 100))) < 100

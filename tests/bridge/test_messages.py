@@ -12,25 +12,25 @@ from rmpa.bridge import messages
 from rmpa.bridge.messages import (
     Advertise,
     AdvertiseServices,
-    Answer,
-    Ask,
     Audience,
-    Close,
-    Closed,
+    CloseRoute,
     CloseService,
     Description,
     Message,
     Mismatch,
-    Offer,
-    Open,
-    Opened,
+    Notification,
+    OpenRoute,
     OpenService,
     Origin,
+    Request,
+    Response,
+    RouteClosed,
+    RouteOpened,
     ServiceClosed,
     ServiceOffer,
     ServiceOpened,
     Source,
-    Tell,
+    TopicOffer,
     decode,
     encode,
 )
@@ -69,7 +69,7 @@ def relayed(**changed: object) -> bytes:
 
 GOLDEN: list[tuple[Message, bytes]] = [
     (
-        Advertise(added=(Offer("/cmd", "/joy", "sensor_msgs/Joy"),), full=True),
+        Advertise(added=(TopicOffer("/cmd", "/joy", "sensor_msgs/Joy"),), full=True),
         (
             b'{"op":"advertise","added":[{"topic":"/cmd","node":"/joy","type":"sensor_msgs/Joy"}],'
             b'"removed":[],"full":true,"more":false}'
@@ -78,7 +78,7 @@ GOLDEN: list[tuple[Message, bytes]] = [
     (
         Advertise(
             added=(
-                Offer(
+                TopicOffer(
                     "/cmd", "/rmpa/pad/joy", "sensor_msgs/Joy", Origin("pad", "10.0.0.1:4000#7", PAD, "/joy", (R,))
                 ),
             )
@@ -97,11 +97,11 @@ GOLDEN: list[tuple[Message, bytes]] = [
         b'{"op":"advertise","added":[],"removed":[{"topic":"/cmd","node":"/joy"}],"full":false,"more":false}',
     ),
     (
-        Open(7, "/cmd", "/joy"),
+        OpenRoute(7, "/cmd", "/joy"),
         b'{"op":"open","route":7,"topic":"/cmd","node":"/joy",' + DEFAULT + b',"epoch":0,"after":0}',
     ),
     (
-        Open(7, "/cmd", "/joy", STRICT, epoch=3, after=4711),
+        OpenRoute(7, "/cmd", "/joy", STRICT, epoch=3, after=4711),
         (
             b'{"op":"open","route":7,"topic":"/cmd","node":"/joy","contract":{"reliability":"reliable",'
             b'"durability":"transient_local","history":"keep_all","depth":5,"deadline":0.5,"lifespan":2.0,'
@@ -110,14 +110,14 @@ GOLDEN: list[tuple[Message, bytes]] = [
         ),
     ),
     (
-        Opened(7, Description("sensor_msgs/Joy", "5a9ea5f83505693b71e785041e67a8bb", "Header header\n", True)),
+        RouteOpened(7, Description("sensor_msgs/Joy", "5a9ea5f83505693b71e785041e67a8bb", "Header header\n", True)),
         (
             b'{"op":"opened","route":7,"description":{"type":"sensor_msgs/Joy","md5":"5a9ea5f83505693b71e785041e67a8bb",'
             b'"definition":"Header header\\n","latching":true},' + DEFAULT + b',"epoch":0,"first":1}'
         ),
     ),
     (
-        Opened(7, Description("a/B", ADD_MD5, "", False), STRICT, 3, 1, following=4711),
+        RouteOpened(7, Description("a/B", ADD_MD5, "", False), STRICT, 3, 1, following=4711),
         (
             b'{"op":"opened","route":7,"description":{"type":"a/B","md5":"6a2e34150c00229791cc89ff309fff21",'
             b'"definition":"","latching":false},"contract":{"reliability":"reliable",'
@@ -127,14 +127,14 @@ GOLDEN: list[tuple[Message, bytes]] = [
         ),
     ),
     (
-        Opened(7, Description("a/B", ADD_MD5, "", False), epoch=4, lost=7046, at_least=True),
+        RouteOpened(7, Description("a/B", ADD_MD5, "", False), epoch=4, lost=7046, at_least=True),
         (
             b'{"op":"opened","route":7,"description":{"type":"a/B","md5":"6a2e34150c00229791cc89ff309fff21",'
             b'"definition":"","latching":false},' + DEFAULT + b',"epoch":4,"first":1,"lost":7046,"at_least":true}'
         ),
     ),
-    (Close(7), b'{"op":"close","route":7}'),
-    (Closed(7, "the node has gone"), b'{"op":"closed","route":7,"reason":"the node has gone"}'),
+    (CloseRoute(7), b'{"op":"close","route":7}'),
+    (RouteClosed(7, "the node has gone"), b'{"op":"closed","route":7,"reason":"the node has gone"}'),
     (
         Mismatch("/cmd", "/joy", "/base", "md5"),
         b'{"op":"mismatch","topic":"/cmd","node":"/joy","subscriber":"/base","text":"md5"}',
@@ -179,12 +179,12 @@ GOLDEN: list[tuple[Message, bytes]] = [
         ServiceClosed(1 << 31 | 1, "its server has gone"),
         b'{"op":"service_closed","route":2147483649,"reason":"its server has gone"}',
     ),
-    (Ask(3, "param.get", {"key": "/a"}), b'{"op":"ask","number":3,"what":"param.get","args":{"key":"/a"}}'),
+    (Request(3, "param.get", {"key": "/a"}), b'{"op":"ask","number":3,"what":"param.get","args":{"key":"/a"}}'),
     (
-        Answer(3, ok=False, error="no /a", remedy="set it"),
+        Response(3, ok=False, error="no /a", remedy="set it"),
         b'{"op":"answer","number":3,"ok":false,"value":null,"error":"no /a","remedy":"set it"}',
     ),
-    (Tell("param.changed", {"key": "/a"}), b'{"op":"tell","what":"param.changed","args":{"key":"/a"}}'),
+    (Notification("param.changed", {"key": "/a"}), b'{"op":"tell","what":"param.changed","args":{"key":"/a"}}'),
 ]
 
 
@@ -314,7 +314,7 @@ def test_a_contract_that_no_file_could_have_is_the_peers_error(beginning: bytes,
 
 def test_a_release_that_knows_no_outage_goes_on_with_the_usual_one() -> None:
     message = decode(OPEN + b',"contract":{"reliability":"reliable"}}')
-    assert isinstance(message, Open)
+    assert isinstance(message, OpenRoute)
     assert message.contract.outage == limits.RESUME_WINDOW
 
 
@@ -335,7 +335,7 @@ def test_a_release_that_knows_no_outage_goes_on_with_the_usual_one() -> None:
 )
 def test_a_contract_at_its_bounds_is_taken(term: str) -> None:
     message = decode(OPEN + b',"contract":{' + term.encode() + b"}}")
-    assert isinstance(message, Open)
+    assert isinstance(message, OpenRoute)
     assert decode(encode(message)) == message
 
 
@@ -359,7 +359,7 @@ def test_numberings_have_32_bits(numbers: bytes) -> None:
 
 
 def test_a_peer_of_before_contracts_gets_the_default_one() -> None:
-    assert decode(OPEN + b"}") == Open(1, "/a", "/b", Contract(), epoch=0, after=0)
+    assert decode(OPEN + b"}") == OpenRoute(1, "/a", "/b", Contract(), epoch=0, after=0)
 
 
 def test_a_message_beyond_the_limit_is_not_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -370,13 +370,13 @@ def test_a_message_beyond_the_limit_is_not_parsed(monkeypatch: pytest.MonkeyPatc
 
 def test_too_many_topics_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "ADVERTISED_MAX", 2)
-    offers = tuple(Offer(f"/t{i}", "/n", "a/B") for i in range(3))
+    offers = tuple(TopicOffer(f"/t{i}", "/n", "a/B") for i in range(3))
     with pytest.raises(LimitExceeded, match="in topics"):
         decode(encode(Advertise(added=offers)))
 
 
 def test_fields_of_later_versions_are_ignored() -> None:
-    assert decode(b'{"op":"close","route":1,"hurry":true}') == Close(1)
+    assert decode(b'{"op":"close","route":1,"hurry":true}') == CloseRoute(1)
 
 
 _names = st.from_regex(r"/[a-z][a-z0-9_]{0,8}(/[a-z][a-z0-9_]{0,8}){0,3}", fullmatch=True)
@@ -403,22 +403,22 @@ _services = st.builds(ServiceOffer, _names, _names)
 _messages: st.SearchStrategy[Message] = st.one_of(
     st.builds(
         Advertise,
-        added=st.lists(st.builds(Offer, _names, _names, _types), max_size=5).map(tuple),
+        added=st.lists(st.builds(TopicOffer, _names, _names, _types), max_size=5).map(tuple),
         removed=st.lists(st.builds(Source, _names, _names), max_size=5).map(tuple),
         full=st.booleans(),
         more=st.booleans(),
     ),
-    st.builds(Open, _routes, _names, _names, _contracts, _numbers, _numbers),
+    st.builds(OpenRoute, _routes, _names, _names, _contracts, _numbers, _numbers),
     st.builds(
-        Opened,
+        RouteOpened,
         _routes,
         st.builds(Description, _types, _md5s, st.text(st.characters(max_codepoint=255)), st.booleans()),
         _contracts,
         _numbers,
         _numbers,
     ),
-    st.builds(Close, _routes),
-    st.builds(Closed, _routes, st.text()),
+    st.builds(CloseRoute, _routes),
+    st.builds(RouteClosed, _routes, st.text()),
     st.builds(Mismatch, _names, _names, st.text(), st.text()),
     st.builds(Audience, _routes, st.lists(_names, max_size=5).map(tuple)),
     st.builds(AdvertiseServices, st.lists(_services).map(tuple), st.lists(_names).map(tuple), st.booleans()),

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.bridge.naming import Names, PeerNames
-from rmpa.core.config import PeerRule, Remap
+from rmpa.config.settings import PeerRule, Remap
 
 ROBOT = PeerRule(
     "robot*",

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from rmpa.bridge.actions import Send
-from rmpa.bridge.exports import Exports, LocalSource
 from rmpa.bridge.pacing import Pacing
 from rmpa.bridge.policy import Policy
+from rmpa.bridge.topics.exports import Exports, LocalSource
+from rmpa.config.settings import PolicySettings
 from rmpa.core import limits
-from rmpa.core.config import PolicySettings
 
 
 def test_a_portion_waits_while_the_lane_is_busy_but_not_for_ever() -> None:

@@ -19,23 +19,23 @@ from rmpa.bridge.actions import (
     Retract,
     Send,
 )
-from rmpa.bridge.exports import Exports, LocalSource
-from rmpa.bridge.imports import Imports, RouteState
 from rmpa.bridge.messages import (
     Advertise,
-    Close,
-    Closed,
+    CloseRoute,
     Description,
     Message,
     Mismatch,
-    Open,
-    Opened,
+    OpenRoute,
+    RouteClosed,
+    RouteOpened,
     Source,
     decode,
     encode,
 )
 from rmpa.bridge.policy import Policy
-from rmpa.core.config import PolicySettings
+from rmpa.bridge.topics.exports import Exports, LocalSource
+from rmpa.bridge.topics.imports import Imports, RouteState
+from rmpa.config.settings import PolicySettings
 
 SOURCES = [Source("/a", "/n"), Source("/a", "/m"), Source("/b", "/n")]
 ABOUT = Description("a/B", "5a9ea5f83505693b71e785041e67a8bb", "", False)
@@ -63,7 +63,7 @@ class World:
     def act(self, actions: list[Action]) -> None:
         for action in actions:
             match action:
-                case Send(_, Advertise() | Opened() | Closed() as message):
+                case Send(_, Advertise() | RouteOpened() | RouteClosed() as message):
                     self.to_importer.append(encode(message))
                 case Send(_, message):
                     self.to_exporter.append(encode(message))
@@ -111,18 +111,18 @@ class World:
                 self.act(self.imports.advertised(1, message))
                 for source in self.wanted & self.visible:
                     self.act(self.imports.demand(1, source, self.now, wanted=True))
-            case Opened():
+            case RouteOpened():
                 self.act(self.imports.opened(1, message, self.now))
-            case Closed():
+            case RouteClosed():
                 self.act(self.imports.closed(1, message, self.now))
             case _:
                 raise AssertionError(message)
 
     def _export(self, message: Message) -> None:
         match message:
-            case Open():
+            case OpenRoute():
                 self.act(self.exports.opened(1, message))
-            case Close():
+            case CloseRoute():
                 self.act(self.exports.closed(1, message))
             case Mismatch():
                 pass

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from rmpa.bridge.policy import BUILT_IN_DENY, Policy
-from rmpa.core.config import PolicySettings
+from rmpa.config.settings import PolicySettings
 
 
 @pytest.mark.parametrize(

@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.bridge.actions import Action, Publish, Retract, Send
-from rmpa.bridge.exports import Exports, LocalSource
-from rmpa.bridge.imports import Imports
 from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, Source, decode, encode
 from rmpa.bridge.policy import Policy
-from rmpa.bridge.relay import Linked, Relay, Ways, may_have
+from rmpa.bridge.relay import LinkedPeer, Relay, RelayPaths, may_have
 from rmpa.bridge.services.exports import ExportAction, LocalService, ServiceExports
 from rmpa.bridge.services.imports import ImportAction, Provide, ServiceImports, Withdraw
 from rmpa.bridge.services.rules import ServiceRules
+from rmpa.bridge.topics.exports import Exports, LocalSource
+from rmpa.bridge.topics.imports import Imports
+from rmpa.config.settings import PolicySettings, ServiceSettings
 from rmpa.core import limits
-from rmpa.core.config import PolicySettings, ServiceSettings
 from rmpa.core.guid import Guid
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ class Map:
             module = self.modules[here]
             module.numbers += 1
             number = module.links[there] = module.numbers
-            who = Linked(f"m{there}", instance(there), Guid(there))
+            who = LinkedPeer(f"m{there}", instance(there), Guid(there))
             self.act(here, module.imports.link_up(number, f"m{there}", who))
             self.act(here, module.exports.link_up(number, f"m{there}", instance(there)))
             self.act(here, module.service_imports.link_up(number, f"m{there}", there, instance(there)))
@@ -277,9 +277,9 @@ def test_nothing_goes_back_where_it_came_from() -> None:
 
 
 def test_the_way_is_told_and_what_came_round_is_not_shown() -> None:
-    ways = Ways()
+    ways = RelayPaths()
     ways.instance = instance(9)
-    ways.linked(1, Linked("r", instance(2), Guid(2)))
+    ways.linked(1, LinkedPeer("r", instance(2), Guid(2)))
     assert not ways.learn(1, origin(9, 2))
     assert ways.why_not(1, origin(9, 2)) == "it is ours, and came back by a relay"
     assert not ways.learn(1, origin(1, 9, 2))

@@ -22,25 +22,25 @@ from rmpa.bridge.actions import (
     Send,
     Warn,
 )
-from rmpa.bridge.exports import Exports, LocalSource
-from rmpa.bridge.imports import Imports, RouteState
 from rmpa.bridge.messages import (
     Advertise,
-    Close,
-    Closed,
+    CloseRoute,
     Description,
     Mismatch,
-    Offer,
-    Open,
-    Opened,
+    OpenRoute,
+    RouteClosed,
+    RouteOpened,
     Source,
+    TopicOffer,
     decode,
     encode,
 )
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
-from rmpa.core.config import PeerRule, PolicySettings, Remap
-from rmpa.core.contract import Contract, Contracts, Priority, Reliability, Rule
+from rmpa.bridge.topics.exports import Exports, LocalSource
+from rmpa.bridge.topics.imports import Imports, RouteState
+from rmpa.config.settings import PeerRule, PolicySettings, Remap
+from rmpa.core.contract import Contract, ContractRule, Contracts, Priority, Reliability
 
 TYPE = "a/B"
 ABOUT = Description(TYPE, "5a9ea5f83505693b71e785041e67a8bb", "", False)
@@ -52,7 +52,7 @@ class Side:
     """The rules of one module."""
 
     def __init__(
-        self, *peers: PeerRule, policy: PolicySettings = EVERYTHING, contracts: tuple[Rule, ...] = ()
+        self, *peers: PeerRule, policy: PolicySettings = EVERYTHING, contracts: tuple[ContractRule, ...] = ()
     ) -> None:
         self.policy = Policy(policy, peers)
         self.contracts = Contracts(contracts)
@@ -86,7 +86,7 @@ def say(exports: Exports, *names: str, node: str = "/n") -> list[Action]:
 
 
 def learn(imports: Imports, *names: str, peer: int = 1, node: str = "/n") -> list[Action]:
-    return imports.advertised(peer, Advertise(added=tuple(Offer(name, node, TYPE) for name in names)))
+    return imports.advertised(peer, Advertise(added=tuple(TopicOffer(name, node, TYPE) for name in names)))
 
 
 def changed(imports: Imports, side: Side) -> list[Action]:
@@ -102,12 +102,12 @@ def test_what_we_publish_under_a_robots_prefix_is_offered_to_it_without() -> Non
     assert offered(exports.link_up(1, "robot1")) == [("+", "/cmd_vel"), ("+", "/robot2/cmd_vel"), ("+", "/map")]
     assert offered(exports.link_up(2, "base")) == [("+", "/robot1/cmd_vel"), ("+", "/robot2/cmd_vel"), ("+", "/map")]
     cmd = Source("/robot1/cmd_vel", "/n")
-    assert exports.opened(1, Open(1, "/cmd_vel", "/n")) == [Connect(cmd, TYPE, "http://127.0.0.1:4000/")]
+    assert exports.opened(1, OpenRoute(1, "/cmd_vel", "/n")) == [Connect(cmd, TYPE, "http://127.0.0.1:4000/")]
     assert exports.local(1, Source("/cmd_vel", "/n")) == cmd
     assert exports.local(1, cmd) is None
-    [closed] = exports.opened(1, Open(2, "/robot1/cmd_vel", "/n"))
+    [closed] = exports.opened(1, OpenRoute(2, "/robot1/cmd_vel", "/n"))
     assert isinstance(closed, Send)
-    assert isinstance(closed.message, Closed)
+    assert isinstance(closed.message, RouteClosed)
 
 
 def test_a_peer_gets_no_more_than_its_rules_allow() -> None:
@@ -116,8 +116,8 @@ def test_a_peer_gets_no_more_than_its_rules_allow() -> None:
     say(exports, "/guest/a", "/guest/private", "/pose", "/secret")
     assert offered(exports.link_up(1, "guest")) == [("+", "/guest/a"), ("+", "/pose")]
     assert offered(exports.link_up(2, "friend")) == [("+", "/guest/a"), ("+", "/pose"), ("+", "/secret")]
-    [closed] = exports.opened(1, Open(1, "/secret", "/n"))
-    assert closed == Send(1, Closed(1, "/secret from /n: not published here, or policy keeps it home"))
+    [closed] = exports.opened(1, OpenRoute(1, "/secret", "/n"))
+    assert closed == Send(1, RouteClosed(1, "/secret from /n: not published here, or policy keeps it home"))
 
 
 def test_peers_with_rules_are_told_in_turn_and_all_others_at_once() -> None:
@@ -149,13 +149,13 @@ def test_of_two_topics_that_would_be_one_over_there_the_first_is_offered_until_i
 
 
 def test_a_contract_is_that_of_the_name_here() -> None:
-    urgent = Rule(("/robot1/cmd",), (), {"priority": Priority.HIGH})
+    urgent = ContractRule(("/robot1/cmd",), (), {"priority": Priority.HIGH})
     exports = Side(ROBOT, contracts=(urgent,)).exports()
     exports.link_up(1, "robot1")
     say(exports, "/robot1/cmd")
-    exports.opened(1, Open(1, "/cmd", "/n"))
+    exports.opened(1, OpenRoute(1, "/cmd", "/n"))
     [opened, route] = exports.described(Source("/robot1/cmd", "/n"), ABOUT)
-    assert opened == Send(1, Opened(1, ABOUT, Contract(priority=Priority.HIGH)))
+    assert opened == Send(1, RouteOpened(1, ABOUT, Contract(priority=Priority.HIGH)))
     assert isinstance(route, AddRoute)
 
 
@@ -166,7 +166,7 @@ def test_new_rules_end_and_begin_what_they_are_about_and_nothing_else() -> None:
     say(exports, "/a", "/b", "/c")
     for peer in (1, 2):
         for route, topic in enumerate(("/a", "/b", "/c"), 1):
-            exports.opened(peer, Open(route, topic, "/n"))
+            exports.opened(peer, OpenRoute(route, topic, "/n"))
     for topic in ("/a", "/b", "/c"):
         exports.described(Source(topic, "/n"), ABOUT)
     rule = PeerRule("robot*", "", (), (Remap("/b", "/bee"),), PolicySettings(deny=("/c",)))
@@ -197,16 +197,16 @@ def test_a_route_whose_contract_changes_here_is_closed_so_that_its_peer_asks_aga
     exports.link_up(1, "base")
     say(exports, "/a", "/b")
     for route, topic in enumerate(("/a", "/b"), 1):
-        exports.opened(1, Open(route, topic, "/n", asked))
+        exports.opened(1, OpenRoute(route, topic, "/n", asked))
         exports.described(Source(topic, "/n"), ABOUT)
-    new = Side(contracts=(Rule(("/b",), (), {"depth": 7}),))
+    new = Side(contracts=(ContractRule(("/b",), (), {"depth": 7}),))
     actions = exports.rules(new.policy, new.contracts, new.names)
     assert actions == [
         RemoveRoute(Source("/b", "/n"), 1, 2),
         Disconnect(Source("/b", "/n")),
-        Send(1, Closed(2, "its contract has changed here")),
+        Send(1, RouteClosed(2, "its contract has changed here")),
     ]
-    exports.opened(1, Open(3, "/b", "/n", asked))
+    exports.opened(1, OpenRoute(3, "/b", "/n", asked))
     assert exports.contract(Source("/b", "/n"), 1) == replace(asked, depth=7)
     assert exports.rules(new.policy, new.contracts, new.names) == []
 
@@ -222,13 +222,13 @@ def test_robots_that_are_all_alike_have_each_its_namespace_here() -> None:
     assert learn(imports, "/odom", peer=1) == [Publish(1, odom, TYPE, "/robot1/odom")]
     assert learn(imports, "/odom", peer=2) == [Publish(2, odom, TYPE, "/robot2/odom")]
     assert learn(imports, "/odom", peer=3) == [Publish(3, odom, TYPE)]
-    assert imports.demand(2, odom, 0.0, wanted=True) == [Send(2, Open(1, "/odom", "/n"))]
+    assert imports.demand(2, odom, 0.0, wanted=True) == [Send(2, OpenRoute(1, "/odom", "/n"))]
     assert list(imports.offered_by(1)) == ["/robot1/odom"]
 
 
 def test_policy_types_and_contracts_go_by_the_name_here() -> None:
     rule = replace(ROBOT, policy=PolicySettings(deny=("/{peer}/camera/**",)))
-    urgent = Rule(("/robot1/odom",), (), {"priority": Priority.HIGH})
+    urgent = ContractRule(("/robot1/odom",), (), {"priority": Priority.HIGH})
     side = Side(rule, policy=PolicySettings(deny=("/robot1/private",)), contracts=(urgent,))
     imports = side.imports()
     imports.link_up(1, "robot1")
@@ -241,7 +241,7 @@ def test_policy_types_and_contracts_go_by_the_name_here() -> None:
         "/private": "bridge.deny has '/robot1/private'",
     }
     [opened] = imports.demand(1, Source("/odom", "/n"), 0.0, wanted=True)
-    assert opened == Send(1, Open(1, "/odom", "/n", Contract(priority=Priority.HIGH)))
+    assert opened == Send(1, OpenRoute(1, "/odom", "/n", Contract(priority=Priority.HIGH)))
     actions = imports.local_type("/robot1/odom", "x/Y")
     assert Retract(1, Source("/odom", "/n")) in actions
     assert Mismatch("/odom", "/n", "", imports.get(1, Source("/odom", "/n")).hidden) in [  # type: ignore[union-attr]
@@ -269,15 +269,15 @@ def test_new_names_and_policy_here_leave_all_else_alone() -> None:
     learn(imports, "/a", "/b", "/c")
     for route, topic in enumerate(("/a", "/b", "/c"), 1):
         imports.demand(1, Source(topic, "/n"), 0.0, wanted=True)
-        imports.opened(1, Opened(route, ABOUT), 0.0)
+        imports.opened(1, RouteOpened(route, ABOUT), 0.0)
     b, c = Source("/b", "/n"), Source("/c", "/n")
     new = Side(PeerRule("p", "", (Remap("/b", "/bee"),)), policy=PolicySettings(deny=("/c",)))
     assert changed(imports, new) == [
-        Send(1, Close(2)),
+        Send(1, CloseRoute(2)),
         Detach(1, b, 2),
         Retract(1, b),
         Publish(1, b, TYPE, "/bee"),
-        Send(1, Close(3)),
+        Send(1, CloseRoute(3)),
         Detach(1, c, 3),
         Retract(1, c),
     ]
@@ -294,13 +294,13 @@ def test_a_route_whose_contract_changes_here_is_opened_anew() -> None:
     learn(imports, "/a", "/b")
     for route, topic in enumerate(("/a", "/b"), 1):
         imports.demand(1, Source(topic, "/n"), 0.0, wanted=True)
-        imports.opened(1, Opened(route, ABOUT), 0.0)
-    new = Side(contracts=(Rule(("/b",), (), {"depth": 7}),))
+        imports.opened(1, RouteOpened(route, ABOUT), 0.0)
+    new = Side(contracts=(ContractRule(("/b",), (), {"depth": 7}),))
     b = Source("/b", "/n")
     assert changed(imports, new) == [
-        Send(1, Close(2)),
+        Send(1, CloseRoute(2)),
         Detach(1, b, 2, missed=True),
-        Send(1, Open(3, "/b", "/n", Contract(depth=7))),
+        Send(1, OpenRoute(3, "/b", "/n", Contract(depth=7))),
     ]
     assert changed(imports, new) == []
 
@@ -338,7 +338,7 @@ class World:
     def act(self, actions: list[Action]) -> None:
         for action in actions:
             match action:
-                case Send(_, Advertise() | Opened() | Closed() as message):
+                case Send(_, Advertise() | RouteOpened() | RouteClosed() as message):
                     self.to_importer.append(encode(message))
                 case Send(_, message):
                     self.to_exporter.append(encode(message))
@@ -394,16 +394,16 @@ class World:
             message = decode(self.to_importer.popleft())
             if isinstance(message, Advertise):
                 self.act(self.imports.advertised(1, message))
-            elif isinstance(message, Opened):
+            elif isinstance(message, RouteOpened):
                 self.act(self.imports.opened(1, message, self.now))
             else:
-                assert isinstance(message, Closed)
+                assert isinstance(message, RouteClosed)
                 self.act(self.imports.closed(1, message, self.now))
         elif self.to_exporter:
             message = decode(self.to_exporter.popleft())
-            if isinstance(message, Open):
+            if isinstance(message, OpenRoute):
                 self.act(self.exports.opened(1, message))
-            elif isinstance(message, Close):
+            elif isinstance(message, CloseRoute):
                 self.act(self.exports.closed(1, message))
         else:
             return False

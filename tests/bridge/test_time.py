@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 from rmpa.bridge.actions import Action, Publish, Retract, Send, Warn
-from rmpa.bridge.exports import Exports, LocalSource
-from rmpa.bridge.imports import Imports
-from rmpa.bridge.messages import Advertise, Mismatch, Offer, Source
+from rmpa.bridge.messages import Advertise, Mismatch, Source, TopicOffer
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
-from rmpa.core.config import PolicySettings, TimeSettings
+from rmpa.bridge.topics.exports import Exports, LocalSource
+from rmpa.bridge.topics.imports import Imports
+from rmpa.config.settings import PolicySettings, TimeSettings
 from rmpa.core.contract import Contracts
 
 CLOCK = "rosgraph_msgs/Clock"
@@ -29,7 +29,7 @@ def imports(follow: str, *names: str) -> Imports:
 
 
 def advertise(machine: Imports, peer: int, *sources: Source) -> list[Action]:
-    return machine.advertised(peer, Advertise(added=tuple(Offer(s.topic, s.node, CLOCK) for s in sources)))
+    return machine.advertised(peer, Advertise(added=tuple(TopicOffer(s.topic, s.node, CLOCK) for s in sources)))
 
 
 def hidden(machine: Imports, peer: int, source: Source) -> str:

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 import msgspec
 import pytest
 
-from rmpa.monitor.aio.control_server import ControlServer, Handler
-from rmpa.monitor.snapshot import PingReply, Snapshot
-from rmpa.ros.aio.core import RosCore
-from tests.monitor.samples import SNAPSHOT
+from rmpa.observe.io.control_server import ControlServer, Handler
+from rmpa.observe.snapshot import PingReply, Snapshot
+from rmpa.ros.core.embedded import RosCore
+from tests.observe.samples import SNAPSHOT
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator

@@ -13,16 +13,16 @@ import pytest
 
 from rmpa.cli.main import main
 from rmpa.core.errors import PeerRefused, UnreachableError
-from rmpa.monitor.snapshot import UnreachableInfo
-from rmpa.ros.aio.node import Node
+from rmpa.observe.snapshot import UnreachableInfo
 from rmpa.ros.environment import RosEnvironment
-from rmpa.ros.nodes import NodeEnd, NodeFacts, NodeLine, NodePing, PeerNodes
+from rmpa.ros.node.node import Node
+from rmpa.ros.node_info import NodeEnd, NodeFacts, NodeLine, NodePing, PeerNodes
 from tests.cli.conftest import with_core
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.ros.aio.core import RosCore
+    from rmpa.ros.core.embedded import RosCore
     from tests.cli.conftest import Background, Place
 
 Rmpa = Callable[..., tuple[int, str, str]]

@@ -13,12 +13,12 @@ from rmpa.cli.output import Column, duration, print_table, printable, size
 from rmpa.cli.topic_figures import facts
 from rmpa.cli.topic_pub import fill_stamps, read_values
 from rmpa.core.errors import ConfigError, RmpaError
-from rmpa.monitor.snapshot import RouteInfo
+from rmpa.observe.snapshot import RouteInfo
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.ros.messages import Plain
+    from rmpa.ros.types.messages import Plain
 
 
 @pytest.mark.parametrize(

@@ -14,16 +14,16 @@ from rmpa.bridge.params import transfer
 from rmpa.cli.param_yaml import read_documents, read_yaml, show_yaml, write_yaml
 from rmpa.core import limits
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.monitor.aio.control_server import ControlServer
-from rmpa.monitor.snapshot import FollowedInfo
-from rmpa.ros.xmlrpc import parse_response, serialize_response
-from tests.monitor.samples import SNAPSHOT
+from rmpa.observe.io.control_server import ControlServer
+from rmpa.observe.snapshot import FollowedInfo
+from rmpa.ros.wire.xmlrpc import parse_response, serialize_response
+from tests.observe.samples import SNAPSHOT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from typing import Any
 
-    from rmpa.ros.aio.core import RosCore
+    from rmpa.ros.core.embedded import RosCore
     from tests.cli.conftest import Background, Place
 
 

@@ -11,8 +11,8 @@ import msgspec
 import pytest
 
 from rmpa.core.errors import RmpaError
-from rmpa.monitor.snapshot import PeerInfo, PingReply
-from tests.monitor.samples import SNAPSHOT
+from rmpa.observe.snapshot import PeerInfo, PingReply
+from tests.observe.samples import SNAPSHOT
 
 if TYPE_CHECKING:
     from tests.cli.conftest import Place

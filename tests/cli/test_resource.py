@@ -13,23 +13,23 @@ import pytest
 
 from rmpa.cli.main import main
 from rmpa.core.errors import ConfigError
-from rmpa.resource.aio.client import ResourceClient
-from rmpa.resource.aio.known import FILE
-from rmpa.resource.aio.member import Member
-from rmpa.resource.aio.store import Store
-from rmpa.resource.declare import Resource, at_least, at_most
-from rmpa.resource.descriptor import describe
-from rmpa.resource.reconfigure import read_config
-from rmpa.resource.sightings import Sightings
-from rmpa.ros.aio.node import Node
+from rmpa.resource.declare.resource import Resource, at_least, at_most
+from rmpa.resource.run.client import ResourceClient
+from rmpa.resource.run.descriptor import describe
+from rmpa.resource.run.dynamic_reconfigure import read_config
+from rmpa.resource.run.member import Member
+from rmpa.resource.run.registry_writer import FILE
+from rmpa.resource.run.resource_registry import ResourceRegistry
+from rmpa.resource.run.store import ResourceStore
 from rmpa.ros.environment import RosEnvironment
-from tests.resource.aio.test_member import echo
+from rmpa.ros.node.node import Node
+from tests.resource.run.test_member import echo
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from rmpa.ros.aio.core import RosCore
+    from rmpa.ros.core.embedded import RosCore
     from tests.cli.conftest import Background
 
 Rmpa = Callable[..., tuple[int, str, str]]
@@ -325,7 +325,7 @@ def write_down(path: Path, *each: tuple[str, str, float]) -> None:
     """Write a module's file as ``rmpa run`` does: of each resource its path, its node, and seconds since then."""
 
     async def write() -> None:
-        store, sightings = Store(path), Sightings()
+        store, sightings = ResourceStore(path), ResourceRegistry()
         await store.open()
         for name, caller, ago in sorted(each, key=lambda one: -one[2]):
             text = describe(sonar(), name).serialize()

@@ -11,17 +11,17 @@ import pytest
 
 from rmpa.cli.main import main
 from rmpa.core.errors import RmpaError
-from rmpa.monitor.snapshot import ServiceInfo, Spread
-from rmpa.ros.aio.node import Node
+from rmpa.observe.snapshot import LatencySpread, ServiceInfo
 from rmpa.ros.environment import RosEnvironment
-from rmpa.ros.service_types import ServiceType
+from rmpa.ros.node.node import Node
+from rmpa.ros.types.service_types import ServiceType
 from tests.cli.conftest import with_core
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from rmpa.ros.aio.core import RosCore
+    from rmpa.ros.core.embedded import RosCore
     from tests.cli.conftest import Background, Place
 
 Rmpa = Callable[..., tuple[int, str, str]]
@@ -197,7 +197,7 @@ def test_info_tells_what_crosses(
     agent: Callable[..., None],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    spread = Spread(count=9, mean=0.002, sd=0, min=0.001, max=0.004, p50=0.002, p99=0.003)
+    spread = LatencySpread(count=9, mean=0.002, sd=0, min=0.001, max=0.004, p50=0.002, p99=0.003)
     services = (
         ServiceInfo(name="/add", node="/server", direction="out", policy="[services] allow", callers=("base",)),
         ServiceInfo(

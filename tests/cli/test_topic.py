@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.ros.aio.node import Node
-from rmpa.ros.messages import MessageType
+from rmpa.ros.node.node import Node
+from rmpa.ros.types.messages import MessageType
 from tests.cli.conftest import Background, Place, with_core
-from tests.ros.workspaces import package
+from tests.ros.types.workspaces import package
 
 if TYPE_CHECKING:
     import subprocess
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from rmpa.ros.aio.core import RosCore
-    from rmpa.ros.aio.topics import Publisher
+    from rmpa.ros.core.embedded import RosCore
+    from rmpa.ros.node.topics import Publisher
 
 TWIST = "{linear: {x: 0.5}, angular: {z: -1}}"
 

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core.errors import ConfigError
-from rmpa.monitor.aio.control_server import ControlServer, Handler
-from rmpa.monitor.diagnosis import Diagnosis, Stage, Verdict
-from tests.monitor.samples import SNAPSHOT
+from rmpa.observe.io.control_server import ControlServer, Handler
+from rmpa.observe.why.diagnosis import Diagnosis, PathStage, StageResult
+from tests.observe.samples import SNAPSHOT
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rmpa.monitor.snapshot import Snapshot
+    from rmpa.observe.snapshot import Snapshot
     from tests.cli.conftest import Background, Place
 
 FLOWS = Diagnosis(
@@ -25,8 +25,8 @@ FLOWS = Diagnosis(
     node="/joy",
     flows=True,
     stages=(
-        Stage("peer", Verdict.OK, "joystick is known"),
-        Stage("contract", Verdict.WARN, "3 lost", "`rmpa topic info`"),
+        PathStage("peer", StageResult.OK, "joystick is known"),
+        PathStage("contract", StageResult.WARN, "3 lost", "`rmpa topic info`"),
     ),
 )
 STOPS = Diagnosis(
@@ -35,8 +35,8 @@ STOPS = Diagnosis(
     to="base",
     flows=False,
     stages=(
-        Stage("peer", Verdict.OK, "joystick is known"),
-        Stage("publisher", Verdict.FAIL, "no node of joystick\x1b[2J publishes /cmd", "start it"),
+        PathStage("peer", StageResult.OK, "joystick is known"),
+        PathStage("publisher", StageResult.FAIL, "no node of joystick\x1b[2J publishes /cmd", "start it"),
     ),
 )
 

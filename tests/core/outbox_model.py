@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rmpa.core.outbox import ABORT, FIRST, LAST, Outbox, Parcel
-from rmpa.mesh.frames import Frame, Kind, pack_data_header, pack_fragment_header, unpack_header
+from rmpa.core.outbox import ABORT, FIRST, LAST, Outbox, QueuedMessage
+from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pack_fragment_header, unpack_header
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -28,7 +28,7 @@ def whole(key: int, number: int, size: int) -> bytes:
 
 
 def fence(key: int, number: int) -> bytes:
-    return Frame(Kind.FENCE, route=key, sequence=number).serialize()
+    return Frame(FrameKind.FENCE, route=key, sequence=number).serialize()
 
 
 @dataclass
@@ -40,7 +40,7 @@ class Entry:
     size: int
     born: float
     pinned: bool = False
-    parcel: Parcel | None = None
+    parcel: QueuedMessage | None = None
     given: int = 0
     """Bytes put in so far, of a framed one without headers."""
     begun: bool = False
@@ -85,9 +85,9 @@ class Reader:
         return read
 
     def _frame(self, kind: int, flags: int, route: int, number: int, size: int, body: bytes) -> str:
-        if kind in {Kind.HELLO, Kind.PING}:
+        if kind in {FrameKind.HELLO, FrameKind.PING}:
             return "whole"
-        if kind != Kind.DATA:
+        if kind != FrameKind.DATA:
             self._in_order(kind, route, number)
             assert route not in self.begun, "a mark in the middle of a message of its route"
             return "whole"
@@ -112,7 +112,7 @@ class Reader:
         return "part"
 
     def _in_order(self, kind: int, route: int, number: int) -> None:
-        key = (kind if kind == Kind.CONTROL else 0, route)
+        key = (kind if kind == FrameKind.CONTROL else 0, route)
         assert number > self.last.get(key, 0), "order is kept per key, marks among the messages"
         self.last[key] = number
 
@@ -225,13 +225,13 @@ class Model:
         self.seen += fresh
         for kind, route, number, length, what in self.reader.feed(fresh):
             at += HEADER + length
-            entry = self.outside.get((route, number)) if kind == Kind.DATA else None
-            if kind == Kind.CONTROL:
+            entry = self.outside.get((route, number)) if kind == FrameKind.DATA else None
+            if kind == FrameKind.CONTROL:
                 entry = self.urgent.pop(0)
                 assert entry.number == number
             elif entry is not None and what != "aborted":
                 entry.left += length
-            elif kind != Kind.HELLO and what != "aborted":
+            elif kind != FrameKind.HELLO and what != "aborted":
                 self._turn(route, number, length, what, at, now)
             if entry is not None and what == "whole":
                 self.in_flight.append((at, entry))

@@ -12,13 +12,13 @@ from rmpa.core import limits
 from rmpa.core.contract import (
     KEYS,
     Contract,
+    ContractRule,
     Contracts,
     Durability,
     History,
     Liveliness,
     Priority,
     Reliability,
-    Rule,
     combine,
 )
 from rmpa.core.names import matches
@@ -40,15 +40,15 @@ VALUES: dict[str, st.SearchStrategy[object]] = {
 CONTRACTS = st.builds(Contract, **VALUES)
 GLOBS = st.lists(st.sampled_from(["/a", "/a/**", "/*", "/**", "/b/?"]), max_size=2, unique=True).map(tuple)
 TYPE_GLOBS = st.lists(st.sampled_from(["m/A", "m/*", "**", "n/B"]), max_size=2, unique=True).map(tuple)
-RULES = st.lists(st.builds(Rule, GLOBS, TYPE_GLOBS, st.fixed_dictionaries({}, optional=VALUES)), max_size=5).map(
-    tuple
-)
+RULES = st.lists(
+    st.builds(ContractRule, GLOBS, TYPE_GLOBS, st.fixed_dictionaries({}, optional=VALUES)), max_size=5
+).map(tuple)
 TOPICS = st.sampled_from(["/a", "/a/x", "/b", "/b/c", "/c/d/e"])
 TYPES = st.sampled_from(["m/A", "m/B", "n/B", ""])
 
 
-def rule(*topics: str, types: tuple[str, ...] = (), **values: object) -> Rule:
-    return Rule(topics, types, values)
+def rule(*topics: str, types: tuple[str, ...] = (), **values: object) -> ContractRule:
+    return ContractRule(topics, types, values)
 
 
 def test_no_rules_ask_for_nothing() -> None:
@@ -92,7 +92,7 @@ def test_the_words_are_those_of_ros_2() -> None:
     ],
 )
 def test_every_fitting_rule_applies_and_a_later_one_outweighs(
-    rules: tuple[Rule, ...], topic: str, type_name: str, changed: dict[str, object]
+    rules: tuple[ContractRule, ...], topic: str, type_name: str, changed: dict[str, object]
 ) -> None:
     assert Contracts(rules).of(topic, type_name) == dataclasses.replace(Contract(), **changed)  # type: ignore[arg-type]
 
@@ -110,7 +110,7 @@ def test_what_decided_is_explained() -> None:
 
 
 @given(RULES, TOPICS, TYPES)
-def test_the_contract_is_what_is_explained(rules: tuple[Rule, ...], topic: str, type_name: str) -> None:
+def test_the_contract_is_what_is_explained(rules: tuple[ContractRule, ...], topic: str, type_name: str) -> None:
     contracts = Contracts(rules)
     contract = contracts.of(topic, type_name)
     assert contracts.of(topic, type_name) is contract or contract == Contract()

@@ -12,8 +12,8 @@ from typing import Final, NamedTuple
 
 import pytest
 
+from rmpa.config.file import known_keys
 from rmpa.core import limits
-from rmpa.core.config_file import known_keys
 
 PAGE: Final = Path(__file__).parents[2] / "docs" / "limits.md"
 INTERNAL: Final = {
@@ -143,7 +143,7 @@ def test_the_settings_of_the_page_are_those_that_there_are() -> None:
     text = PAGE.read_text(encoding="utf-8")
     block = text.partition("```toml\n[limits]\n")[2].partition("```")[0]
     written = {key: int(value) for key, value in (line.split(" = ") for line in block.splitlines())}
-    from rmpa.core.config import LimitSettings
+    from rmpa.config.settings import LimitSettings
 
     defaults = LimitSettings()
     assert written == {key: getattr(defaults, key) for _, key in (k for k in known_keys() if k[0] == "limits")}

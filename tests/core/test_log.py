@@ -29,12 +29,12 @@ def stream() -> Iterator[io.StringIO]:
 
 
 def test_rooms() -> None:
-    assert [room_of(n) for n in ("rmpa.mesh.aio.mesh", "rmpa", "asyncio")] == ["mesh", "rmpa", "asyncio"]
+    assert [room_of(n) for n in ("rmpa.mesh.io.mesh", "rmpa", "asyncio")] == ["mesh", "rmpa", "asyncio"]
 
 
 def test_text(stream: io.StringIO) -> None:
     configure_logging("info", stream, as_json=False)
-    logging.getLogger("rmpa.mesh.aio.mesh").warning("! %s", "it\nis \x1b[31m")
+    logging.getLogger("rmpa.mesh.io.mesh").warning("! %s", "it\nis \x1b[31m")
     logging.getLogger("rmpa.mesh").debug("hidden")
     assert re.fullmatch(r"\d\d:\d\d:\d\d\.\d{3} warning mesh      ! it\\nis \\x1b\[31m\n", stream.getvalue())
 

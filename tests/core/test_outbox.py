@@ -14,7 +14,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError
-from rmpa.core.outbox import ABORT, FIRST, LAST, URGENT, Outbox, Parcel
+from rmpa.core.outbox import ABORT, FIRST, LAST, URGENT, Outbox, QueuedMessage
 
 ENTRIES = 4
 BYTES = 300
@@ -134,7 +134,7 @@ def test_clear_lets_go_and_keeps_the_counts() -> None:
 # --- in turns and in parts ----------------------------------------------------------------------------------------
 
 
-def flags_of(parcel: Parcel, length: int, flags: int) -> bytes:
+def flags_of(parcel: QueuedMessage, length: int, flags: int) -> bytes:
     """A header that can be read in a test: ``<7:3F`` is the first fragment of route 7, 3 bytes."""
     letters = "".join(letter for letter, flag in (("F", FIRST), ("L", LAST), ("A", ABORT)) if flags & flag)
     return f"<{parcel.key}:{length}{letters}>".encode()
@@ -156,7 +156,7 @@ def test_messages_of_several_keys_take_turns() -> None:
 def test_a_large_message_leaves_in_fragments_and_a_small_one_between_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "COMMIT_BYTES", 1)  # nothing is prepared beyond what leaves
     box = framed()
-    large = Parcel(1, 10)
+    large = QueuedMessage(1, 10)
     box.extend(large, b"0123456789")
     assert b"".join(box.head()) == b"<1:4F>0123"
     box.push(b"small", 2)
@@ -167,7 +167,7 @@ def test_a_large_message_leaves_in_fragments_and_a_small_one_between_them(monkey
 
 def test_what_comes_while_it_leaves_follows_and_a_parcel_without_bytes_holds_nobody_up() -> None:
     box = framed()
-    growing = Parcel(1, 9)
+    growing = QueuedMessage(1, 9)
     box.extend(growing, b"abc")
     assert drain(box) == b"<1:3F>abc"
     assert not box
@@ -175,7 +175,7 @@ def test_what_comes_while_it_leaves_follows_and_a_parcel_without_bytes_holds_nob
     box.push(b"other", 2)
     box.push(b"later", 1)
     assert drain(box) == b"other", "the next of its key waits for the rest"
-    box.extend(Parcel(3, 1), b"x")
+    box.extend(QueuedMessage(3, 1), b"x")
     growing_rest = b"defghi"
     with pytest.raises(LocalProtocolError, match="9 bytes"):
         box.extend(growing, growing_rest + b"j")
@@ -184,7 +184,7 @@ def test_what_comes_while_it_leaves_follows_and_a_parcel_without_bytes_holds_nob
 def test_bytes_of_a_message_behind_which_another_was_queued_are_never_put_in_front_of_it() -> None:
     """A leg sends the parts of one message in one go; this is what keeps the model honest."""
     box = framed()
-    growing = Parcel(1, 6)
+    growing = QueuedMessage(1, 6)
     box.extend(growing, b"abc")
     box.extend(growing, b"def")
     box.push(b"next", 1)
@@ -193,7 +193,7 @@ def test_bytes_of_a_message_behind_which_another_was_queued_are_never_put_in_fro
 
 def test_a_parcel_in_many_small_pieces_leaves_in_as_few_fragments_as_there_can_be() -> None:
     box = framed()
-    parcel = Parcel(1, 10)
+    parcel = QueuedMessage(1, 10)
     for byte in b"0123456789":
         box.extend(parcel, bytes([byte]))
     assert drain(box) == b"<1:4F>0123<1:4>4567<1:2L>89"
@@ -201,7 +201,7 @@ def test_a_parcel_in_many_small_pieces_leaves_in_as_few_fragments_as_there_can_b
 
 def test_without_a_framer_bytes_leave_as_they_are() -> None:
     box = Outbox(10, 1000, fragment=4)
-    parcel = Parcel(1, 10)
+    parcel = QueuedMessage(1, 10)
     box.extend(parcel, b"0123456")
     box.push_urgent(b"!")
     assert drain(box) == b"!0123456"
@@ -211,7 +211,7 @@ def test_without_a_framer_bytes_leave_as_they_are() -> None:
 
 def test_a_message_that_was_not_begun_is_abandoned_without_a_word() -> None:
     box = framed()
-    parcel = Parcel(1, 10)
+    parcel = QueuedMessage(1, 10)
     box.extend(parcel, b"0123")
     assert box.abandon(parcel) is False
     assert not box
@@ -222,7 +222,7 @@ def test_a_message_that_was_not_begun_is_abandoned_without_a_word() -> None:
 
 def test_one_that_was_begun_is_abandoned_with_a_word_once() -> None:
     box = framed()
-    parcel = Parcel(1, 10)
+    parcel = QueuedMessage(1, 10)
     box.extend(parcel, b"012345")
     box.head(2)
     assert box.abandon(parcel) is False
@@ -234,7 +234,7 @@ def test_one_that_was_begun_is_abandoned_with_a_word_once() -> None:
 
 def test_without_a_framer_nobody_can_be_told() -> None:
     box = Outbox(10, 1000)
-    parcel = Parcel(1, 10)
+    parcel = QueuedMessage(1, 10)
     box.extend(parcel, b"012345")
     drain(box)
     assert box.abandon(parcel) is True
@@ -243,7 +243,7 @@ def test_without_a_framer_nobody_can_be_told() -> None:
 
 def test_a_closed_route_aborts_what_it_began() -> None:
     box = framed()
-    parcel = Parcel(1, 10)
+    parcel = QueuedMessage(1, 10)
     box.extend(parcel, b"0123456789")
     box.push(b"behind", 1)
     box.consumed(len(b"<1:4F>0123"))
@@ -255,7 +255,7 @@ def test_a_closed_route_aborts_what_it_began() -> None:
 
 def test_a_growing_message_that_was_dropped_is_dropped_for_good() -> None:
     box = framed(entries=1)
-    old = Parcel(1, 10)
+    old = QueuedMessage(1, 10)
     box.extend(old, b"0123")
     assert box.push(b"new", 1) == 1
     assert old.dropped
@@ -267,7 +267,7 @@ def test_a_growing_message_that_was_dropped_is_dropped_for_good() -> None:
 def test_what_grows_pushes_others_out_but_never_itself() -> None:
     box = framed(max_bytes=20)
     box.push(bytes(15), 2)
-    growing = Parcel(1, 40)
+    growing = QueuedMessage(1, 40)
     assert box.extend(growing, bytes(4)) == 0
     assert box.extend(growing, bytes(30)) == 1
     assert box.dropped == {2: 1}
@@ -319,7 +319,7 @@ def test_a_lifespan_holds_for_the_newest_too() -> None:
 def test_what_was_begun_and_marks_never_grow_too_old() -> None:
     box = framed()
     box.set_terms(1, 10, 0.5, strict=True)
-    begun = Parcel(1, 6, born=1.0)
+    begun = QueuedMessage(1, 6, born=1.0)
     box.extend(begun, b"abc")
     assert b"".join(box.head(now=1.1)) == b"<1:3F>abc"
     box.extend(begun, b"def")
@@ -346,7 +346,7 @@ def test_a_lost_connection_takes_what_was_begun_and_leaves_the_rest_for_the_next
 ) -> None:
     monkeypatch.setattr(limits, "COMMIT_BYTES", 1)
     box = framed()
-    torn, whole = Parcel(1, 8), Parcel(2, 8)
+    torn, whole = QueuedMessage(1, 8), QueuedMessage(2, 8)
     box.extend(torn, b"01234567")
     box.head()
     box.extend(whole, b"abcdefgh")
@@ -365,7 +365,7 @@ def test_a_lost_connection_takes_what_was_begun_and_leaves_the_rest_for_the_next
 
 def test_a_message_that_waits_for_its_next_bytes_is_torn_too() -> None:
     box = framed()
-    parcel = Parcel(1, 8)
+    parcel = QueuedMessage(1, 8)
     box.extend(parcel, b"0123")
     drain(box)
     assert box.reset() == 1

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from rmpa.core import limits
-from rmpa.core.outbox import FIRST, LAST, Parcel
-from rmpa.mesh.frames import Frame, Kind, pack_fragment_header
+from rmpa.core.outbox import FIRST, LAST, QueuedMessage
+from rmpa.mesh.frames import Frame, FrameKind, pack_fragment_header
 from tests.core.outbox_model import FRAGMENT, Entry, Model, fence, make_box, payload, whole
 
 ENTRIES = 4
@@ -59,7 +59,7 @@ class AgainstModel(RuleBasedStateMachine):
     @rule(size=st.integers(0, 50))
     def urgent(self, size: int) -> None:
         entry = self.entry(0, size)
-        data = Frame(Kind.CONTROL, bytes(size), sequence=entry.number).serialize()
+        data = Frame(FrameKind.CONTROL, bytes(size), sequence=entry.number).serialize()
         entry.given = len(data)
         self.box.push_urgent(data)
         self.model.urgent.append(entry)
@@ -69,7 +69,7 @@ class AgainstModel(RuleBasedStateMachine):
         if key in self.open:
             return
         entry = self.open[key] = self.entry(key, size)
-        entry.parcel = Parcel(key, size, entry.number, size, self.now)
+        entry.parcel = QueuedMessage(key, size, entry.number, size, self.now)
 
     @rule(key=KEYS, size=st.integers(1, 200))
     def extend(self, key: int, size: int) -> None:
@@ -184,7 +184,7 @@ class AgainstModel(RuleBasedStateMachine):
                 entry.parcel.dropped = True  # the lane does this: the outbox does not know of it
                 entry.fate = "torn"
         assert self.box.reset() == self.model.cut()
-        self.box.prepend(Frame(Kind.HELLO, bytes(hello)).serialize())
+        self.box.prepend(Frame(FrameKind.HELLO, bytes(hello)).serialize())
 
     # --- what must be ---------------------------------------------------------------------------------------
 

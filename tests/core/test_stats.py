@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core.stats import Flow, Ring, Summary, percentile
+from rmpa.core.stats import ArrivalStats, SampleRing, SampleSummary, percentile
 
 SAMPLES = st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=50)
 
 
 @given(SAMPLES)
 def test_summary_agrees_with_the_standard_library(samples: list[float]) -> None:
-    s = Summary.of(samples)
+    s = SampleSummary.of(samples)
     assert s.mean == pytest.approx(statistics.fmean(samples), abs=1e-6)
     assert s.sd == pytest.approx(statistics.pstdev(samples), abs=1e-3)
     assert (s.count, s.minimum, s.maximum) == (len(samples), min(samples), max(samples))
@@ -24,7 +24,7 @@ def test_summary_agrees_with_the_standard_library(samples: list[float]) -> None:
 
 
 def test_nothing_gives_nan() -> None:
-    s = Summary.of([])
+    s = SampleSummary.of([])
     assert s.count == 0
     assert all(math.isnan(x) for x in (s.mean, s.sd, s.minimum, s.maximum, s.p50, s.p95, s.p99, percentile([], 5)))
 
@@ -35,7 +35,7 @@ def test_percentiles_are_linear_between_neighbours() -> None:
 
 @given(st.integers(1, 10), st.lists(st.floats(allow_nan=False), max_size=40))
 def test_a_ring_keeps_the_last_in_order(size: int, samples: list[float]) -> None:
-    ring = Ring(size)
+    ring = SampleRing(size)
     for sample in samples:
         ring.add(sample)
     assert list(ring) == samples[-size:]
@@ -46,12 +46,12 @@ def test_a_ring_keeps_the_last_in_order(size: int, samples: list[float]) -> None
 
 def test_a_ring_holds_something() -> None:
     with pytest.raises(ValueError):
-        Ring(0)
+        SampleRing(0)
 
 
 def test_a_flow() -> None:
-    flow = Flow(window=3)
-    assert Flow().last is None
+    flow = ArrivalStats(window=3)
+    assert ArrivalStats().last is None
     assert math.isnan(flow.rate())
     for number in range(11):
         flow.arrived(number * 0.5, 100)
@@ -62,7 +62,7 @@ def test_a_flow() -> None:
 
 
 def test_a_flow_at_one_moment_has_no_rate() -> None:
-    flow = Flow()
+    flow = ArrivalStats()
     flow.arrived(1.0, 1)
     flow.arrived(1.0, 1)
     assert math.isnan(flow.rate())

@@ -13,13 +13,13 @@ from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.events import (
-    Conflict,
     ConflictCleared,
     ConflictKind,
-    Heard,
+    HeardBy,
     LossReason,
     Output,
     PeerChanged,
+    PeerConflict,
     PeerFound,
     PeerLost,
     PeerRestarted,
@@ -106,7 +106,7 @@ def test_jitter_stays_in_its_bounds() -> None:
 def test_an_unknown_peer_is_found_and_answered_by_unicast(one: Harness) -> None:
     speaker = Speaker(who(2))
     one.hear(speaker())
-    assert one.roster.events() == [PeerFound(who(2), ("10.0.0.2", 40002), Heard.MULTICAST)]
+    assert one.roster.events() == [PeerFound(who(2), ("10.0.0.2", 40002), HeardBy.MULTICAST)]
     assert unicasts(one.roster.outputs(), BeaconKind.ANSWER) == [("10.0.0.2", 40002)]
     one.now += 1
     one.hear(speaker())
@@ -182,7 +182,7 @@ def test_a_linked_peer_is_never_lost_by_silence_and_its_lease_begins_when_the_li
 
 def test_a_link_alone_finds_a_peer(one: Harness) -> None:
     one.roster.link_up(who(2), one.now)
-    assert one.roster.events() == [PeerFound(who(2), None, Heard.LINK)]
+    assert one.roster.events() == [PeerFound(who(2), None, HeardBy.LINK)]
 
 
 def test_goodbye_and_its_late_shadow(one: Harness) -> None:
@@ -307,7 +307,7 @@ def twins(one: Harness, *, linked: bool = False) -> tuple[Speaker, Speaker]:
 def test_two_live_peers_with_one_guid_stay_out_until_one_is_silent(one: Harness) -> None:
     left, right = twins(one)
     events = one.roster.events()
-    assert [type(e) for e in events] == [PeerFound, PeerRestarted, Conflict, PeerLost]
+    assert [type(e) for e in events] == [PeerFound, PeerRestarted, PeerConflict, PeerLost]
     assert isinstance(events[-1], PeerLost)
     assert events[-1].reason is LossReason.CONFLICT
     assert one.present() == []
@@ -344,7 +344,7 @@ def test_a_conflict_ends_with_a_goodbye(one: Harness) -> None:
 def test_a_working_link_survives_a_conflict(one: Harness) -> None:
     twins(one, linked=True)
     events = one.roster.events()
-    assert [type(e) for e in events] == [PeerFound, Conflict]
+    assert [type(e) for e in events] == [PeerFound, PeerConflict]
     assert one.present() == ["left"]
     one.roster.link_down(who(2).guid, one.now)
     assert [type(e) for e in one.roster.events()] == [PeerLost]
@@ -356,7 +356,7 @@ def test_somebody_else_with_our_guid(one: Harness) -> None:
     one.run(5)
     one.hear(twin())
     (event,) = one.roster.events()
-    assert isinstance(event, Conflict)
+    assert isinstance(event, PeerConflict)
     assert event.kind is ConflictKind.OWN_GUID
     assert "twin has our own GUID address 10.0.0.1:40001" in str(event)
     for _ in range(3):
@@ -374,7 +374,7 @@ def test_two_peers_of_one_name_both_stay_and_it_is_said_once(one: Harness) -> No
         one.hear(first())
         one.hear(second())
         one.run(5)
-    conflicts = [e for e in one.roster.events() if isinstance(e, Conflict)]
+    conflicts = [e for e in one.roster.events() if isinstance(e, PeerConflict)]
     assert [str(c) for c in conflicts] == [
         "two peers are named base: 10.0.0.3:40003#1 and 10.0.0.2:40002#1; rename one: --name"
     ]
@@ -399,7 +399,7 @@ def test_a_killed_agent_that_starts_again_at_another_port_is_no_namesake_of_its_
     speaker = Speaker(again)
     one.hear(speaker())
     assert one.roster.events() == [
-        PeerFound(again, again.guid.endpoint, Heard.MULTICAST),
+        PeerFound(again, again.guid.endpoint, HeardBy.MULTICAST),
         PeerLost(ghost, LossReason.MOVED),
     ]
     for _ in range(3):
@@ -419,7 +419,7 @@ def test_a_namesake_on_the_same_machine_that_lives_comes_back_and_is_said(one: H
     one.roster.link_up(second.identity, one.now)
     one.hear(first())
     events = one.roster.events()
-    assert [e.kind for e in events if isinstance(e, Conflict)] == [ConflictKind.NAME]
+    assert [e.kind for e in events if isinstance(e, PeerConflict)] == [ConflictKind.NAME]
     assert one.present() == ["base", "base"]
 
 
@@ -428,17 +428,17 @@ def test_a_namesake_elsewhere_is_said_only_once_it_has_shown_to_live(one: Harnes
     one.hear(first())
     one.run(1)
     one.hear(second())
-    assert not [e for e in one.roster.events() if isinstance(e, Conflict)]
+    assert not [e for e in one.roster.events() if isinstance(e, PeerConflict)]
     assert not any(view.conflicts for view in one.roster.peers())
     one.run(1)
     one.hear(first())
-    assert [e.kind for e in one.roster.events() if isinstance(e, Conflict)] == [ConflictKind.NAME]
+    assert [e.kind for e in one.roster.events() if isinstance(e, PeerConflict)] == [ConflictKind.NAME]
 
 
 def test_a_peer_with_our_own_name() -> None:
     one = Harness(name="base")
     one.hear(Speaker(who(2, name="base"))())
-    assert [e.kind for e in one.roster.events() if isinstance(e, Conflict)] == [ConflictKind.NAME]
+    assert [e.kind for e in one.roster.events() if isinstance(e, PeerConflict)] == [ConflictKind.NAME]
 
 
 def test_a_peer_that_changes(one: Harness) -> None:
@@ -481,7 +481,7 @@ def test_a_greeted_peer_that_answers_is_found_by_gossip(one: Harness) -> None:
     one.hear(Speaker(who(2))(BeaconKind.ANSWER, who(3).guid), multicast=False)
     one.hear(Speaker(who(3))(BeaconKind.ANSWER), multicast=False)
     assert one.present() == ["peer2", "peer3"]
-    assert one.roster.peers()[1].found_by is Heard.GOSSIP
+    assert one.roster.peers()[1].found_by is HeardBy.GOSSIP
     sent = one.roster.outputs() + one.run(15)
     assert unicasts(sent, BeaconKind.ANNOUNCE).count(("10.0.0.3", 40003)) == 1
 

@@ -17,9 +17,9 @@ import psutil
 import pytest
 
 from rmpa.experiments.bed.processes import Process, eventually
-from rmpa.monitor.aio.control_client import ControlClient, choose_agent
+from rmpa.observe.io.control_client import ControlClient, choose_agent
 from rmpa.resource import ResourceClient, at_least, at_most
-from rmpa.ros.aio.node import Node
+from rmpa.ros.node.node import Node
 from stick import AXIS, BUTTON, EVENT
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from rmpa.ros.messages import MessageType
+from rmpa.ros.types.messages import MessageType
 from robot import Turtlebot, odometry
 from unicycle import Pose
 

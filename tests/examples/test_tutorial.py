@@ -17,7 +17,7 @@ import pytest
 from rmpa.cli.run import load
 from rmpa.cli.topic_pub import read_values
 from rmpa.experiments.bed.processes import Process, eventually
-from rmpa.resource.requirement_text import parse_requirement
+from rmpa.resource.declare.requirement_text import parse_requirement
 from tests.interop.ros import free_port
 
 if TYPE_CHECKING:

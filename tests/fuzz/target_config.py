@@ -5,14 +5,14 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
-from rmpa.bridge.messages import Open, decode, encode
+from rmpa.bridge.messages import OpenRoute, decode, encode
 from rmpa.bridge.naming import PeerNames
-from rmpa.core import config_values as values
+from rmpa.config import values
+from rmpa.config.contract_rules import read_contracts, read_duration, read_rate
+from rmpa.config.file import known_keys, parse_config
+from rmpa.config.param_rules import overlap, read_follow_rules, untouchable
+from rmpa.config.peer_rules import read_peers
 from rmpa.core import limits
-from rmpa.core.config_contract import read_contracts, read_duration, read_rate
-from rmpa.core.config_file import known_keys, parse_config
-from rmpa.core.config_param import overlap, read_follow_rules, untouchable
-from rmpa.core.config_peer import read_peers
 from rmpa.core.contract import Contracts
 from rmpa.core.errors import ConfigError
 from rmpa.core.names import is_global_name
@@ -126,7 +126,7 @@ def _check_contracts(raw: object) -> None:
     contracts = Contracts(read.rules)
     for topic, type_name in (("/a/b", "a/B"), ("/cmd_vel", "geometry_msgs/Twist"), ("/map", "*"), ("/a", "")):
         contract = contracts.of(topic, type_name)
-        message = Open(7, topic, "/n", contract)
+        message = OpenRoute(7, topic, "/n", contract)
         if decode(encode(message)) != message:
             raise AssertionError(f"{contract} does not survive its way to a peer")
         if set(contracts.explain(topic, type_name)) != set(type(contract).__dataclass_fields__):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import msgspec
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.monitor.control import Reply, Request
-from rmpa.monitor.snapshot import Snapshot
+from rmpa.observe.control import ControlReply, ControlRequest
+from rmpa.observe.snapshot import Snapshot
 
 SEEDS: list[bytes] = [
     b'{"op": "snapshot"}\n',
@@ -24,16 +24,16 @@ SEEDS: list[bytes] = [
 def fuzz(data: bytes) -> None:
     """A request or reply that survives its own round trip and is safe to log, or a documented error."""
     try:
-        request = Request.parse(data)
-        if Request.parse(request.serialize()) != request:
+        request = ControlRequest.parse(data)
+        if ControlRequest.parse(request.serialize()) != request:
             raise AssertionError(f"{request} does not survive its round trip")
         if not str(request).isprintable():
             raise AssertionError("a request's text is not safe to log")
     except RemoteProtocolError as error:
         str(error)
     try:
-        reply = Reply.parse(data)
-        if Reply.parse(reply.serialize()) != reply:
+        reply = ControlReply.parse(data)
+        if ControlReply.parse(reply.serialize()) != reply:
             raise AssertionError("a reply does not survive its round trip")
         msgspec.convert(reply.value, Snapshot)
     except (RemoteProtocolError, msgspec.ValidationError) as error:

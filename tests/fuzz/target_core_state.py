@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.ros.master import kept
 from rmpa.ros.master.api import MasterApi
-from rmpa.ros.xmlrpc import response_pieces
+from rmpa.ros.wire.xmlrpc import response_pieces
 
 if TYPE_CHECKING:
     from rmpa.ros.master.parameters import Tree

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.mesh.frames import Frame, Kind, parse_pong, parse_text, pong
+from rmpa.mesh.frames import Frame, FrameKind, parse_pong, parse_text, pong
 
 SEEDS: list[bytes] = [
     b"",
-    Frame(Kind.PING, stamp_ns=1).serialize(),
+    Frame(FrameKind.PING, stamp_ns=1).serialize(),
     pong(1, 2, 3).serialize(),
-    Frame(Kind.CONTROL, b'{"op":"x"}').serialize(),
-    Frame(Kind.DATA, b"\x04\x00\x00\x00abcd", 7, 1, 99).serialize(),
-    Frame(Kind.BYE, b"ends").serialize() + Frame(Kind.DATA, flags=1).serialize(),
-    Frame(Kind.DATA, b"\x08\x00\x00\x00abcd", 7, 1, 99, FIRST).serialize(),
-    Frame(Kind.DATA, b"efgh", 7, 1, 99, LAST).serialize(),
-    Frame(Kind.DATA, b"", 7, 1, 99, LAST | ABORT).serialize(),
-    *(Frame(kind, route=7, sequence=0xFFFFFFFF).serialize() for kind in (Kind.ACK, Kind.FENCE, Kind.FENCED)),
+    Frame(FrameKind.CONTROL, b'{"op":"x"}').serialize(),
+    Frame(FrameKind.DATA, b"\x04\x00\x00\x00abcd", 7, 1, 99).serialize(),
+    Frame(FrameKind.BYE, b"ends").serialize() + Frame(FrameKind.DATA, flags=1).serialize(),
+    Frame(FrameKind.DATA, b"\x08\x00\x00\x00abcd", 7, 1, 99, FIRST).serialize(),
+    Frame(FrameKind.DATA, b"efgh", 7, 1, 99, LAST).serialize(),
+    Frame(FrameKind.DATA, b"", 7, 1, 99, LAST | ABORT).serialize(),
+    *(
+        Frame(kind, route=7, sequence=0xFFFFFFFF).serialize()
+        for kind in (FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED)
+    ),
 ]
 
 
@@ -27,7 +30,7 @@ def fuzz(data: bytes) -> None:
         if parsed is None:
             return
         frame, taken = parsed
-        if frame.kind is Kind.PONG:
+        if frame.kind is FrameKind.PONG:
             parse_pong(frame.payload)
     except RemoteProtocolError as error:
         str(error)

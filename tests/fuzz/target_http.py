@@ -11,12 +11,12 @@ import h11
 
 from rmpa.core.counters import Counters
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.ros.aio.http_client import _request, _response_body
-from rmpa.ros.aio.http_server import XmlRpcServer, _Connection
-from rmpa.ros.xmlrpc import serialize_call, serialize_response
+from rmpa.ros.http.client import _request, _response_body
+from rmpa.ros.http.server import XmlRpcServer, _Connection
+from rmpa.ros.wire.xmlrpc import serialize_call, serialize_response
 
 if TYPE_CHECKING:
-    from rmpa.ros.xmlrpc import XmlRpcValue
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 _CALL = serialize_call("getPid", ["/x"])
 _REPLY = serialize_response([1, "", 5])

@@ -6,19 +6,23 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.mesh.frames import Frame, Kind, pack_data_header, pong
+from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pong
 from rmpa.mesh.handshake import Hello, Refuse
-from rmpa.mesh.link import Event, HelloReceived, Link, Role, State
+from rmpa.mesh.link import Event, HelloReceived, LinkProtocol, LinkRole, LinkState
 
 _OURS = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")
 _THEIRS = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")
-_HELLO = Frame(Kind.HELLO, Hello.of(_THEIRS, lease=1.0, expected=_OURS.guid).serialize()).serialize()
-_WELCOME = Frame(Kind.WELCOME, Hello.of(_THEIRS, lease=1.0, expected=_OURS.guid).serialize()).serialize()
-_TALK = Frame(Kind.PING, stamp_ns=5).serialize() + pong(1, 2, 3).serialize() + Frame(Kind.CONTROL, b"{}").serialize()
+_HELLO = Frame(FrameKind.HELLO, Hello.of(_THEIRS, lease=1.0, expected=_OURS.guid).serialize()).serialize()
+_WELCOME = Frame(FrameKind.WELCOME, Hello.of(_THEIRS, lease=1.0, expected=_OURS.guid).serialize()).serialize()
+_TALK = (
+    Frame(FrameKind.PING, stamp_ns=5).serialize()
+    + pong(1, 2, 3).serialize()
+    + Frame(FrameKind.CONTROL, b"{}").serialize()
+)
 _DATA = pack_data_header(4, 1, 1, 9) + b"\0\0\0\0"
 
 _PARTS = b"".join(
-    Frame(Kind.DATA, part, route, 1, 9, flags).serialize()
+    Frame(FrameKind.DATA, part, route, 1, 9, flags).serialize()
     for part, route, flags in (
         (b"\x08\0\0\0ab", 1, FIRST),
         (b"\x04\0\0\0", 2, FIRST),
@@ -27,7 +31,9 @@ _PARTS = b"".join(
         (b"efgh", 1, LAST),
     )
 )
-_MARKS = b"".join(Frame(kind, route=1, sequence=7).serialize() for kind in (Kind.ACK, Kind.FENCE, Kind.FENCED))
+_MARKS = b"".join(
+    Frame(kind, route=1, sequence=7).serialize() for kind in (FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED)
+)
 _LONG = pack_data_header(200_000, 1, 1, 9) + bytes(50)
 """The beginning of a frame that is handed on as it comes."""
 
@@ -35,9 +41,9 @@ SEEDS: list[bytes] = [
     b"",
     _HELLO,
     _WELCOME,
-    Frame(Kind.REFUSE, Refuse(8, "busy").serialize()).serialize(),
+    Frame(FrameKind.REFUSE, Refuse(8, "busy").serialize()).serialize(),
     _HELLO + _TALK + _DATA,
-    _TALK + _DATA + Frame(Kind.BYE, b"ends").serialize(),
+    _TALK + _DATA + Frame(FrameKind.BYE, b"ends").serialize(),
     _PARTS + _MARKS,
     _MARKS + _DATA + _LONG,
     _PARTS[:60] + _LONG,
@@ -46,15 +52,15 @@ SEEDS: list[bytes] = [
 
 def fuzz(data: bytes) -> None:
     """The same bytes whole and in two pieces, to a fresh link of either role and to one that is up."""
-    for role in Role:
-        for prefix in (b"", _HELLO if role is Role.ACCEPTOR else _WELCOME):
+    for role in LinkRole:
+        for prefix in (b"", _HELLO if role is LinkRole.ACCEPTOR else _WELCOME):
             whole = _feed(role, [prefix + data])
             parts = _feed(role, [prefix, data[: len(data) // 2], data[len(data) // 2 :]])
             if whole != parts:
                 raise AssertionError(f"{whole} whole, but {parts} in pieces")
 
 
-def _feed(role: Role, pieces: list[bytes]) -> tuple[str, int, int, list[list[object]]]:
+def _feed(role: LinkRole, pieces: list[bytes]) -> tuple[str, int, int, list[list[object]]]:
     """What the link says and how it ends; of parts, what they are put together."""
     events: list[Event] = []
     parts: list[list[object]] = []
@@ -76,10 +82,10 @@ def _feed(role: Role, pieces: list[bytes]) -> tuple[str, int, int, list[list[obj
         else:
             parts[-1][2:] = [flags & (LAST | ABORT), bytes(parts[-1][3]) + bytes(part)]  # type: ignore[call-overload]
 
-    link = Link(role, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event, on_data=on_data, on_part=on_part)
+    link = LinkProtocol(role, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event, on_data=on_data, on_part=on_part)
 
     def closed() -> bool:
-        return link.state is State.CLOSED
+        return link.state is LinkState.CLOSED
 
     kept = b""
     for piece in pieces:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import struct
 
-from rmpa.bridge.aio.legs import Leg, ReliableLeg, make_leg
+from rmpa.bridge.data.io.route_sender import ReliableRouteSender, RouteSender, make_route_sender
 from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.core.outbox import Parcel
+from rmpa.core.outbox import QueuedMessage
 from tests.simulation.network import World
 from tests.simulation.process import Process
 
@@ -39,14 +39,14 @@ class _Lane:
         self.numbers.append(sequence)
         return 0
 
-    def open(self, route: int, size: int, sequence: int, stamp_ns: int) -> Parcel:
+    def open(self, route: int, size: int, sequence: int, stamp_ns: int) -> QueuedMessage:
         self.numbers.append(sequence)
-        return Parcel(route, size, sequence, stamp_ns)
+        return QueuedMessage(route, size, sequence, stamp_ns)
 
-    def extend(self, parcel: Parcel, data: bytes | bytearray | memoryview) -> int:
+    def extend(self, parcel: QueuedMessage, data: bytes | bytearray | memoryview) -> int:
         return 0
 
-    def abandon(self, parcel: Parcel) -> None:
+    def abandon(self, parcel: QueuedMessage) -> None:
         pass
 
     def fence(self, route: int, number: int) -> None:
@@ -79,7 +79,7 @@ def _fuzz(data: bytes) -> None:
     )
     link = _Link()
     links = [link]
-    leg: Leg = make_leg(link, 7, contract, 1, large=False)
+    leg: RouteSender = make_route_sender(link, 7, contract, 1, large=False)
     published = 0
     for start in range(1, len(data) - _MARK.size + 1, _MARK.size):
         what, number = _MARK.unpack_from(data, start)
@@ -102,7 +102,7 @@ def _fuzz(data: bytes) -> None:
     sent = [n for one in links for lane in (one.express, one.bulk) for n in lane.numbers if n > 0]
     if sent and max(sent) > published:
         raise AssertionError(f"message {max(sent)} was sent, of {published}")
-    if isinstance(leg, ReliableLeg) and leg.sender.confirmed > published:
+    if isinstance(leg, ReliableRouteSender) and leg.sender.confirmed > published:
         raise AssertionError(f"message {leg.sender.confirmed} counts as acknowledged, of {published}")
     if len(leg._held) > contract.depth:
         raise AssertionError(f"{len(leg._held)} messages are held, of {contract.depth} that may be")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from rmpa.core.errors import LimitExceeded
-from rmpa.ros.definitions import DefinitionError, full_text, md5sum, parse_definition
-from rmpa.ros.messages import MessageType
+from rmpa.ros.types.definitions import DefinitionError, full_text, md5sum, parse_definition
+from rmpa.ros.types.messages import MessageType
 
 SEEDS: list[bytes] = [
     b"",

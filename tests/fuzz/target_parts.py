@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rmpa.bridge.aio.flows import ImportFlow
-from rmpa.bridge.aio.link_time import LinkTime
+from rmpa.bridge.data.io.flows import ImportFlow
+from rmpa.bridge.data.io.link_time import LinkTime
 from rmpa.core import limits
 from rmpa.core.contract import Contract, Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.mesh.frames import WHOLE, Frame, Kind
+from rmpa.mesh.frames import WHOLE, Frame, FrameKind
 from rmpa.mesh.handshake import Hello
-from rmpa.mesh.link import HelloReceived, Link, Role
+from rmpa.mesh.link import HelloReceived, LinkProtocol, LinkRole
 from tests.simulation.network import World
 from tests.simulation.process import Process
 
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 _OURS = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")
 _THEIRS = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")
-_HELLO = Frame(Kind.HELLO, Hello.of(_THEIRS, lease=1.0, expected=_OURS.guid).serialize()).serialize()
+_HELLO = Frame(FrameKind.HELLO, Hello.of(_THEIRS, lease=1.0, expected=_OURS.guid).serialize()).serialize()
 
 
 def _wire(*frames: tuple[int, int, bytes]) -> bytes:
-    return b"".join(Frame(Kind.DATA, part, 1, number, 9, flags).serialize() for number, flags, part in frames)
+    return b"".join(Frame(FrameKind.DATA, part, 1, number, 9, flags).serialize() for number, flags, part in frames)
 
 
 _WHOLE = (1, WHOLE, b"\x02\0\0\0ab")
@@ -113,7 +113,9 @@ def _fuzz(data: bytes) -> None:
     def on_part(_route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
         flow.part(sequence, stamp_ns, flags, part)
 
-    link = Link(Role.ACCEPTOR, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event, on_data=on_data, on_part=on_part)
+    link = LinkProtocol(
+        LinkRole.ACCEPTOR, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event, on_data=on_data, on_part=on_part
+    )
     link.receive(memoryview(_HELLO), 0.0)
     wire = data[1:]
     try:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.contexts import parse_rule
-from rmpa.resource.declare import Resource
-from rmpa.resource.reconfigure import CONFIG_TYPE, checked, config, entries, from_server, read_config
-from rmpa.ros.messages import MessageError, MessageType
+from rmpa.resource.declare.context_rules import parse_rule
+from rmpa.resource.declare.resource import Resource
+from rmpa.resource.run.dynamic_reconfigure import CONFIG_TYPE, checked, config, entries, from_server, read_config
+from rmpa.ros.types.messages import MessageError, MessageType
 
 _ONE = Resource("one", role="sensing")
 _ONE.parameter("gain", 1.0, low=0.5, high=2.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.bridge.services.aio.bodies import BodyTaker, Budget
+from rmpa.bridge.services.io.bodies import BodyReceiver, Budget
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
 
@@ -31,7 +31,7 @@ SEEDS: list[bytes] = [
 ]
 
 
-class _Taker(BodyTaker):
+class _Taker(BodyReceiver):
     """Checks that what is whole is as long as was said."""
 
     def __init__(self) -> None:

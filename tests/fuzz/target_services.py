@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from rmpa.core import limits
 from rmpa.core.errors import RemoteProtocolError, RmpaError
-from rmpa.ros.definitions import DefinitionError
-from rmpa.ros.service_types import ServiceType
-from rmpa.ros.services import (
-    Body,
+from rmpa.ros.types.definitions import DefinitionError
+from rmpa.ros.types.service_types import ServiceType
+from rmpa.ros.wire.services import (
+    BodyBuffer,
     ServiceDescription,
     check_client,
     check_server,
@@ -20,7 +20,7 @@ from rmpa.ros.services import (
     parse_service_uri,
     server_header,
 )
-from rmpa.ros.tcpros import encode_header, parse_header
+from rmpa.ros.wire.tcpros import encode_header, parse_header
 
 _ADD = ServiceDescription("rospy_tutorials/AddTwoInts", "6a2e34150c00229791cc89ff309fff21")
 
@@ -89,7 +89,7 @@ def _reply(data: bytes) -> None:
     ok, size = head
     if size > limits.SERVICE_MESSAGE_MAX:
         raise AssertionError("more was believed than is allowed")
-    body = Body(size)
+    body = BodyBuffer(size)
     taken = body.take(memoryview(data)[5:])
     if taken != min(size, len(data) - 5) or body.whole != (taken == size):
         raise AssertionError("a body took what is not its own")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.ros.tcpros import (
-    Description,
+from rmpa.ros.wire.tcpros import (
+    TopicDescription,
     check_publisher,
     check_subscriber,
     encode_header,
@@ -14,7 +14,7 @@ from rmpa.ros.tcpros import (
     subscriber_header,
 )
 
-_STRING = Description("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n", latching=True)
+_STRING = TopicDescription("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n", latching=True)
 
 SEEDS: list[bytes] = [
     b"",

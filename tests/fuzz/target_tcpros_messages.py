@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded
-from rmpa.ros.definitions import SEPARATOR
-from rmpa.ros.messages import MessageError, MessageType
-from rmpa.ros.tcpros import MalformedStream, frame_message, split_messages
+from rmpa.ros.types.definitions import SEPARATOR
+from rmpa.ros.types.messages import MessageError, MessageType
+from rmpa.ros.wire.tcpros import MalformedStream, frame_message, split_messages
 
 _JOY = MessageType("sensor_msgs/Joy")
 _HEADER = f"{SEPARATOR}\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"

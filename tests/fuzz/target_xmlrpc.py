@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.ros.xmlrpc import (
+from rmpa.ros.wire.xmlrpc import (
     RosFault,
     parse_call,
     parse_response,

@@ -58,7 +58,7 @@ def fed_in_order(client: Process, goal: int, *, connected: bool, since: int = 0)
             first: its ``waitForServer`` counts a publisher from ``connect()`` on, before the TCPROS handshake ends.
         since: A mark of the client's events.
     """
-    values = [event["value"] for event in client.events("feedback", since=since)]
+    values = [int(str(event["value"])) for event in client.events("feedback", since=since)]
     first = 1 if connected else values[0]
     assert first <= 3
     assert 1 <= len(values) <= goal

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.ros.aio.core import RosCore
-from rmpa.ros.aio.http_client import call
-from rmpa.ros.aio.http_server import XmlRpcServer
-from rmpa.ros.xmlrpc import RosFault, XmlRpcValue, brief
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.http.client import call
+from rmpa.ros.http.server import XmlRpcServer
+from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, brief
 from tests.interop.ros import free_port
 
 if TYPE_CHECKING:

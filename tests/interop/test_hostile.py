@@ -11,13 +11,13 @@ import pytest
 
 from rmpa.core import limits
 from rmpa.experiments.bed.processes import Process, eventually, run
-from rmpa.monitor.aio.control_client import ControlClient
+from rmpa.observe.io.control_client import ControlClient
 from tests.interop.modules import Module, flows
 from tests.interop.ros import NODES
 
 if TYPE_CHECKING:
     from rmpa.experiments.bed.namespaces import Lab
-    from rmpa.monitor.snapshot import Snapshot
+    from rmpa.observe.snapshot import Snapshot
     from tests.interop.conftest import ModuleFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.experiments.bed.processes import eventually
-from rmpa.monitor.aio.control_client import ControlClient
+from rmpa.observe.io.control_client import ControlClient
 
 if TYPE_CHECKING:
     from rmpa.experiments.bed.namespaces import Lab
-    from rmpa.monitor.snapshot import PeerInfo
+    from rmpa.observe.snapshot import PeerInfo
     from tests.interop.conftest import AgentFactory, ModuleFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]

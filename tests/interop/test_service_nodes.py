@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.ros.aio.core import RosCore
-from rmpa.ros.aio.node import Node
-from rmpa.ros.aio.service_client import ServiceFailed
+from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
-from rmpa.ros.service_types import ServiceType
+from rmpa.ros.node.node import Node
+from rmpa.ros.node.service_client import ServiceFailed
+from rmpa.ros.types.service_types import ServiceType
 from tests.interop.nodes.payload import Pattern
 
 if TYPE_CHECKING:

@@ -12,12 +12,12 @@ import pytest
 from rmpa.core.counters import Counters
 from rmpa.experiments.bed.agents import Agent
 from rmpa.experiments.bed.processes import DEADLINE, eventually, run
-from rmpa.ros.aio.core import RosCore
-from rmpa.ros.aio.publication import Publication
-from rmpa.ros.aio.shared_listener import SharedListener
-from rmpa.ros.aio.slave_server import SlaveNode
-from rmpa.ros.messages import MessageType
-from rmpa.ros.tcpros import frame_message
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.node.publication import Publication
+from rmpa.ros.node.shared_listener import SharedListener
+from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.ros.types.messages import MessageType
+from rmpa.ros.wire.tcpros import frame_message
 from tests.interop.modules import flows
 from tests.interop.nodes.payload import Pattern
 from tests.interop.ros import PYTHON

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.experiments.bed.processes import eventually
-from rmpa.monitor.aio.control_client import ControlClient
+from rmpa.observe.io.control_client import ControlClient
 from tests.interop.modules import Module, flows
 from tests.interop.ros import lacks
 

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.ros.aio.core import RosCore
-from rmpa.ros.aio.http_client import call_api
-from rmpa.ros.aio.node import Node
-from rmpa.ros.aio.publication import Publication
-from rmpa.ros.aio.slave_server import SlaveNode
-from rmpa.ros.definitions import known_types
+from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
-from rmpa.ros.messages import MessageType
-from rmpa.ros.tcpros import frame_message
+from rmpa.ros.http.client import call_api
+from rmpa.ros.node.node import Node
+from rmpa.ros.node.publication import Publication
+from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.ros.types.definitions import known_types
+from rmpa.ros.types.messages import MessageType
+from rmpa.ros.wire.tcpros import frame_message
 from tests.interop.nodes.payload import Pattern, Tally
 from tests.interop.ros import PYTHON
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from rmpa.experiments.bed.processes import Process
-    from rmpa.ros.aio.node import Publisher, Received
+    from rmpa.ros.node.node import Publisher, Received
     from tests.interop.conftest import ShellFactory
     from tests.interop.ros import Ros
 

@@ -13,22 +13,22 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.bridge.actions import Describe, Publish
-from rmpa.bridge.aio.inbound import Inbound
 from rmpa.bridge.messages import Description as About
 from rmpa.bridge.messages import Source
+from rmpa.bridge.topics.io.proxies import PeerProxies
 from rmpa.core.contract import Contract
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.experiments.bed.processes import eventually
-from rmpa.ros.aio.core import RosCore
-from rmpa.ros.aio.http_client import call_api
-from rmpa.ros.aio.node import Node
+from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
-from rmpa.ros.messages import MessageType
-from rmpa.ros.tcpros import encode_header, frame_message, subscriber_header
+from rmpa.ros.http.client import call_api
+from rmpa.ros.node.node import Node
+from rmpa.ros.types.messages import MessageType
+from rmpa.ros.wire.tcpros import encode_header, frame_message, subscriber_header
 from tests.interop.modules import flows, whole
 from tests.interop.nodes.payload import Pattern
 from tests.interop.ros import PYTHON
-from tests.ros.aio.peers import RawSubscriber
+from tests.ros.node.peers import RawSubscriber
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -213,9 +213,9 @@ async def test_listeners_that_were_hung_up_on_in_the_middle_of_a_message_come_ba
 SOURCE = Source("/chatter", "/speaker")
 
 
-async def proxied(core: RosCore, listener: Process) -> tuple[Inbound, Process]:
+async def proxied(core: RosCore, listener: Process) -> tuple[PeerProxies, Process]:
     """A peer's side with one source, and a listener of that source that is connected to its proxy."""
-    inbound = Inbound(
+    inbound = PeerProxies(
         core,
         "/rmpa/peer",
         on_demand=lambda _s, _w: None,
@@ -227,7 +227,7 @@ async def proxied(core: RosCore, listener: Process) -> tuple[Inbound, Process]:
     return inbound, listener
 
 
-def describe(inbound: Inbound, route: int, *, latching: bool = False) -> None:
+def describe(inbound: PeerProxies, route: int, *, latching: bool = False) -> None:
     """A route of the source is open."""
     kind = MessageType(BYTES)
     about = About(BYTES, kind.md5sum, kind.definition, latching)
@@ -235,7 +235,7 @@ def describe(inbound: Inbound, route: int, *, latching: bool = False) -> None:
 
 
 async def heard(
-    inbound: Inbound, route: int, listener: Process, source: str, *, first: int = 1, after: int = 0
+    inbound: PeerProxies, route: int, listener: Process, source: str, *, first: int = 1, after: int = 0
 ) -> int:
     """Send messages on a route until the listener has heard one; return the last one's number."""
     sequence = first - 1

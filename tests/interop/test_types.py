@@ -9,9 +9,9 @@ import pytest
 
 from rmpa.experiments.bed.agents import RMPA
 from rmpa.experiments.bed.processes import run
-from rmpa.ros.definitions import known_text
+from rmpa.ros.types.definitions import known_text
 from tests.interop.ros import PYTHON
-from tests.ros.workspaces import package
+from tests.ros.types.workspaces import package
 
 if TYPE_CHECKING:
     from pathlib import Path

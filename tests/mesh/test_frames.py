@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 
 from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
-from rmpa.core.outbox import ABORT, FIRST, LAST, Parcel
+from rmpa.core.outbox import ABORT, FIRST, LAST, QueuedMessage
 from rmpa.mesh.frames import (
     PAYLOAD_MAX,
     WHOLE,
     Frame,
-    Kind,
+    FrameKind,
     check_header,
     pack_data_header,
     pack_fragment_header,
@@ -25,25 +25,28 @@ from rmpa.mesh.frames import (
 
 GOLDEN = [
     (
-        Frame(Kind.DATA, b"\x04\x00\x00\x00abcd", route=7, sequence=12, stamp_ns=0x0102030405060708),
+        Frame(FrameKind.DATA, b"\x04\x00\x00\x00abcd", route=7, sequence=12, stamp_ns=0x0102030405060708),
         "00000008 07 03 0000 00000007 0000000c 0102030405060708 0400000061626364",
     ),
-    (Frame(Kind.PING, stamp_ns=1), "00000000 04 03 0000 00000000 00000000 0000000000000001"),
+    (Frame(FrameKind.PING, stamp_ns=1), "00000000 04 03 0000 00000000 00000000 0000000000000001"),
     (pong(1, 2, 3), "00000010 05 03 0000 00000000 00000000 0000000000000003 0000000000000001 0000000000000002"),
-    (Frame(Kind.BYE, b"ends"), "00000004 08 03 0000 00000000 00000000 0000000000000000 656e6473"),
+    (Frame(FrameKind.BYE, b"ends"), "00000004 08 03 0000 00000000 00000000 0000000000000000 656e6473"),
     (
-        Frame(Kind.DATA, b"\x08\0\0\0ab", 7, 12, 9, flags=FIRST),
+        Frame(FrameKind.DATA, b"\x08\0\0\0ab", 7, 12, 9, flags=FIRST),
         "00000006 07 01 0000 00000007 0000000c 0000000000000009 080000006162",
     ),
-    (Frame(Kind.DATA, b"cd", 7, 12, 9, flags=0), "00000002 07 00 0000 00000007 0000000c 0000000000000009 6364"),
-    (Frame(Kind.DATA, b"ef", 7, 12, 9, flags=LAST), "00000002 07 02 0000 00000007 0000000c 0000000000000009 6566"),
+    (Frame(FrameKind.DATA, b"cd", 7, 12, 9, flags=0), "00000002 07 00 0000 00000007 0000000c 0000000000000009 6364"),
     (
-        Frame(Kind.DATA, b"", 7, 12, 9, flags=LAST | ABORT),
+        Frame(FrameKind.DATA, b"ef", 7, 12, 9, flags=LAST),
+        "00000002 07 02 0000 00000007 0000000c 0000000000000009 6566",
+    ),
+    (
+        Frame(FrameKind.DATA, b"", 7, 12, 9, flags=LAST | ABORT),
         "00000000 07 06 0000 00000007 0000000c 0000000000000009",
     ),
-    (Frame(Kind.ACK, route=7, sequence=0xFFFFFFFF), "00000000 09 03 0000 00000007 ffffffff 0000000000000000"),
-    (Frame(Kind.FENCE, route=7, sequence=1), "00000000 0a 03 0000 00000007 00000001 0000000000000000"),
-    (Frame(Kind.FENCED, route=7, sequence=1), "00000000 0b 03 0000 00000007 00000001 0000000000000000"),
+    (Frame(FrameKind.ACK, route=7, sequence=0xFFFFFFFF), "00000000 09 03 0000 00000007 ffffffff 0000000000000000"),
+    (Frame(FrameKind.FENCE, route=7, sequence=1), "00000000 0a 03 0000 00000007 00000001 0000000000000000"),
+    (Frame(FrameKind.FENCED, route=7, sequence=1), "00000000 0b 03 0000 00000007 00000001 0000000000000000"),
 ]
 
 
@@ -65,19 +68,19 @@ def test_the_data_path_packs_the_same_header() -> None:
 
 
 def test_a_parcel_makes_the_headers_of_its_fragments() -> None:
-    parcel = Parcel(7, 10, 12, 9)
+    parcel = QueuedMessage(7, 10, 12, 9)
     sizes = [(6, FIRST), (2, 0), (2, LAST), (0, LAST | ABORT)]
     for (frame, _), (length, flags) in zip(GOLDEN[4:8], sizes, strict=True):
         assert pack_fragment_header(parcel, length, flags) + frame.payload == frame.serialize()
-    assert pack_fragment_header(Parcel(7, 10, (1 << 32) + 12, 9), 2, 0) == GOLDEN[5][0].serialize()[:24]
+    assert pack_fragment_header(QueuedMessage(7, 10, (1 << 32) + 12, 9), 2, 0) == GOLDEN[5][0].serialize()[:24]
 
 
 def test_the_sequence_wraps() -> None:
     assert pack_data_header(0, 1, 1 << 32, 0)[12:16] == bytes(4)
 
 
-@pytest.mark.parametrize("kind", list(Kind))
-def test_lengths_are_limited_by_kind_from_the_header_alone(kind: Kind) -> None:
+@pytest.mark.parametrize("kind", list(FrameKind))
+def test_lengths_are_limited_by_kind_from_the_header_alone(kind: FrameKind) -> None:
     header = (PAYLOAD_MAX[kind] + 1).to_bytes(4, "big") + bytes([kind, 3]) + bytes(18)
     with pytest.raises(LimitExceeded, match=kind.name.lower()):
         Frame.parse(header)
@@ -89,9 +92,9 @@ def test_unknown_kinds(kind: int) -> None:
         Frame.parse(bytes([0, 0, 0, 0, kind, 3]) + bytes(18))
 
 
-@pytest.mark.parametrize("kind", [kind for kind in Kind if kind is not Kind.DATA])
+@pytest.mark.parametrize("kind", [kind for kind in FrameKind if kind is not FrameKind.DATA])
 @pytest.mark.parametrize("flags", [0, FIRST, LAST, LAST | ABORT, ABORT])
-def test_only_data_comes_in_fragments(kind: Kind, flags: int) -> None:
+def test_only_data_comes_in_fragments(kind: FrameKind, flags: int) -> None:
     with pytest.raises(RemoteProtocolError, match="fragment"):
         Frame.parse(Frame(kind, flags=flags).serialize())
 
@@ -112,26 +115,26 @@ def test_only_data_comes_in_fragments(kind: Kind, flags: int) -> None:
 )
 def test_a_fragment_that_cannot_be(payload: bytes, flags: int, problem: str) -> None:
     with pytest.raises(RemoteProtocolError, match=problem):
-        Frame.parse(Frame(Kind.DATA, payload, flags=flags).serialize())
+        Frame.parse(Frame(FrameKind.DATA, payload, flags=flags).serialize())
 
 
 @pytest.mark.parametrize("flags", [0x08, 0x80, 0xF8])
 def test_flags_of_a_later_version_are_ignored(flags: int) -> None:
-    check_header(0, Kind.PING, WHOLE | flags)
+    check_header(0, FrameKind.PING, WHOLE | flags)
     for own in (0, FIRST, LAST, WHOLE):
-        check_header(1, Kind.DATA, own | flags)
+        check_header(1, FrameKind.DATA, own | flags)
 
 
 def test_the_longest_fragment_that_is_sent_is_read_and_one_byte_more_than_may_be_is_not() -> None:
-    check_header(limits.FRAGMENT_BYTES, Kind.DATA, 0)
-    check_header(limits.DATA_PAYLOAD_MAX, Kind.DATA, WHOLE)
+    check_header(limits.FRAGMENT_BYTES, FrameKind.DATA, 0)
+    check_header(limits.DATA_PAYLOAD_MAX, FrameKind.DATA, WHOLE)
     with pytest.raises(LimitExceeded, match="data"):
-        check_header(limits.DATA_PAYLOAD_MAX + 1, Kind.DATA, 0)
+        check_header(limits.DATA_PAYLOAD_MAX + 1, FrameKind.DATA, 0)
 
 
 def test_our_own_faults() -> None:
     with pytest.raises(LocalProtocolError):
-        Frame(Kind.PING, b"x").serialize()
+        Frame(FrameKind.PING, b"x").serialize()
     with pytest.raises(LocalProtocolError):
         pack_data_header(limits.DATA_PAYLOAD_MAX + 1, 1, 1, 1)
     with pytest.raises(LocalProtocolError):
@@ -149,15 +152,17 @@ def test_text_is_safe_for_a_log() -> None:
 
 
 @given(
-    kind=st.sampled_from(Kind),
+    kind=st.sampled_from(FrameKind),
     payload=st.binary(max_size=200),
     route=st.integers(0, 2**32 - 1),
     sequence=st.integers(0, 2**32 - 1),
     stamp=st.integers(0, 2**64 - 1),
     flags=st.sampled_from([0, FIRST, LAST, WHOLE]),
 )
-def test_any_frame_survives(kind: Kind, payload: bytes, route: int, sequence: int, stamp: int, flags: int) -> None:
-    if kind is Kind.DATA:
+def test_any_frame_survives(
+    kind: FrameKind, payload: bytes, route: int, sequence: int, stamp: int, flags: int
+) -> None:
+    if kind is FrameKind.DATA:
         frame = Frame(kind, payload or b"x", route, sequence, stamp, flags)
     else:
         frame = Frame(kind, payload[: PAYLOAD_MAX[kind]], route, sequence, stamp)

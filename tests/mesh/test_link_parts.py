@@ -7,9 +7,9 @@ import pytest
 from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.mesh.frames import WHOLE, Frame, Kind, pack_data_header
+from rmpa.mesh.frames import WHOLE, Frame, FrameKind, pack_data_header
 from rmpa.mesh.handshake import Lane
-from rmpa.mesh.link import Closed, ControlReceived, HelloReceived, Marked, Role, State, Up
+from rmpa.mesh.link import ControlReceived, HelloReceived, LinkClosed, LinkRole, LinkState, Marked, Up
 from tests.mesh.worlds import HIGH, LOW, Time, deliver, exchange, pair, pass_time, side
 
 
@@ -23,7 +23,7 @@ def fragments(route: int, sequence: int, payload: bytes, sizes: list[int]) -> li
     frames = []
     for number, piece in enumerate(pieces):
         flags = FIRST * (number == 0) | LAST * (number == len(pieces) - 1)
-        frames.append(Frame(Kind.DATA, piece, route, sequence, 99, flags).serialize())
+        frames.append(Frame(FrameKind.DATA, piece, route, sequence, 99, flags).serialize())
     return frames
 
 
@@ -48,12 +48,12 @@ def test_a_large_frame_is_handed_on_while_it_arrives(flags: int, chunk: int) -> 
     _, acceptor = pair(time)
     payload = bytes(range(251)) * 1000
     assert limits.CUT_THROUGH_BYTES < len(payload) <= limits.DATA_PAYLOAD_MAX
-    wire = Frame(Kind.DATA, payload, 7, 1, 99, flags).serialize()
+    wire = Frame(FrameKind.DATA, payload, 7, 1, 99, flags).serialize()
     half = len(wire) // 2
     consumed, wanted = acceptor.link.receive(memoryview(wire[:half]), time.now)
     assert (consumed, wanted) == (half, 0), "nothing is kept, nothing is waited for"
     assert sum(len(part) for *_, part in acceptor.parts) == half - 24
-    deliver(wire[half:] + Frame(Kind.CONTROL, b"{}").serialize(), acceptor.link, time.now, chunk)
+    deliver(wire[half:] + Frame(FrameKind.CONTROL, b"{}").serialize(), acceptor.link, time.now, chunk)
     assert b"".join(part for *_, part in acceptor.parts) == payload
     marks = [mark for _, _, _, mark, _ in acceptor.parts]
     assert marks[0] == flags & FIRST
@@ -85,7 +85,7 @@ def test_an_abort_is_handed_on_as_a_part_without_bytes() -> None:
     time = Time()
     _, acceptor = pair(time)
     frames = fragments(7, 1, bytes(900), [300, 300])
-    abort = Frame(Kind.DATA, b"", 7, 1, 99, LAST | ABORT).serialize()
+    abort = Frame(FrameKind.DATA, b"", 7, 1, 99, LAST | ABORT).serialize()
     deliver(frames[0] + frames[1] + abort, acceptor.link, time.now, 11)
     assert [(flags, len(part)) for _, _, _, flags, part in acceptor.parts] == [
         (FIRST, 300),
@@ -100,8 +100,8 @@ def test_an_abort_that_is_none_ends_the_link(flags: int) -> None:
     time = Time()
     _, acceptor = pair(time)
     with pytest.raises(RemoteProtocolError, match="aborts"):
-        acceptor.link.receive(memoryview(Frame(Kind.DATA, b"", 7, 1, 99, flags).serialize()), time.now)
-    assert acceptor.link.state is State.CLOSED
+        acceptor.link.receive(memoryview(Frame(FrameKind.DATA, b"", 7, 1, 99, flags).serialize()), time.now)
+    assert acceptor.link.state is LinkState.CLOSED
     assert acceptor.parts == []
 
 
@@ -110,16 +110,16 @@ def test_an_abort_that_is_none_ends_the_link(flags: int) -> None:
 def test_a_frame_that_is_too_long_is_refused_before_its_bytes_come(size: int, flags: int) -> None:
     time = Time()
     _, acceptor = pair(time)
-    header = size.to_bytes(4, "big") + bytes([Kind.DATA, flags]) + bytes(18)
+    header = size.to_bytes(4, "big") + bytes([FrameKind.DATA, flags]) + bytes(18)
     with pytest.raises(LimitExceeded):
         acceptor.link.receive(memoryview(header), time.now)
 
 
 def test_no_fragment_before_the_handshake_is_over() -> None:
     time = Time()
-    acceptor = side(Role.ACCEPTOR, HIGH, time)
+    acceptor = side(LinkRole.ACCEPTOR, HIGH, time)
     with pytest.raises(RemoteProtocolError, match="data frame while handshaking"):
-        acceptor.link.receive(memoryview(Frame(Kind.DATA, b"x", flags=FIRST).serialize()), time.now)
+        acceptor.link.receive(memoryview(Frame(FrameKind.DATA, b"x", flags=FIRST).serialize()), time.now)
 
 
 def test_closing_from_within_a_part_stops_the_reading() -> None:
@@ -157,14 +157,14 @@ def test_a_half_read_frame_keeps_the_link_no_longer_than_its_bytes_come() -> Non
         time.now += 0.9
         acceptor.link.receive(memoryview(bytes(1000)), time.now)
         acceptor.link.handle_timer(time.now)
-    assert not any(isinstance(event, Closed) for event in acceptor.events)
+    assert not any(isinstance(event, LinkClosed) for event in acceptor.events)
     pass_time(acceptor.link, time, 1.0)
-    assert isinstance(acceptor.last(), Closed)
+    assert isinstance(acceptor.last(), LinkClosed)
 
 
-@pytest.mark.parametrize("kind", [Kind.ACK, Kind.FENCE, Kind.FENCED])
+@pytest.mark.parametrize("kind", [FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED])
 @pytest.mark.parametrize("chunk", [1, 24, 1 << 20])
-def test_marks_come_in_the_order_of_the_messages(kind: Kind, chunk: int) -> None:
+def test_marks_come_in_the_order_of_the_messages(kind: FrameKind, chunk: int) -> None:
     time = Time()
     dialler, acceptor = pair(time)
     said: list[object] = []
@@ -180,8 +180,8 @@ def test_marks_come_in_the_order_of_the_messages(kind: Kind, chunk: int) -> None
         assert not link.has_output, "who answers a fence is the driver's business"
 
 
-@pytest.mark.parametrize("kind", [Kind.ACK, Kind.FENCE, Kind.FENCED])
-def test_a_mark_has_no_bytes(kind: Kind) -> None:
+@pytest.mark.parametrize("kind", [FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED])
+def test_a_mark_has_no_bytes(kind: FrameKind) -> None:
     time = Time()
     _, acceptor = pair(time)
     with pytest.raises(LimitExceeded, match=kind.name.lower()):
@@ -199,8 +199,8 @@ def test_a_bulk_lane_says_what_it_is_and_promises_its_own_lease() -> None:
 
 def test_an_acceptor_promises_for_a_bulk_lane_what_bulk_lanes_have() -> None:
     time = Time()
-    dialler = side(Role.DIALLER, LOW, time, expected=HIGH.guid, lease=limits.BULK_LEASE, lane=Lane.BULK)
-    acceptor = side(Role.ACCEPTOR, HIGH, time, lease=limits.LINK_LEASE)
+    dialler = side(LinkRole.DIALLER, LOW, time, expected=HIGH.guid, lease=limits.BULK_LEASE, lane=Lane.BULK)
+    acceptor = side(LinkRole.ACCEPTOR, HIGH, time, lease=limits.LINK_LEASE)
     deliver(dialler.link.take_output(), acceptor.link, time.now)
     acceptor.link.accept(time.now)
     exchange(dialler, acceptor, time)
@@ -214,5 +214,5 @@ def test_an_acceptor_promises_for_a_bulk_lane_what_bulk_lanes_have() -> None:
             mine.link.handle_timer(time.now)
             pings += mine.link.has_output
         exchange(dialler, acceptor, time)
-    assert dialler.link.state is acceptor.link.state is State.UP
+    assert dialler.link.state is acceptor.link.state is LinkState.UP
     assert pings <= 100 * 2.1, "a bulk lane's keepalives are seldom"

@@ -12,7 +12,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
-from rmpa.mesh.reliable import DELIVER, DUPLICATE, ReliableReceiver, ReliableSender, ResumeTable, Verdict
+from rmpa.mesh.reliable import DELIVER, DUPLICATE, ReceiveResult, ReliableReceiver, ReliableSender, ResumeTable
 from tests.mesh.reliable_pair import MASK, Bounds, Pair, number_of, payload
 
 FIRSTS = (1, 0, MASK, MASK - 5, (1 << 31) - 3)
@@ -291,9 +291,9 @@ def test_each_message_is_delivered_once() -> None:
 
 def test_a_gap_is_counted_exactly() -> None:
     receiver = ReliableReceiver(7, first=1)
-    assert receiver.accept(4, 7, 0.0) == Verdict(deliver=True, gap=3)
+    assert receiver.accept(4, 7, 0.0) == ReceiveResult(deliver=True, gap=3)
     assert receiver.accept(5, 7, 0.0) is DELIVER
-    assert receiver.accept(1000, 7, 0.0) == Verdict(deliver=True, gap=994)
+    assert receiver.accept(1000, 7, 0.0) == ReceiveResult(deliver=True, gap=994)
     assert receiver.accept(999, 7, 0.0) is DUPLICATE
     assert receiver.gap_total == 997
 
@@ -303,7 +303,7 @@ def test_without_a_first_sequence_no_gap_is_claimed() -> None:
     assert receiver.judge(500, 7) is DELIVER
     assert receiver.position() is None
     assert receiver.accept(500, 7, 0.0) is DELIVER
-    assert receiver.accept(502, 7, 0.0) == Verdict(deliver=True, gap=1)
+    assert receiver.accept(502, 7, 0.0) == ReceiveResult(deliver=True, gap=1)
     assert receiver.position() == (7, 502)
 
 
@@ -316,7 +316,7 @@ def test_another_epoch_begins_where_its_sender_says() -> None:
     assert receiver.accept(2, 7, 0.0) is DUPLICATE
     assert receiver.judge(2, 7) is DUPLICATE
     assert receiver.next_timer() is None
-    assert receiver.accept(2, 8, 0.0) == Verdict(deliver=True, gap=1)
+    assert receiver.accept(2, 8, 0.0) == ReceiveResult(deliver=True, gap=1)
     assert (receiver.breaks, receiver.duplicates) == (1, 1)
 
 
@@ -334,7 +334,7 @@ def test_the_same_epoch_goes_on() -> None:
 def test_a_first_fragment_is_judged_and_counts_only_with_its_last() -> None:
     receiver = ReliableReceiver(7, first=1)
     assert receiver.judge(1, 7) is DELIVER
-    assert receiver.judge(3, 7) == Verdict(deliver=True, gap=2)
+    assert receiver.judge(3, 7) == ReceiveResult(deliver=True, gap=2)
     assert receiver.position() == (7, 0)
     assert receiver.gap_total == 0
     receiver.accept(1, 7, 0.0)

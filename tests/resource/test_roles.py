@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.declare import Resource, Role
+from rmpa.resource.declare.resource import Resource, Role
 
 _PAGE = Path(__file__).parents[2] / "docs" / "smart-resources.md"
 

@@ -6,8 +6,8 @@ import asyncio
 from typing import TYPE_CHECKING, cast
 
 from rmpa.discovery.events import PeerChanged, PeerFound, PeerLost, PeerRestarted
-from rmpa.mesh.aio.link import Takers
-from rmpa.mesh.aio.mesh import Mesh
+from rmpa.mesh.io.link import LinkHandlers
+from rmpa.mesh.io.mesh import Mesh
 from tests.simulation.process import Process
 from tests.simulation.roster_peer import RosterPeer
 from tests.simulation.sockets import SimListener, SimSocket, connect
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.discovery.events import Event as RosterEvent
-    from rmpa.mesh.aio.link import MeshLink
-    from rmpa.mesh.frames import Kind
+    from rmpa.mesh.frames import FrameKind
     from rmpa.mesh.handshake import Lane
+    from rmpa.mesh.io.link import MeshLink
     from tests.simulation.network import Address, World
 
 
@@ -73,7 +73,7 @@ class MeshPeer(RosterPeer):
             on_link_up=ours(self.link_up),
             on_link_down=ours(self.link_down),
             on_control=ours(self.control),
-            takers=Takers(
+            takers=LinkHandlers(
                 ours(self.data), ours(self.part), ours(self.mark), ours(self.clock_known), ours(self.lane_lost)
             ),
             clock=SimClock(self.world),
@@ -147,7 +147,7 @@ class MeshPeer(RosterPeer):
     def part(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
         """A part of one; nothing here."""
 
-    def mark(self, link: MeshLink, kind: Kind, route: int, sequence: int) -> None:
+    def mark(self, link: MeshLink, kind: FrameKind, route: int, sequence: int) -> None:
         """An acknowledgement or the answer to a fence; nothing here."""
 
     def clock_known(self, link: MeshLink) -> None:

@@ -14,7 +14,7 @@ from tests.simulation.scenario import Outcome, Scenario
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.mesh.aio.link import MeshLink
+    from rmpa.mesh.io.link import MeshLink
     from tests.simulation.sockets import SimSocket
 
 _MANY = 10
@@ -57,8 +57,8 @@ class MeshScenario(Scenario):
         """What the code would ask the system for, the simulation tells."""
         slower = _SLOWER if self.count > _MANY else 1
         with (
-            mock.patch("rmpa.mesh.aio.mesh.unacknowledged", lambda sock: sock.in_flight),
-            mock.patch("rmpa.core.aio.acceptor.Acceptor._has_room", return_value=True),
+            mock.patch("rmpa.mesh.io.mesh.unacknowledged", lambda sock: sock.in_flight),
+            mock.patch("rmpa.runtime.acceptor.Acceptor._has_room", return_value=True),
             mock.patch.multiple(
                 limits,
                 LINK_LEASE=slower * limits.LINK_LEASE,

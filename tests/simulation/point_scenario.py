@@ -17,7 +17,7 @@ from tests.simulation.mesh_scenario import socket_of
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.mesh.aio.link import MeshLink
+    from rmpa.mesh.io.link import MeshLink
     from tests.simulation.traffic import Courier
 
 TROUBLES: Final = ("break", "swallow", "part", "kill receiver", "kill sender", "abort")
@@ -76,7 +76,7 @@ class PointScenario(LanesScenario):
         """And fragments are as short as can be read in a trace."""
         with (
             super().simulated(),
-            mock.patch("rmpa.mesh.aio.lane.Outbox", partial(Outbox, fragment=_FRAGMENT)),
+            mock.patch("rmpa.mesh.io.lane.Outbox", partial(Outbox, fragment=_FRAGMENT)),
             mock.patch.multiple(limits, FRAGMENT_BYTES=_FRAGMENT, EXPRESS_MESSAGE_MAX=50),
         ):
             yield

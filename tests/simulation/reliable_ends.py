@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.core import limits
 from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import frames
-from rmpa.mesh.frames import Frame, Kind
+from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.reliable import ReliableReceiver, ReliableSender, ResumeTable
 
 if TYPE_CHECKING:
@@ -69,14 +69,14 @@ class Wire:
 
     def control(self, **fields: Any) -> None:
         """Send a control message."""
-        self.end.send(Frame(Kind.CONTROL, json.dumps(fields).encode()).serialize())
+        self.end.send(Frame(FrameKind.CONTROL, json.dumps(fields).encode()).serialize())
 
     def data(self, sequence: int, stamp_ns: int, payload: bytes) -> None:
         """Send one message in its fragments."""
         for start in range(0, len(payload), FRAGMENT):
             flags = FIRST * (start == 0) | LAST * (start + FRAGMENT >= len(payload))
             piece = payload[start : start + FRAGMENT]
-            self.end.send(Frame(Kind.DATA, piece, ROUTE, sequence, stamp_ns, flags).serialize())
+            self.end.send(Frame(FrameKind.DATA, piece, ROUTE, sequence, stamp_ns, flags).serialize())
 
     def cut(self) -> None:
         """The stream breaks: noticed here now, by the other end a little later; what is under way is lost."""
@@ -99,7 +99,7 @@ class Wire:
                 break
             payload = self._buffer[header : header + length]
             self._buffer = self._buffer[header + length :]
-            self._on_frame(self, Frame(Kind(kind), payload, route, sequence, stamp_ns, flags))
+            self._on_frame(self, Frame(FrameKind(kind), payload, route, sequence, stamp_ns, flags))
 
 
 class Exporter:
@@ -285,7 +285,7 @@ class Importer:
 
     def _frame(self, wire: Wire, frame: Frame) -> None:
         life = self.lives[-1]
-        if frame.kind is Kind.CONTROL:
+        if frame.kind is FrameKind.CONTROL:
             message = json.loads(frame.payload)
             if wire is self.wire:  # a late word of an old link must not bring an old epoch back
                 wire.epoch = message["epoch"]

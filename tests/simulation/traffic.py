@@ -10,18 +10,18 @@ import json
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.bridge.aio.flows import ExportFlow, ImportFlow
-from rmpa.bridge.aio.legs import ReliableLeg
-from rmpa.bridge.aio.link_time import LinkTime
+from rmpa.bridge.data.io.flows import ExportFlow, ImportFlow
+from rmpa.bridge.data.io.link_time import LinkTime
+from rmpa.bridge.data.io.route_sender import ReliableRouteSender
 from rmpa.core.contract import Contract, Priority, Reliability
-from rmpa.mesh.frames import Kind
+from rmpa.mesh.frames import FrameKind
 from tests.simulation.mesh_peer import MeshPeer
 
 if TYPE_CHECKING:
     import random
 
-    from rmpa.bridge.aio.legs import Leg
-    from rmpa.mesh.aio.link import MeshLink
+    from rmpa.bridge.data.io.route_sender import RouteSender
+    from rmpa.mesh.io.link import MeshLink
 
 _RING: Final = bytes(range(256))
 _SIZES: Final = (20, 300, 300, 5000, 9000, 40_000, 150_000, 400_000)
@@ -112,7 +112,7 @@ class Courier(MeshPeer):
         self.first: dict[bytes, int] = {}
         """By instance: the number of the first message that this reliable receiver must have."""
         self.inboxes: dict[bytes, Inbox] = {}
-        self.legs: dict[tuple[MeshLink, int], Leg] = {}
+        self.legs: dict[tuple[MeshLink, int], RouteSender] = {}
         self.flows: dict[tuple[MeshLink, int], ImportFlow] = {}
         self.times: dict[MeshLink, LinkTime] = {}
         self._peers: dict[bytes, int] = {}
@@ -209,7 +209,7 @@ class Courier(MeshPeer):
         for key in [key for key in self.legs if key[0] is link]:
             leg = self.legs.pop(key)
             peer = self._peers[link.identity.instance]
-            if isinstance(leg, ReliableLeg):
+            if isinstance(leg, ReliableRouteSender):
                 self.exports.suspend(peer)
             else:
                 self.exports.remove(peer)
@@ -251,12 +251,12 @@ class Courier(MeshPeer):
         if flow is not None:
             flow.part(sequence, stamp_ns, flags, part)
 
-    def mark(self, link: MeshLink, kind: Kind, route: int, sequence: int) -> None:
+    def mark(self, link: MeshLink, kind: FrameKind, route: int, sequence: int) -> None:
         """An acknowledgement, or a fence's answer."""
         leg = self.legs.get((link, route))
-        if leg is not None and kind is Kind.ACK:
+        if leg is not None and kind is FrameKind.ACK:
             leg.acknowledged(sequence)
-        elif leg is not None and kind is Kind.FENCED:
+        elif leg is not None and kind is FrameKind.FENCED:
             leg.fenced(sequence)
 
     # --- inside ---------------------------------------------------------------------------------------------
@@ -270,7 +270,7 @@ class Courier(MeshPeer):
         peer = self._peers[link.identity.instance]
         leg = self.exports.by_peer.get(peer)
         contract = {"reliability": self.contract.reliability, "priority": self.contract.priority}
-        if epoch and isinstance(leg, ReliableLeg) and leg.sender.epoch == epoch:
+        if epoch and isinstance(leg, ReliableRouteSender) and leg.sender.epoch == epoch:
             self._say(link, op="opened", epoch=epoch, first=leg.sender.first, **contract)
             leg.resume(link, 1, after)
         else:
@@ -287,7 +287,7 @@ class Courier(MeshPeer):
         )
 
         def acknowledge(sequence: int) -> None:
-            link.mark(Kind.ACK, 1, sequence)
+            link.mark(FrameKind.ACK, 1, sequence)
 
         if inbox.flow is not None:
             inbox.flow.rebind(acknowledge)

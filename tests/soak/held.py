@@ -16,13 +16,13 @@ import psutil
 
 from rmpa.core.errors import UnreachableError
 from rmpa.experiments.bed.processes import BedError, eventually
-from rmpa.monitor.aio.control_client import ControlClient
+from rmpa.observe.io.control_client import ControlClient
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rmpa.experiments.bed.agents import Agent
-    from rmpa.monitor.snapshot import Snapshot
+    from rmpa.observe.snapshot import Snapshot
 
 MB: Final = 1 << 20
 PATIENCE: Final = 60.0

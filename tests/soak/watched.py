@@ -19,7 +19,7 @@ from typing import Final
 
 from rmpa.agent import agent
 from rmpa.cli.main import main
-from rmpa.core.aio.loop import AgentLoop
+from rmpa.runtime.event_loop import AgentLoop
 
 _EVERY: Final = 0.25
 """Seconds between two looks at the loop."""

@@ -12,49 +12,49 @@ import sys
 import time
 from typing import TYPE_CHECKING, Final
 
-from rmpa.agent.clocks import Clocks
 from rmpa.agent.core_choice import make_core
-from rmpa.agent.diagnostics import Diagnostics
-from rmpa.agent.nodes import NodeDesk
-from rmpa.agent.params import ParamOps
+from rmpa.agent.node_requests import NodeRequests
+from rmpa.agent.param_requests import ParamOps
 from rmpa.agent.reload import Hangups, Reloader
-from rmpa.agent.station import Station
-from rmpa.agent.view import View
-from rmpa.agent.view_services import ServicesView
-from rmpa.agent.why import Why
-from rmpa.bridge.aio.bounds import Bounds
-from rmpa.bridge.aio.bridge import Bridge
+from rmpa.bridge.io.bounds import Bounds
+from rmpa.bridge.io.bridge import Bridge
+from rmpa.bridge.io.network_endpoint import NetworkEndpoint
 from rmpa.bridge.naming import Names
-from rmpa.bridge.params.aio.part import Params
+from rmpa.bridge.params.io.part import Params
 from rmpa.bridge.policy import Policy
-from rmpa.bridge.services.aio.part import Services
+from rmpa.bridge.services.io.part import Services
 from rmpa.bridge.services.rules import ServiceRules
+from rmpa.config.values import did_you_mean
 from rmpa.core import limits
-from rmpa.core.aio import realtime
-from rmpa.core.aio.collector import Collector
-from rmpa.core.aio.descriptors import is_shortage, raise_file_limit
-from rmpa.core.aio.loop import AgentLoop
-from rmpa.core.aio.notify import notify_service_manager
-from rmpa.core.config_values import did_you_mean
 from rmpa.core.contract import Contracts
 from rmpa.core.counters import Counters
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError, UnreachableError
 from rmpa.core.open_files import remedy
-from rmpa.monitor.aio.control_server import ControlServer
-from rmpa.monitor.aio.runtime_dir import runtime_dir
-from rmpa.monitor.snapshot import FollowedInfo, PingReply, Snapshot
-from rmpa.ros.aio.logger_services import LoggerServices
+from rmpa.observe.io.control_server import ControlServer
+from rmpa.observe.io.diagnostics import Diagnostics
+from rmpa.observe.io.peer_clocks import PeerClocks
+from rmpa.observe.io.runtime_dir import runtime_dir
+from rmpa.observe.io.services_section import ServicesSection
+from rmpa.observe.io.snapshot_builder import SnapshotBuilder
+from rmpa.observe.io.why import WhyService
+from rmpa.observe.snapshot import FollowedInfo, PingReply, Snapshot
+from rmpa.ros.node.logger_services import LoggerServices
+from rmpa.runtime import realtime
+from rmpa.runtime.descriptors import is_shortage, raise_file_limit
+from rmpa.runtime.event_loop import AgentLoop
+from rmpa.runtime.garbage_collector import GarbageCollector
+from rmpa.runtime.service_manager import notify_service_manager
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.bridge.aio.bridge import Attached
-    from rmpa.core.config import Settings
-    from rmpa.core.config_sources import Loaded
-    from rmpa.mesh.aio.link import MeshLink
-    from rmpa.monitor.diagnosis import Diagnosis
-    from rmpa.monitor.reloading import ReloadReply
-    from rmpa.ros.aio.core_api import Core
+    from rmpa.bridge.io.bridge import PeerSession
+    from rmpa.config.settings import Settings
+    from rmpa.config.sources import Loaded
+    from rmpa.mesh.io.link import MeshLink
+    from rmpa.observe.reload_reply import ReloadReply
+    from rmpa.observe.why.diagnosis import Diagnosis
+    from rmpa.ros.core.api import Core
 
 _log = logging.getLogger(__name__)
 
@@ -76,7 +76,7 @@ class Agent:
     def __init__(
         self,
         settings: Settings,
-        wishes: tuple[realtime.Wish, ...] = (),
+        wishes: tuple[realtime.SchedulingRequest, ...] = (),
         load: Callable[[], Loaded] | None = None,
     ) -> None:
         self._settings = settings
@@ -103,12 +103,12 @@ class Agent:
             relay=settings.relay,
             most=settings.limits,
         )
-        self.station: Station | None = None
+        self.station: NetworkEndpoint | None = None
         self._moving: asyncio.Task[None] | None = None
         counters = Counters()
-        self._collector = Collector(self._carried, counters)
-        self._clocks = Clocks(self.bridge)
-        self._view = View(
+        self._collector = GarbageCollector(self._carried, counters)
+        self._clocks = PeerClocks(self.bridge)
+        self._view = SnapshotBuilder(
             settings,
             self.core,
             self.bridge,
@@ -128,13 +128,13 @@ class Agent:
         bounds = Bounds(self.bridge, self.services, settings.limits)
         self.bridge.add(bounds)
         self._view.watch(bounds)
-        self._view.services = ServicesView(self.services)
-        self._nodes = NodeDesk(settings, self.core, self.bridge, self._attached)
+        self._view.services = ServicesSection(self.services)
+        self._nodes = NodeRequests(settings, self.core, self.bridge, self._attached)
         self._param_ops = ParamOps(self.params, self.bridge.asks, self._attached)
         self.reloader = Reloader(settings, load, self._take)
         self._view.parameters = self.params.notes
         self._view.waiting = lambda: self.reloader.waiting
-        self._whys = Why(settings, self.core, self.bridge, self.services, self._view)
+        self._whys = WhyService(settings, self.core, self.bridge, self.services, self._view)
 
     async def start(self) -> None:
         """Start every part; the network last, so that who finds us finds us ready.
@@ -172,7 +172,7 @@ class Agent:
     # --- the place in the network ------------------------------------------------------------------------------
 
     async def _join(self, port: int) -> None:
-        self.station = Station(self._settings, self.bridge, port=port, on_displaced=self._displaced)
+        self.station = NetworkEndpoint(self._settings, self.bridge, port=port, on_displaced=self._displaced)
         self._view.station = self.station
         await self.station.start()
 
@@ -248,7 +248,7 @@ class Agent:
     def _link(self, peer: str) -> MeshLink:
         return self._attached(peer).link
 
-    def _attached(self, peer: str) -> Attached:
+    def _attached(self, peer: str) -> PeerSession:
         linked = {attached.link: attached for attached in self.bridge.attached()}
         links = list(linked)
         fitting = [link for link in links if peer in {link.name, str(link.guid), str(link.guid).partition("#")[0]}]
@@ -262,7 +262,7 @@ class Agent:
 
 
 async def _serve(
-    settings: Settings, wishes: tuple[realtime.Wish, ...], load: Callable[[], Loaded] | None = None
+    settings: Settings, wishes: tuple[realtime.SchedulingRequest, ...], load: Callable[[], Loaded] | None = None
 ) -> None:
     agent = Agent(settings, wishes, load)
     stop = asyncio.Event()

@@ -7,16 +7,16 @@ import os
 from typing import TYPE_CHECKING
 
 from rmpa.bridge.policy import OWN_NODE, is_own
-from rmpa.core.aio.state_dir import core_file
-from rmpa.ros.aio.core import RosCore
-from rmpa.ros.aio.external_core import ExternalCore
-from rmpa.ros.aio.http_client import is_own_name
-from rmpa.ros.aio.local_addresses import local_addresses
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.core.external import ExternalCore
 from rmpa.ros.environment import DEFAULT_MASTER_URI, RosEnvironment, host_of, is_loopback
+from rmpa.ros.http.client import is_own_name
+from rmpa.ros.node.local_addresses import local_addresses
+from rmpa.runtime.state_dir import core_file
 
 if TYPE_CHECKING:
-    from rmpa.core.config import Settings
-    from rmpa.ros.aio.core_api import Core
+    from rmpa.config.settings import Settings
+    from rmpa.ros.core.api import Core
 
 _log = logging.getLogger(__name__)
 

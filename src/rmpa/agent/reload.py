@@ -10,15 +10,15 @@ import time
 from dataclasses import fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.aio.notify import notify_service_manager
 from rmpa.core.errors import ConfigError
-from rmpa.monitor.reloading import ReloadReply
+from rmpa.observe.reload_reply import ReloadReply
+from rmpa.runtime.service_manager import notify_service_manager
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rmpa.core.config import Settings
-    from rmpa.core.config_sources import Loaded
+    from rmpa.config.settings import Settings
+    from rmpa.config.sources import Loaded
 
 _log = logging.getLogger(__name__)
 

@@ -54,7 +54,7 @@ class Origin(msgspec.Struct, frozen=True):
     path: tuple[str, ...] = ()
 
 
-class Offer(msgspec.Struct, frozen=True, omit_defaults=True):
+class TopicOffer(msgspec.Struct, frozen=True, omit_defaults=True):
     """A source that the sender's graph has, and its message type.
 
     Args:
@@ -113,13 +113,13 @@ class Advertise(msgspec.Struct, frozen=True, tag_field="op", tag="advertise"):
         more: Further messages go on with that.
     """
 
-    added: tuple[Offer, ...] = ()
+    added: tuple[TopicOffer, ...] = ()
     removed: tuple[Source, ...] = ()
     full: bool = False
     more: bool = False
 
 
-class Open(msgspec.Struct, frozen=True, tag_field="op", tag="open"):
+class OpenRoute(msgspec.Struct, frozen=True, tag_field="op", tag="open"):
     """Send me this source; its data frames shall bear this route's id, which I chose.
 
     Args:
@@ -144,7 +144,7 @@ class Open(msgspec.Struct, frozen=True, tag_field="op", tag="open"):
         return Source(self.topic, self.node)
 
 
-class Opened(msgspec.Struct, frozen=True, tag_field="op", tag="opened"):
+class RouteOpened(msgspec.Struct, frozen=True, tag_field="op", tag="opened"):
     """The route is open; data follows.
 
     Args:
@@ -169,13 +169,13 @@ class Opened(msgspec.Struct, frozen=True, tag_field="op", tag="opened"):
     at_least: bool | msgspec.UnsetType = msgspec.UNSET
 
 
-class Close(msgspec.Struct, frozen=True, tag_field="op", tag="close"):
+class CloseRoute(msgspec.Struct, frozen=True, tag_field="op", tag="close"):
     """I want no more of this route."""
 
     route: int
 
 
-class Closed(msgspec.Struct, frozen=True, tag_field="op", tag="closed"):
+class RouteClosed(msgspec.Struct, frozen=True, tag_field="op", tag="closed"):
     """The route is not, or no longer, open on my side; ``reason`` is for people."""
 
     route: int
@@ -282,8 +282,8 @@ class ServiceClosed(msgspec.Struct, frozen=True, tag_field="op", tag="service_cl
     reason: str
 
 
-class Ask(msgspec.Struct, frozen=True, tag_field="op", tag="ask"):
-    """A question of one agent to another; ``bridge.aio.asks`` has those that are answered.
+class Request(msgspec.Struct, frozen=True, tag_field="op", tag="ask"):
+    """A question of one agent to another; ``bridge.session.peer_rpc`` has those that are answered.
 
     Args:
         number: The asker's number for it.
@@ -296,7 +296,7 @@ class Ask(msgspec.Struct, frozen=True, tag_field="op", tag="ask"):
     args: dict[str, Any] = {}
 
 
-class Answer(msgspec.Struct, frozen=True, tag_field="op", tag="answer"):
+class Response(msgspec.Struct, frozen=True, tag_field="op", tag="answer"):
     """What came of a question.
 
     Args:
@@ -314,17 +314,17 @@ class Answer(msgspec.Struct, frozen=True, tag_field="op", tag="answer"):
     remedy: str = ""
 
 
-class Tell(msgspec.Struct, frozen=True, tag_field="op", tag="tell"):
-    """News for another agent that nobody answers; its handler is found by ``what``, as for ``Ask``."""
+class Notification(msgspec.Struct, frozen=True, tag_field="op", tag="tell"):
+    """News for another agent that nobody answers; its handler is found by ``what``, as for ``Request``."""
 
     what: str
     args: dict[str, Any] = {}
 
 
-RouteMessage = Open | Opened | Close | Closed | Audience
+RouteMessage = OpenRoute | RouteOpened | CloseRoute | RouteClosed | Audience
 TopicMessage = Advertise | Mismatch | RouteMessage
 ServiceMessage = AdvertiseServices | OpenService | ServiceOpened | CloseService | ServiceClosed
-AgentMessage = Ask | Answer | Tell
+AgentMessage = Request | Response | Notification
 Message = TopicMessage | ServiceMessage | AgentMessage
 
 _ENCODER: Final = msgspec.json.Encoder()
@@ -374,7 +374,7 @@ def _validate(message: Message) -> None:
             _check_names(message.topic, message.node)
             _check_text(message.subscriber)
             _check_text(message.text)
-        case Ask() | Answer() | Tell():
+        case Request() | Response() | Notification():
             _validate_agent(message)
         case AdvertiseServices() | OpenService() | ServiceOpened() | CloseService() | ServiceClosed():
             _validate_service(message)
@@ -414,12 +414,12 @@ def _validate_route(message: RouteMessage) -> None:
     if not 0 < message.route < limits.SERVICE_ROUTES:
         raise RemoteProtocolError(f"route {message.route} is not a 31-bit number above 0")
     match message:
-        case Open():
+        case OpenRoute():
             _check_names(message.topic, message.node)
             _check_terms(message)
-        case Closed():
+        case RouteClosed():
             _check_text(message.reason)
-        case Opened():
+        case RouteOpened():
             if message.description.problem:
                 raise RemoteProtocolError(f"route {message.route}: {message.description.problem}")
             _check_terms(message)
@@ -461,20 +461,20 @@ def _check_service_route(route: int) -> None:
 
 
 def _validate_agent(message: AgentMessage) -> None:
-    if isinstance(message, Answer):
+    if isinstance(message, Response):
         _check_text(message.error)
         _check_text(message.remedy)
     elif len(message.what) > limits.ASK_NAME_MAX:
         raise LimitExceeded("name of a question", len(message.what), limits.ASK_NAME_MAX)
-    if isinstance(message, Ask | Answer) and not 0 < message.number <= _ROUTE_MAX:
+    if isinstance(message, Request | Response) and not 0 < message.number <= _ROUTE_MAX:
         raise RemoteProtocolError(f"question {message.number} is not a 32-bit number above 0")
 
 
-def _check_terms(message: Open | Opened) -> None:
+def _check_terms(message: OpenRoute | RouteOpened) -> None:
     """A contract that a peer sends must be one that our own file could have."""
     contract = message.contract
-    numbers = [message.epoch, message.after if isinstance(message, Open) else message.first]
-    if isinstance(message, Opened):
+    numbers = [message.epoch, message.after if isinstance(message, OpenRoute) else message.first]
+    if isinstance(message, RouteOpened):
         numbers += [n for n in (message.following, message.lost) if not isinstance(n, msgspec.UnsetType)]
     times = (contract.deadline, contract.lifespan, contract.liveliness_lease)
     lowest, highest = limits.CONTRACT_TIME_MIN, limits.CONTRACT_TIME_MAX

@@ -14,15 +14,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from rmpa.config.param_rules import CLOCK
+from rmpa.config.peer_rules import PEER
 from rmpa.core import limits
-from rmpa.core.config_param import CLOCK
-from rmpa.core.config_peer import PEER
 from rmpa.core.names import matches
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rmpa.core.config import PeerRule, Remap
+    from rmpa.config.settings import PeerRule, Remap
 
 
 class PeerNames:

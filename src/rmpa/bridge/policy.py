@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
+from rmpa.config.param_rules import CLOCK
+from rmpa.config.peer_rules import PEER
+from rmpa.config.settings import TimeSettings
 from rmpa.core import limits
-from rmpa.core.config import TimeSettings
-from rmpa.core.config_param import CLOCK
-from rmpa.core.config_peer import PEER
 from rmpa.core.names import NEVER_CROSSING, matches
 
 if TYPE_CHECKING:
-    from rmpa.core.config import PeerRule, PolicySettings
+    from rmpa.config.settings import PeerRule, PolicySettings
 
 OWN_NODE: Final = "/rmpa"
 """The agent's own node; what it stands for lives below: ``/rmpa/<peer>/<node>``."""
@@ -25,7 +25,7 @@ _NO_TIME: Final = TimeSettings()
 
 
 @dataclass(frozen=True, slots=True)
-class Decision:
+class PolicyDecision:
     """Whether a source may cross, and the rule that says so, ready to show."""
 
     allowed: bool
@@ -54,23 +54,23 @@ class Policy:
         self._time = time
         self._known: dict[str, list[tuple[str, PolicySettings]]] = {}
 
-    def judge(self, topic: str, type_name: str, node: str) -> Decision:
+    def judge(self, topic: str, type_name: str, node: str) -> PolicyDecision:
         """Decide about one source; the first "no" wins, in the order of the table below."""
         if is_own(node):
-            return Decision(False, f"{node} stands for a node of another module, or is the agent itself")
+            return PolicyDecision(False, f"{node} stands for a node of another module, or is the agent itself")
         if topic == CLOCK and self._time.share:
-            return Decision(True, "time.share = true: peers may follow this module's time")
+            return PolicyDecision(True, "time.share = true: peers may follow this module's time")
         if why := never_crosses(topic):
-            return Decision(False, f"built in: {why}")
+            return PolicyDecision(False, f"built in: {why}")
         return _judge(self._settings, "bridge", topic, type_name)
 
-    def judge_clock(self, peer: str) -> Decision:
+    def judge_clock(self, peer: str) -> PolicyDecision:
         """Decide whether a peer's ``/clock`` may come here."""
         if not self._time.follow:
-            return Decision(False, f"built in: {NEVER_CROSSING[CLOCK]}; [time] follow names the peer to follow")
+            return PolicyDecision(False, f"built in: {NEVER_CROSSING[CLOCK]}; [time] follow names the peer to follow")
         if self._time.follow != peer:
-            return Decision(False, f'time.follow = "{self._time.follow}": time comes from there alone')
-        return Decision(True, f'time.follow = "{peer}"')
+            return PolicyDecision(False, f'time.follow = "{self._time.follow}": time comes from there alone')
+        return PolicyDecision(True, f'time.follow = "{peer}"')
 
     def has_rules_for(self, peer: str) -> bool:
         """Whether ``judge_for`` has anything to say about a peer."""
@@ -89,7 +89,7 @@ class Policy:
             ]
         return known
 
-    def judge_for(self, peer: str, name: str, type_name: str | None = None, wire: str = "") -> Decision:
+    def judge_for(self, peer: str, name: str, type_name: str | None = None, wire: str = "") -> PolicyDecision:
         """Decide whether what ``judge`` lets cross may do so between us and one peer.
 
         Args:
@@ -98,9 +98,9 @@ class Policy:
             type_name: A topic's message type; ``None`` where there is none to judge by.
             wire: What it is called on its way, where that is another name.
         """
-        decision = Decision(True, "")
+        decision = PolicyDecision(True, "")
         if wire and wire != name and (why := never_crosses(wire)):
-            return Decision(False, f"built in: {why} (it is {wire} there)")
+            return PolicyDecision(False, f"built in: {why} (it is {wire} there)")
         for where, settings in self._rules_for(peer):
             decision = _judge(settings, where, name, type_name)
             if not decision.allowed:
@@ -118,18 +118,18 @@ def _filled(settings: PolicySettings, peer: str) -> PolicySettings:
     return replace(settings, allow=allow, deny=deny)
 
 
-def _judge(settings: PolicySettings, where: str, name: str, type_name: str | None) -> Decision:
+def _judge(settings: PolicySettings, where: str, name: str, type_name: str | None) -> PolicyDecision:
     """Decide by one set of globs; ``where`` is its place in the file, to show."""
     for pattern in settings.deny:
         if matches(pattern, name):
-            return Decision(False, f"{where}.deny has {pattern!r}")
+            return PolicyDecision(False, f"{where}.deny has {pattern!r}")
     if type_name is not None:
         for pattern in settings.deny_types:
             if matches(pattern, type_name):
-                return Decision(False, f"{where}.deny_types has {pattern!r}")
+                return PolicyDecision(False, f"{where}.deny_types has {pattern!r}")
         if not any(matches(pattern, type_name) for pattern in settings.allow_types):
-            return Decision(False, f"no glob of {where}.allow_types fits {type_name}")
+            return PolicyDecision(False, f"no glob of {where}.allow_types fits {type_name}")
     for pattern in settings.allow:
         if matches(pattern, name):
-            return Decision(True, f"{where}.allow has {pattern!r}")
-    return Decision(False, f"no glob of {where}.allow fits {name}")
+            return PolicyDecision(True, f"{where}.allow has {pattern!r}")
+    return PolicyDecision(False, f"no glob of {where}.allow fits {name}")

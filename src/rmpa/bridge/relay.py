@@ -82,7 +82,7 @@ def may_have(instance: str, origin: Origin) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Linked:
+class LinkedPeer:
     """A peer with a link of its own.
 
     Args:
@@ -109,7 +109,7 @@ class _Origin:
     ways: dict[int, list[int]] = field(default_factory=dict)
 
 
-class Ways:
+class RelayPaths:
     """The receiving side: by which of its ways a module is reached. Its own link goes first, then the best relay.
 
     The best relay has the shortest path; of several the lowest GUID's. All sources of a module come the same way.
@@ -118,7 +118,7 @@ class Ways:
     def __init__(self) -> None:
         self.instance = ""
         """Our own, as 32 hexadecimal digits."""
-        self._linked: dict[int, Linked] = {}
+        self._linked: dict[int, LinkedPeer] = {}
         self._origins: dict[str, _Origin] = {}
 
     def __iter__(self) -> Iterator[tuple[Origin, str]]:
@@ -131,7 +131,7 @@ class Ways:
     def __contains__(self, instance: str) -> bool:
         return instance in self._origins
 
-    def linked(self, peer: int, who: Linked) -> set[str]:
+    def linked(self, peer: int, who: LinkedPeer) -> set[str]:
         """A peer has a link; return the modules whose way may be another one now."""
         self._linked[peer] = who
         return {who.instance}

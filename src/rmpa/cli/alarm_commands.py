@@ -18,15 +18,15 @@ from rmpa.cli.output import Column, coloured, print_json, print_line, print_tabl
 from rmpa.cli.resources_seen import look_around, run_around
 from rmpa.cli.stream import run_stream, with_node
 from rmpa.core.errors import RmpaError
-from rmpa.resource.descriptor import TOPIC
-from rmpa.ros.diagnostic_array import ARRAY_TYPE, Level
-from rmpa.ros.messages import MessageType
+from rmpa.resource.run.descriptor import TOPIC
+from rmpa.ros.types.diagnostic_array import ARRAY_TYPE, DiagnosticLevel
+from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:
     from rmpa.cli.master import Master
-    from rmpa.cli.resources_seen import Room, Seen
-    from rmpa.ros.aio.node import Node
-    from rmpa.ros.aio.topics import Received
+    from rmpa.cli.resources_seen import Room, SeenResource
+    from rmpa.ros.node.node import Node
+    from rmpa.ros.node.topics import Received
 
 _COLOURS: Final = {"OK": "green", "WARN": "yellow", "ERROR": "red", "STALE": "magenta"}
 _LOOK: Final = 1.0
@@ -66,7 +66,7 @@ def _health(message: Any) -> dict[str, Any]:
 
 def _status(status: Any) -> dict[str, Any]:
     return {
-        "level": Level(int(status.level) & 3).name,
+        "level": DiagnosticLevel(int(status.level) & 3).name,
         "message": str(status.message),
         "values": {str(pair.key): str(pair.value) for pair in status.values},
     }
@@ -98,10 +98,10 @@ async def _echo(master: Master, resource: str | None, count: int | None, *, as_j
         async def pick(room: Room) -> None:
             printer.only = room.pick(resource)
 
-        printer = _Printer(count, as_json=as_json)
+        printer = _AlarmPrinter(count, as_json=as_json)
         await look_around(master, pick)
     else:
-        printer = _Printer(count, as_json=as_json)
+        printer = _AlarmPrinter(count, as_json=as_json)
 
     async def body(node: Node) -> None:
         looking = asyncio.create_task(_keep_looking(node, master, printer))
@@ -118,7 +118,7 @@ async def _echo(master: Master, resource: str | None, count: int | None, *, as_j
     await with_node(master, "rmpa_alarm", body)
 
 
-async def _keep_looking(node: Node, master: Master, printer: _Printer) -> None:
+async def _keep_looking(node: Node, master: Master, printer: _AlarmPrinter) -> None:
     """Listen to the alarms of all resources, those to come included."""
     known: set[str] = set()
     while True:
@@ -138,11 +138,11 @@ async def _keep_looking(node: Node, master: Master, printer: _Printer) -> None:
         await asyncio.sleep(_LOOK)
 
 
-class _Printer:
+class _AlarmPrinter:
     """Prints alarms, and counts them."""
 
     def __init__(self, count: int | None, *, as_json: bool) -> None:
-        self.only: Seen | None = None
+        self.only: SeenResource | None = None
         self.enough = asyncio.Event()
         self.told = False
         self._left = count

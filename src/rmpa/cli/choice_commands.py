@@ -15,12 +15,12 @@ from rmpa.core.errors import ConfigError
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Mapping
 
-    from rmpa.cli.resources_seen import Room, Seen
-    from rmpa.resource.descriptor import Descriptor
+    from rmpa.cli.resources_seen import Room, SeenResource
+    from rmpa.resource.run.descriptor import Descriptor
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class ManualChoice:
     """What is chosen of a resource.
 
     Args:
@@ -31,7 +31,7 @@ class Choice:
 
     what: str
     names: Callable[[Descriptor], Iterable[str]]
-    present: Callable[[Room, Seen], Awaitable[Mapping[str, Any]]]
+    present: Callable[[Room, SeenResource], Awaitable[Mapping[str, Any]]]
 
     def get_command(self, text: str) -> click.Command:
         """``get``, with its help."""
@@ -87,6 +87,6 @@ class Choice:
         return set_
 
 
-def whose(one: Seen) -> dict[str, str | None]:
+def whose(one: SeenResource) -> dict[str, str | None]:
     """Which resource it is about, for JSON."""
     return {"resource": one.path, "peer": one.peer}

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.cli.choice_commands import Choice, whose
+from rmpa.cli.choice_commands import ManualChoice, whose
 from rmpa.cli.options import agent_option, json_option, master_option
 from rmpa.cli.output import Column, print_json, print_table, printable
 from rmpa.cli.resources_seen import run_around
 from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
-    from rmpa.cli.resources_seen import Room, Seen
+    from rmpa.cli.resources_seen import Room, SeenResource
 
 
 @click.command("list", epilog="\b\nExamples:\n  rmpa context list\n  rmpa context list base:/sonar --json\n")
@@ -58,7 +58,7 @@ def _mark(name: str, context: str, chosen: str) -> str:
     return "by hand" if name == chosen else "yes"
 
 
-async def _present(room: Room, one: Seen) -> dict[str, str]:
+async def _present(room: Room, one: SeenResource) -> dict[str, str]:
     """The present context, and the one chosen by hand."""
     if not one.descriptor.contexts:
         return {"context": "", "chosen": ""}
@@ -68,7 +68,7 @@ async def _present(room: Room, one: Seen) -> dict[str, str]:
     return {"context": said[one], "chosen": str(values.get("context", ""))}
 
 
-_CHOICE = Choice("context", lambda descriptor: (each.name for each in descriptor.contexts), _present)
+_CHOICE = ManualChoice("context", lambda descriptor: (each.name for each in descriptor.contexts), _present)
 get = _CHOICE.get_command("Print the present context of a RESOURCE; an empty line for none.")
 set_ = _CHOICE.set_command(
     "Choose the CONTEXT of a RESOURCE by hand; returns when it is there.", "Let the rules decide again.", "docked"

@@ -15,8 +15,8 @@ from rmpa.core.errors import UnreachableError
 
 def _default_port() -> int:
     """The port of ``ROS_MASTER_URI`` if that names this machine, as roscore has it; else ROS's own."""
-    from rmpa.ros.aio.core import DEFAULT_PORT
-    from rmpa.ros.aio.http_client import is_own_name, split_uri
+    from rmpa.ros.core.embedded import DEFAULT_PORT
+    from rmpa.ros.http.client import is_own_name, split_uri
 
     try:
         host, port, _ = split_uri(os.environ.get("ROS_MASTER_URI", ""))
@@ -46,7 +46,7 @@ def _default_port() -> int:
 @click.option("--debug", is_flag=True, help="Log every call.")
 def core(port: int | None, host: str, advertise: str, fresh: bool, verbose: bool, debug: bool) -> None:
     """Run a ROS core: master, parameter server and /rosout, as roscore does."""
-    from rmpa.core.aio.descriptors import raise_file_limit
+    from rmpa.runtime.descriptors import raise_file_limit
 
     level = logging.DEBUG if debug else logging.INFO if verbose else logging.WARNING
     logging.basicConfig(level=level, format="%(asctime)s %(levelname)-7s %(name)s %(message)s")
@@ -56,8 +56,8 @@ def core(port: int | None, host: str, advertise: str, fresh: bool, verbose: bool
 
 async def _run(host: str, port: int, advertise: str, *, fresh: bool) -> None:
     from rmpa import __version__
-    from rmpa.core.aio.state_dir import core_file
-    from rmpa.ros.aio.core import ROS_VERSION, RosCore
+    from rmpa.ros.core.embedded import ROS_VERSION, RosCore
+    from rmpa.runtime.state_dir import core_file
 
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()

@@ -10,14 +10,19 @@ import click
 
 from rmpa.cli.options import json_option
 from rmpa.cli.output import coloured, print_json, print_line, printable
-from rmpa.doctor.finding import Level, exit_code
+from rmpa.observe.doctor.finding import FindingLevel, exit_code
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rmpa.doctor.finding import Finding
+    from rmpa.observe.doctor.finding import Finding
 
-_COLOURS: Final = {Level.OK: "green", Level.WARN: "yellow", Level.FAIL: "red", Level.SKIPPED: "cyan"}
+_COLOURS: Final = {
+    FindingLevel.OK: "green",
+    FindingLevel.WARN: "yellow",
+    FindingLevel.FAIL: "red",
+    FindingLevel.SKIPPED: "cyan",
+}
 EPILOG = """\
 \b
 Exit codes: 0 nothing fails (there may be warnings); 1 something does.
@@ -41,16 +46,18 @@ def doctor(config: str | None, quiet: bool, as_json: bool) -> int:
     and looks whether it is heard. A firewall on another machine, or a switch between, shows only there: run it on
     both sides, and `rmpa multicast` between them.
     """
-    from rmpa.doctor.aio.look import examine, look_at
+    from rmpa.observe.doctor.io.checks import examine, look_at
 
     found = []
     for finding in examine(look_at(os.environ, config)):
         found.append(finding)
-        if not as_json and (not quiet or finding.level in (Level.WARN, Level.FAIL)):
+        if not as_json and (not quiet or finding.level in (FindingLevel.WARN, FindingLevel.FAIL)):
             for line in _lines(finding):
                 print_line(line)
     if as_json:
-        print_json([finding for finding in found if not quiet or finding.level in (Level.WARN, Level.FAIL)])
+        print_json(
+            [finding for finding in found if not quiet or finding.level in (FindingLevel.WARN, FindingLevel.FAIL)]
+        )
     else:
         print_line(_summary(found))
     return exit_code(found)
@@ -69,5 +76,5 @@ def _lines(finding: Finding) -> list[str]:
 
 def _summary(found: Sequence[Finding]) -> str:
     counts = Counter(finding.level for finding in found)
-    words = [f"{counts[level]} {level.value}" for level in Level if counts[level]]
+    words = [f"{counts[level]} {level.value}" for level in FindingLevel if counts[level]]
     return f"{len(found)} answers: {', '.join(words)}"

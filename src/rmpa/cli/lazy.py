@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.core.config_values import did_you_mean
+from rmpa.config.values import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -12,17 +12,17 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.proxy_names import proxied_node
-from rmpa.core.config_values import did_you_mean
+from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RmpaError, UnreachableError
 from rmpa.core.names import is_legal_name
-from rmpa.monitor.aio.control_client import ControlClient, choose_agent, find_agents, same_core
+from rmpa.observe.io.control_client import ControlClient, choose_agent, find_agents, same_core
 from rmpa.ros.environment import DEFAULT_MASTER_URI
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from rmpa.monitor.snapshot import Snapshot
+    from rmpa.observe.snapshot import Snapshot
 
 _REMEDY: Final = "start one with `rmpa up` or `rmpa core`, or name it with --master"
 
@@ -133,7 +133,7 @@ async def read_graph(master: Master) -> Graph:
         UnreachableError: It does not answer.
         RmpaError: It answers with something else.
     """
-    from rmpa.ros.aio.http_client import call_api
+    from rmpa.ros.http.client import call_api
 
     try:
         state = (await call_api(master.uri, "getSystemState", "/rmpa_topic")).value

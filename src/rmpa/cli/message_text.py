@@ -11,7 +11,7 @@ from rmpa.core.errors import RmpaError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.ros.messages import Plain
+    from rmpa.ros.types.messages import Plain
 
 _PART: Final = re.compile(r"(?P<name>\w+)(?P<indices>(?:\[[0-9]+\])*)", re.ASCII)
 _TIME: Final = {"secs", "nsecs"}

@@ -12,10 +12,10 @@ from rmpa.cli.options import json_option
 from rmpa.cli.output import print_json, print_line, printable, warn
 from rmpa.core import limits
 from rmpa.core.errors import ConfigError, RmpaError
-from rmpa.discovery.aio.interfaces import choose, list_interfaces
+from rmpa.discovery.io.interfaces import choose, list_interfaces
 
 if TYPE_CHECKING:
-    from rmpa.discovery.aio.interfaces import Interface
+    from rmpa.discovery.io.interfaces import Interface
 
 _HERE: Final = "rmpa.cli.multicast"
 
@@ -90,7 +90,7 @@ def send(interfaces: tuple[str, ...], group: str, port: int, count: int, interva
 
     Exits 1 if no packet could be sent on one of them.
     """
-    from rmpa.doctor.aio.multicast import GroupSender
+    from rmpa.observe.doctor.io.multicast import GroupSender
 
     wanted = chosen(interfaces)
     failed: dict[str, str] = {}
@@ -135,7 +135,7 @@ def receive(
 
     Exits 1 if fewer than --count came within --timeout.
     """
-    from rmpa.doctor.aio.multicast import GroupReceiver
+    from rmpa.observe.doctor.io.multicast import GroupReceiver
 
     wanted = chosen(interfaces)
     until = None if timeout is None else time.monotonic() + timeout

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Final, TypeVar
 from rmpa.bridge.proxy_names import proxied_node
 from rmpa.cli.master import TopicName, read_topic
 from rmpa.cli.output import printable, warn
+from rmpa.config.values import did_you_mean
 from rmpa.core import limits
-from rmpa.core.config_values import did_you_mean
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
-from rmpa.monitor.aio.control_client import ControlClient
-from rmpa.monitor.snapshot import Snapshot, UnreachableInfo
-from rmpa.ros.aio.http_client import call, call_api
+from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.snapshot import Snapshot, UnreachableInfo
+from rmpa.ros.http.client import call, call_api
 from rmpa.ros.master.survey import lookup_calls, read_lookups
-from rmpa.ros.nodes import NodeLine, PeerNodes
+from rmpa.ros.node_info import NodeLine, PeerNodes
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -16,11 +16,11 @@ from rmpa.cli.output import Column, print_json, print_table, printable, size, wa
 from rmpa.cli.param_store import open_store, read_key
 from rmpa.cli.param_yaml import read_documents, read_yaml, show_yaml, write_yaml
 from rmpa.core.errors import ConfigError, RmpaError
-from rmpa.monitor.aio.control_client import ControlClient, choose_agent
-from rmpa.monitor.snapshot import FollowedInfo
+from rmpa.observe.io.control_client import ControlClient, choose_agent
+from rmpa.observe.snapshot import FollowedInfo
 
 if TYPE_CHECKING:
-    from rmpa.ros.xmlrpc import XmlRpcValue
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 peer_option = click.option("--peer", metavar="PEER", help="The parameters of this peer's module (or its GUID).")
 

@@ -11,23 +11,23 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 from rmpa.bridge.params import transfer
 from rmpa.bridge.params.rules import key_problem, leaves
 from rmpa.cli.master import Master, choose_master
+from rmpa.config.values import did_you_mean
 from rmpa.core import limits
-from rmpa.core.config_values import did_you_mean
 from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.names import is_legal_name
-from rmpa.monitor.aio.control_client import ControlClient, choose_agent
+from rmpa.observe.io.control_client import ControlClient, choose_agent
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Mapping
 
-    from rmpa.ros.xmlrpc import Reply, XmlRpcValue
+    from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 _CALLER: Final = "/rmpa_param"
 _FOR_ALL: Final = 30.0
 """Seconds for one call of a master: megabytes of XML, on a busy machine."""
 
 
-class Store(Protocol):
+class ParamStore(Protocol):
     """The parameters of one master."""
 
     @property
@@ -60,7 +60,7 @@ class Store(Protocol):
         ...
 
 
-def open_store(peer: str | None, master: str | None, agent: str | None) -> Store:
+def open_store(peer: str | None, master: str | None, agent: str | None) -> ParamStore:
     """The store that the flags name.
 
     Raises:
@@ -146,7 +146,7 @@ class MasterStore:
 
     def set(self, key: str, value: XmlRpcValue) -> int:
         """Set a parameter, or each member of a namespace."""
-        from rmpa.ros.xmlrpc import serialize_response
+        from rmpa.ros.wire.xmlrpc import serialize_response
 
         parameters = check(key, value)
         serialize_response(value)  # what cannot be said is told before anything is set
@@ -162,8 +162,8 @@ class MasterStore:
         if reply.code != 1:
             raise absent(key, self.names(), self.title)
 
-    def _call(self, method: str, *params: XmlRpcValue) -> Reply:
-        from rmpa.ros.aio.http_client import call_api
+    def _call(self, method: str, *params: XmlRpcValue) -> RosReply:
+        from rmpa.ros.http.client import call_api
 
         try:
             return asyncio.run(call_api(self.master.uri, method, _CALLER, *params, timeout=_FOR_ALL))
@@ -194,7 +194,7 @@ class PeerStore:
 
     def set(self, key: str, value: XmlRpcValue) -> int:
         """Set a parameter, or each member of a namespace."""
-        from rmpa.ros.xmlrpc import serialize_response
+        from rmpa.ros.wire.xmlrpc import serialize_response
 
         check(key, value)
         try:
@@ -208,7 +208,7 @@ class PeerStore:
         self._ask((transfer.DELETE, {"key": key}))
 
     def _value(self, what: str, args: dict[str, Any]) -> XmlRpcValue:
-        from rmpa.ros.xmlrpc import parse_response
+        from rmpa.ros.wire.xmlrpc import parse_response
 
         return parse_response(self._drive(transfer.reading(what, args)).encode())
 

@@ -17,7 +17,7 @@ from rmpa.core.errors import RmpaError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rmpa.ros.xmlrpc import XmlRpcValue
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 _INT_MAX: Final = (1 << 31) - 1
 _OPERATORS: Final[dict[type[ast.AST], Callable[..., float]]] = {

@@ -11,14 +11,14 @@ import click
 from rmpa.cli.lazy import LazyGroup
 from rmpa.cli.options import agent_option, json_option
 from rmpa.cli.output import Column, duration, print_json, print_line, print_table, printable, size, warn
-from rmpa.core.config_values import did_you_mean
+from rmpa.config.values import did_you_mean
 from rmpa.core.errors import PeerRefused, RmpaError
-from rmpa.core.stats import Summary
-from rmpa.monitor.aio.control_client import ControlClient, choose_agent
-from rmpa.monitor.snapshot import PingReply
+from rmpa.core.stats import SampleSummary
+from rmpa.observe.io.control_client import ControlClient, choose_agent
+from rmpa.observe.snapshot import PingReply
 
 if TYPE_CHECKING:
-    from rmpa.monitor.snapshot import PeerInfo, RouteInfo, Snapshot, TopicInfo
+    from rmpa.observe.snapshot import PeerInfo, RouteInfo, Snapshot, TopicInfo
 
 _HERE: Final = "rmpa.cli.peer"
 _COLOURS: Final = {"linked": "green", "relayed": "green", "linking": "yellow", "refused": "red", "conflict": "red"}
@@ -266,7 +266,7 @@ def _ping_once(client: ControlClient, peer: PeerInfo, number: int, times: list[f
 
 
 def _ping_summary(name: str, sent: int, times: list[float], *, as_json: bool) -> None:
-    summary = Summary.of(times)
+    summary = SampleSummary.of(times)
     figures = {"min": summary.minimum, "avg": summary.mean, "max": summary.maximum, "sd": summary.sd}
     if as_json:
         print_json({"peer": name, "sent": sent, "received": len(times), **figures})

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rmpa.cli.choice_commands import Choice, whose
+from rmpa.cli.choice_commands import ManualChoice, whose
 from rmpa.cli.options import agent_option, json_option, master_option
 from rmpa.cli.output import Column, print_json, print_table, printable
 from rmpa.cli.resources_seen import decision_of, run_around
 from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
-    from rmpa.cli.resources_seen import Room, Seen
-    from rmpa.resource.descriptor import Descriptor
+    from rmpa.cli.resources_seen import Room, SeenResource
+    from rmpa.resource.run.descriptor import Descriptor
 
 
 def shown(value: object, unit: str) -> str:
@@ -30,7 +30,7 @@ def offers(descriptor: Descriptor, values: dict[str, float | str]) -> str:
     return ", ".join(f"{name} {shown(value, units.get(name, ''))}" for name, value in values.items())
 
 
-async def _decision(room: Room, one: Seen) -> dict[str, Any]:
+async def _decision(room: Room, one: SeenResource) -> dict[str, Any]:
     (said,) = await room.texts([one], "decision")
     if not said.get(one):
         raise RmpaError(f"{one} has decided nothing yet; is it active?")
@@ -81,12 +81,12 @@ def list_(resource: str | None, as_json: bool, agent: str | None, master: str | 
     run_around(master, agent, body)
 
 
-async def _present(room: Room, one: Seen) -> dict[str, Any]:
+async def _present(room: Room, one: SeenResource) -> dict[str, Any]:
     decision = await _decision(room, one)
     return {key: decision.get(key, "") for key in ("profile", "applying", "chosen")}
 
 
-_CHOICE = Choice("profile", lambda descriptor: (each.name for each in descriptor.profiles), _present)
+_CHOICE = ManualChoice("profile", lambda descriptor: (each.name for each in descriptor.profiles), _present)
 get = _CHOICE.get_command("Print the profile of a RESOURCE that runs.")
 set_ = _CHOICE.set_command(
     """Choose the PROFILE of a RESOURCE by hand; returns when it runs.
@@ -129,7 +129,7 @@ def explain(resource: str | None, as_json: bool, agent: str | None, master: str 
     run_around(master, agent, body)
 
 
-def _print_explained(one: Seen, decision: dict[str, Any]) -> None:
+def _print_explained(one: SeenResource, decision: dict[str, Any]) -> None:
     runs, chosen = str(decision.get("profile", "")), str(decision.get("chosen", ""))
     clients = ", ".join(map(str, decision.get("clients", ()))) or "nobody"
     click.echo(printable(f"{one}: profile {runs or 'none'}" + (", chosen by hand" if chosen else "")))

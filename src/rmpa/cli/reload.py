@@ -7,7 +7,7 @@ import click
 from rmpa.cli.options import agent_option, json_option
 from rmpa.cli.output import print_json, printable, warn
 from rmpa.cli.peer import connect
-from rmpa.monitor.reloading import ReloadReply
+from rmpa.observe.reload_reply import ReloadReply
 
 EPILOG = """\
 \b

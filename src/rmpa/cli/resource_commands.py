@@ -11,14 +11,14 @@ from rmpa.cli.options import agent_option, json_option, master_option
 from rmpa.cli.output import Column, print_json, print_table, printable, warn
 from rmpa.cli.profile_commands import offers, shown
 from rmpa.cli.resources_seen import run_around
-from rmpa.resource.attributes import MEASURED
-from rmpa.ros.diagnostic_array import ARRAY_TYPE, Level
+from rmpa.resource.declare.attributes import MEASURED
+from rmpa.ros.types.diagnostic_array import ARRAY_TYPE, DiagnosticLevel
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from rmpa.cli.resources_seen import Room, Seen
-    from rmpa.resource.descriptor import Descriptor, ParameterDescriptor, TaskDescriptor, TopicDescriptor
+    from rmpa.cli.resources_seen import Room, SeenResource
+    from rmpa.resource.run.descriptor import Descriptor, ParameterDescriptor, TaskDescriptor, TopicDescriptor
 
 _TIMES: Final = frozenset({"deadline", "lifespan", "liveliness_lease"})
 
@@ -67,7 +67,7 @@ def _statuses(message: Any) -> list[dict[str, Any]]:
     return [
         {
             "name": str(status.name),
-            "level": Level(int(status.level) & 3).name,
+            "level": DiagnosticLevel(int(status.level) & 3).name,
             "message": str(status.message),
             "values": {str(pair.key): str(pair.value) for pair in status.values},
         }
@@ -75,7 +75,7 @@ def _statuses(message: Any) -> list[dict[str, Any]]:
     ]
 
 
-def _print_info(one: Seen, about: dict[str, Any]) -> None:
+def _print_info(one: SeenResource, about: dict[str, Any]) -> None:
     said, health = one.descriptor, about["health"]
     kind = "device" if said.physical else "simulated"
     _line("Resource", f"{one} ({said.role}, {kind})")

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rmpa.cli.master import Master
-    from rmpa.cli.resources_known import Remembered
-    from rmpa.cli.resources_seen import Room, Seen
+    from rmpa.cli.resources_known import KnownResource
+    from rmpa.cli.resources_seen import Room, SeenResource
 
 _COLOURS: Final = {"active": "green", "inactive": "yellow", "unconfigured": "yellow", "finalized": "red"}
 _TITLES: Final = ("RESOURCE", "STATE", "ROLE", "KIND", "PROFILE", "CONTEXT", "DESCRIPTION")
@@ -39,7 +39,7 @@ Examples:
 class _Present:
     """A resource that is here, with what it says; ``None``: it does not answer."""
 
-    seen: Seen
+    seen: SeenResource
     state: str | None
     profile: str | None
     context: str | None
@@ -87,7 +87,7 @@ def _here(master: Master) -> list[_Present]:
     return found
 
 
-def _print(here: Sequence[_Present], gone: Sequence[Remembered]) -> None:
+def _print(here: Sequence[_Present], gone: Sequence[KnownResource]) -> None:
     rows = [_row(one.seen, one.state or "does not answer", one.profile, one.context) for one in here]
     rows += [_row(one.seen, str(one), None, None) for one in gone]
     colours = [_COLOURS.get(one.state or "", "") for one in here] + [""] * len(gone)
@@ -99,14 +99,14 @@ def _print(here: Sequence[_Present], gone: Sequence[Remembered]) -> None:
     print_table(tuple(map(Column, titles)), rows, colours=colours)
 
 
-def _row(seen: Seen, state: str, profile: str | None, context: str | None) -> list[str]:
+def _row(seen: SeenResource, state: str, profile: str | None, context: str | None) -> list[str]:
     said = seen.descriptor
     kind = "device" if said.physical else "simulated"
     cells = (str(seen), state, said.role, kind, profile or "-", context or "-", said.description)
     return [printable(cell) for cell in cells]
 
 
-def _as_json(seen: Seen, present: _Present | None = None) -> dict[str, Any]:
+def _as_json(seen: SeenResource, present: _Present | None = None) -> dict[str, Any]:
     return {
         "name": seen.path,
         "peer": seen.peer,
@@ -119,7 +119,7 @@ def _as_json(seen: Seen, present: _Present | None = None) -> dict[str, Any]:
     }
 
 
-def _as_known(one: Remembered) -> dict[str, Any]:
+def _as_known(one: KnownResource) -> dict[str, Any]:
     return {
         "here": False,
         "seen_by": one.module,

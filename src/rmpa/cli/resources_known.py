@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 from rmpa.bridge.proxy_names import proxied_node
 from rmpa.cli.output import duration, printable, warn
-from rmpa.cli.resources_seen import Seen
-from rmpa.resource.aio.known import FILE
-from rmpa.resource.aio.store import module_dir, read_state, state_dir
-from rmpa.resource.sightings import Sightings
+from rmpa.cli.resources_seen import SeenResource
+from rmpa.resource.run.registry_writer import FILE
+from rmpa.resource.run.resource_registry import ResourceRegistry
+from rmpa.resource.run.store import module_dir, read_state, state_dir
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Remembered:
+class KnownResource:
     """One resource.
 
     Args:
@@ -31,7 +31,7 @@ class Remembered:
     """
 
     module: str
-    seen: Seen
+    seen: SeenResource
     first: float
     last: float
 
@@ -45,7 +45,7 @@ class Remembered:
         return f"last seen {duration(self.ago)} ago, not here now"
 
 
-def remembered(module: str | None, state: str | None, here: Iterable[Seen]) -> list[Remembered]:
+def remembered(module: str | None, state: str | None, here: Iterable[SeenResource]) -> list[KnownResource]:
     """The resources that were seen before and are not here now, the latest first.
 
     Args:
@@ -64,7 +64,7 @@ def remembered(module: str | None, state: str | None, here: Iterable[Seen]) -> l
     return sorted(found, key=lambda each: -each.last)
 
 
-def _read(path: Path) -> list[Remembered]:
+def _read(path: Path) -> list[KnownResource]:
     if not path.exists():
         return []
     try:
@@ -72,13 +72,13 @@ def _read(path: Path) -> list[Remembered]:
     except OSError as error:
         warn(printable(str(error)))
         return []
-    latest: dict[tuple[str, str | None], Remembered] = {}
-    for each in Sightings(rows).all:  # the latest first
+    latest: dict[tuple[str, str | None], KnownResource] = {}
+    for each in ResourceRegistry(rows).all:  # the latest first
         proxy = proxied_node(each.caller)
         peer = proxy[0] if proxy is not None else None
-        one = Remembered(
+        one = KnownResource(
             path.parent.name,
-            Seen(each.path, peer, each.caller, each.descriptor),
+            SeenResource(each.path, peer, each.caller, each.descriptor),
             each.first_ns / 1e9,
             each.last_ns / 1e9,
         )

@@ -15,17 +15,17 @@ from rmpa.cli.master import TopicName, choose_master, read_graph, read_topic
 from rmpa.cli.output import printable
 from rmpa.cli.service_ends import require_service
 from rmpa.cli.stream import with_node
-from rmpa.core.config_values import did_you_mean
+from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
-from rmpa.resource.descriptor import TOPIC, Descriptor
-from rmpa.ros.messages import MessageType
+from rmpa.resource.run.descriptor import TOPIC, Descriptor
+from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 
     from rmpa.cli.master import Graph, Master
-    from rmpa.ros.aio.node import Node
-    from rmpa.ros.aio.topics import Received
+    from rmpa.ros.node.node import Node
+    from rmpa.ros.node.topics import Received
 
 TEXT: Final = "std_msgs/String"
 _ANSWER: Final = 3.0
@@ -34,7 +34,7 @@ _NODE: Final = "rmpa_resource"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class SeenResource:
     """One resource.
 
     Args:
@@ -66,9 +66,9 @@ class Room:
 
     node: Node
     graph: Graph
-    seen: tuple[Seen, ...]
+    seen: tuple[SeenResource, ...]
 
-    def pick(self, text: str | None) -> Seen:
+    def pick(self, text: str | None) -> SeenResource:
         """The resource that a user means: ``sonar``, ``/sonar``, ``base:/sonar``; ``None``: the only one.
 
         Raises:
@@ -88,11 +88,11 @@ class Room:
 
     async def hear(
         self,
-        each: Iterable[Seen],
+        each: Iterable[SeenResource],
         name: str,
         kind: str = TEXT,
         timeout: float = _ANSWER,  # noqa: ASYNC109
-    ) -> dict[Seen, Any]:
+    ) -> dict[SeenResource, Any]:
         """The first message of each resource's topic, as far as they come in time.
 
         Args:
@@ -101,8 +101,8 @@ class Room:
             kind: Its type.
             timeout: Seconds.
         """
-        found: dict[Seen, Any] = {}
-        callers: dict[str, dict[str, Seen]] = {}
+        found: dict[SeenResource, Any] = {}
+        callers: dict[str, dict[str, SeenResource]] = {}
         for one in each:
             callers.setdefault(f"{one.path}/{name}", {})[one.caller] = one
         messages = await first_messages(self.node, {t: set(c) for t, c in callers.items()}, kind, timeout)
@@ -110,26 +110,26 @@ class Room:
             found[callers[topic][caller]] = received.message
         return found
 
-    async def texts(self, each: Sequence[Seen], *names: str) -> list[dict[Seen, str]]:
+    async def texts(self, each: Sequence[SeenResource], *names: str) -> list[dict[SeenResource, str]]:
         """What several topics ``std_msgs/String`` of resources say."""
         heard = await asyncio.gather(*(self.hear(each, name) for name in names))
         return [{one: str(message.data) for one, message in found.items()} for found in heard]
 
-    async def configuration(self, one: Seen) -> dict[str, bool | int | float | str]:
+    async def configuration(self, one: SeenResource) -> dict[str, bool | int | float | str]:
         """The values of a resource's parameters."""
-        from rmpa.resource.reconfigure import CONFIG_TYPE, read_config
+        from rmpa.resource.run.dynamic_reconfigure import CONFIG_TYPE, read_config
 
         message = (await self.hear([one], "parameter_updates", CONFIG_TYPE)).get(one)
         return read_config(message) if message is not None else {}
 
-    async def configure(self, one: Seen, values: Mapping[str, str]) -> None:
+    async def configure(self, one: SeenResource, values: Mapping[str, str]) -> None:
         """Set texts among a resource's parameters.
 
         Raises:
             RmpaError: It cannot be reached, or refuses; nothing has changed then.
         """
-        from rmpa.resource.reconfigure import SERVICE_TYPE
-        from rmpa.ros.service_types import ServiceType
+        from rmpa.resource.run.dynamic_reconfigure import SERVICE_TYPE
+        from rmpa.ros.types.service_types import ServiceType
 
         service = TopicName(f"{one.path}/set_parameters", one.peer)
         server = require_service(self.graph, service)
@@ -143,7 +143,7 @@ class Room:
             raise RmpaError(printable(f"{one}: {error.reason}")) from None
 
 
-def _only(found: Sequence[Seen], remedy: str) -> Seen:
+def _only(found: Sequence[SeenResource], remedy: str) -> SeenResource:
     if len(found) == 1:
         return found[0]
     if not found:
@@ -166,7 +166,7 @@ async def look_around(master: Master, body: Callable[[Room], Awaitable[None]]) -
     await with_node(master, _NODE, within)
 
 
-async def find_resources(node: Node, graph: Graph) -> tuple[Seen, ...]:
+async def find_resources(node: Node, graph: Graph) -> tuple[SeenResource, ...]:
     """All resources that say what they are, this module's first."""
     ending = f"/{TOPIC}"
     topics = {
@@ -181,7 +181,9 @@ async def find_resources(node: Node, graph: Graph) -> tuple[Seen, ...]:
         except RmpaError:
             continue  # somebody else's topic of that name
         proxy = proxied_node(caller)
-        found.append(Seen(topic.removesuffix(ending), proxy[0] if proxy is not None else None, caller, descriptor))
+        found.append(
+            SeenResource(topic.removesuffix(ending), proxy[0] if proxy is not None else None, caller, descriptor)
+        )
     return tuple(sorted(found, key=lambda each: (each.peer or "", each.path)))
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import FrameType, TracebackType
 
-    from rmpa.resource.declare import Parameter, Resource
+    from rmpa.resource.declare.resource import Parameter, Resource
 
 _log = logging.getLogger("rmpa.run")
 _STARTS: Final = 20.0
@@ -107,7 +107,7 @@ def prepared(path: Path, given: Sequence[str] = ()) -> list[Resource]:
     Raises:
         ConfigError: The file cannot be run, or a parameter cannot have its value.
     """
-    import rmpa.resource.aio.member  # noqa: F401 - takes a while, the first time
+    import rmpa.resource.run.member  # noqa: F401 - takes a while, the first time
 
     resources = load(path)
     for text in given:
@@ -128,7 +128,7 @@ def load(path: Path) -> list[Resource]:
     """
     import runpy
 
-    from rmpa.resource.declare import Resource
+    from rmpa.resource.declare.resource import Resource
 
     sys.path.insert(0, str(path.resolve().parent))
     try:
@@ -177,7 +177,7 @@ def _set(resources: Sequence[Resource], text: str) -> None:
     Raises:
         ConfigError: There is no such one, more than one, or it cannot have this value.
     """
-    from rmpa.core.config_values import did_you_mean
+    from rmpa.config.values import did_you_mean
 
     key, equals, value = text.partition("=")
     if not equals:
@@ -288,7 +288,7 @@ class ModuleAgent:
 
 def _core_of(name: str) -> str | None:
     """The core's URI of a running agent, or ``None``."""
-    from rmpa.monitor.aio.control_client import ControlClient, find_agents
+    from rmpa.observe.io.control_client import ControlClient, find_agents
 
     for found in find_agents(os.environ):
         if found.name == name:
@@ -302,7 +302,7 @@ def _core_of(name: str) -> str | None:
 
 def _stores(module: str, state: str | None) -> Path | None:
     """Where the resources of a module remember."""
-    from rmpa.resource.aio.store import module_dir, state_dir
+    from rmpa.resource.run.store import module_dir, state_dir
 
     directory = state_dir(os.environ, state)
     if directory is None:
@@ -312,8 +312,8 @@ def _stores(module: str, state: str | None) -> Path | None:
 
 
 async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None, stores: Path | None = None) -> int:
-    from rmpa.core.aio.descriptors import raise_file_limit
-    from rmpa.resource.aio.member import run_all
+    from rmpa.resource.run.member import run_all
+    from rmpa.runtime.descriptors import raise_file_limit
 
     raise_file_limit()
     sys.setswitchinterval(limits.THREAD_SWITCH)  # a task that is due does not wait for what the loop does just then

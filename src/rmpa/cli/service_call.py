@@ -19,7 +19,7 @@ from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 
 if TYPE_CHECKING:
     from rmpa.cli.master import Master, TopicName
-    from rmpa.ros.messages import Plain
+    from rmpa.ros.types.messages import Plain
 
 _LOOK: Final = 0.1
 """Between two looks whether a service is there."""
@@ -82,7 +82,7 @@ async def _call(
     *,
     wait: bool,
 ) -> dict[str, Plain]:
-    from rmpa.ros.aio.service_client import ServiceConnection
+    from rmpa.ros.node.service_client import ServiceConnection
 
     if wait:
         await _wait(master, wanted, timeout)

@@ -7,18 +7,18 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.proxy_names import proxied_node
+from rmpa.config.values import did_you_mean
 from rmpa.core import limits
-from rmpa.core.config_values import did_you_mean
 from rmpa.core.errors import RmpaError, UnreachableError
-from rmpa.ros.aio.http_client import call_api
-from rmpa.ros.find_types import find_service_type
+from rmpa.ros.http.client import call_api
+from rmpa.ros.types.find import find_service_type
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from rmpa.cli.master import Graph, Master, TopicName
-    from rmpa.ros.service_types import ServiceType
-    from rmpa.ros.services import ServiceDescription
+    from rmpa.ros.types.service_types import ServiceType
+    from rmpa.ros.wire.services import ServiceDescription
 
 CALLER_ID: Final = "/rmpa_service"
 _AT_ONCE: Final = 16
@@ -86,7 +86,7 @@ async def probe(master: Master, name: str) -> Probed:
     Raises:
         UnreachableError: The master does not answer.
     """
-    from rmpa.ros.aio.node_services import probe as ask
+    from rmpa.ros.node.services import probe as ask
 
     uri = ""
     try:

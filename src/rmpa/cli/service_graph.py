@@ -18,8 +18,8 @@ from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
     from rmpa.cli.service_ends import Probed
-    from rmpa.monitor.snapshot import ServiceInfo
-    from rmpa.ros.messages import MessageType
+    from rmpa.observe.snapshot import ServiceInfo
+    from rmpa.ros.types.messages import MessageType
 
 
 def _graph(master: str | None, agent: str | None) -> tuple[Master, Graph]:

@@ -12,7 +12,7 @@ from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
     from rmpa.cli.master import Master, TopicName
-    from rmpa.monitor.snapshot import ServiceInfo
+    from rmpa.observe.snapshot import ServiceInfo
 
 
 def crossing(master: Master, wanted: TopicName | None = None) -> tuple[ServiceInfo, ...]:

@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine
 
     from rmpa.cli.master import Master, TopicName
-    from rmpa.ros.aio.node import Node, Received
+    from rmpa.ros.node.node import Node, Received
 
 
 class Enough(Exception):  # noqa: N818 - not an error
     """As many messages came as were asked for: raised by a command's callback, caught around ``watch_topic``."""
 
 
-class Watch:
+class StreamWatch:
     """Until when a command runs, and where its callbacks hand over what went wrong."""
 
     def __init__(self) -> None:
@@ -49,7 +49,7 @@ class Watch:
 
 def run_stream(body: Callable[[], Coroutine[object, object, None]]) -> None:
     """Run until the body ends; Ctrl-C and SIGTERM end it too, behind its own cleaning up."""
-    from rmpa.core.aio.descriptors import raise_file_limit
+    from rmpa.runtime.descriptors import raise_file_limit
 
     async def run() -> None:
         task = asyncio.current_task()
@@ -68,7 +68,7 @@ async def with_node(master: Master, name: str, body: Callable[[Node], Awaitable[
     Raises:
         UnreachableError: The master does not answer.
     """
-    from rmpa.ros.aio.node import Node
+    from rmpa.ros.node.node import Node
 
     node = Node(name, master_uri=master.uri, anonymous=True)
     try:
@@ -85,7 +85,7 @@ async def watch_topic(
     master: Master,
     wanted: TopicName,
     on_message: Callable[[Received], None],
-    body: Callable[[Watch], Awaitable[None]],
+    body: Callable[[StreamWatch], Awaitable[None]],
 ) -> None:
     """Subscribe to a topic and run ``body``.
 
@@ -95,7 +95,7 @@ async def watch_topic(
         on_message: Called for each of them; what it raises ends the command.
         body: Runs until the watch is finished.
     """
-    watch = Watch()
+    watch = StreamWatch()
 
     def take(received: Received) -> None:
         if not wanted.takes(received.caller_id):
@@ -118,6 +118,6 @@ async def watch_topic(
     await with_node(master, "rmpa_topic", listen)
 
 
-async def _end_with(node: Node, watch: Watch) -> None:
+async def _end_with(node: Node, watch: StreamWatch) -> None:
     await node.stopped.wait()
     watch.finish()

@@ -15,17 +15,17 @@ from rmpa.cli.master import Graph, Master, TopicName, choose_master, read_graph,
 from rmpa.cli.message_text import flatten, pick, shorten, to_text
 from rmpa.cli.options import agent_option, json_option, master_option
 from rmpa.cli.output import print_json, print_line, warn
-from rmpa.cli.stream import Enough, Watch, run_stream, watch_topic
-from rmpa.core.config_values import did_you_mean
+from rmpa.cli.stream import Enough, StreamWatch, run_stream, watch_topic
+from rmpa.config.values import did_you_mean
 
 if TYPE_CHECKING:
-    from rmpa.ros.aio.node import Received
-    from rmpa.ros.messages import Plain
+    from rmpa.ros.node.node import Received
+    from rmpa.ros.types.messages import Plain
 
 _CLEAR = "\x1b[2J\x1b[H"
 
 
-class _Printer:
+class _MessagePrinter:
     """Prints messages, each in the form that was asked for."""
 
     def __init__(
@@ -129,7 +129,7 @@ async def _echo(
     if wanted.topic not in graph.publishers:
         near = did_you_mean(wanted.topic, graph.publishers)
         warn(f"{wanted.topic} is not published yet; waiting" + (f" (did you mean {near}?)" if near else ""))
-    printer = _Printer(wanted, path, form=form, noarr=noarr, nostr=nostr, clear=clear)
+    printer = _MessagePrinter(wanted, path, form=form, noarr=noarr, nostr=nostr, clear=clear)
 
     def take(received: Received) -> None:
         if count is None or printer.count < count:
@@ -137,7 +137,7 @@ async def _echo(
         if count is not None and printer.count >= count:
             raise Enough
 
-    async def body(watch: Watch) -> None:
+    async def body(watch: StreamWatch) -> None:
         await watch.finished()
 
     try:

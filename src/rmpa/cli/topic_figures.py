@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 from rmpa.cli.output import duration, printable, size
 from rmpa.core import limits
 from rmpa.core.errors import RmpaError
-from rmpa.monitor.aio.control_client import ControlClient
-from rmpa.monitor.snapshot import Snapshot
+from rmpa.observe.io.control_client import ControlClient
+from rmpa.observe.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rmpa.cli.master import Master, TopicName
-    from rmpa.monitor.snapshot import LatencyInfo, RouteInfo, TopicInfo
+    from rmpa.observe.snapshot import LatencyInfo, RouteInfo, TopicInfo
 
 
 def ask_agent(master: Master, topic: str) -> TopicInfo | None:

@@ -16,7 +16,7 @@ from rmpa.cli.topic_figures import ask_agent, facts
 from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
-    from rmpa.monitor.snapshot import TopicInfo
+    from rmpa.observe.snapshot import TopicInfo
 
 
 def _graph(master: str | None, agent: str | None) -> tuple[Master, Graph]:

@@ -16,8 +16,8 @@ from rmpa.cli.stream import run_stream, with_node
 from rmpa.core.errors import ConfigError, UnreachableError
 
 if TYPE_CHECKING:
-    from rmpa.ros.aio.node import Node, Publisher
-    from rmpa.ros.messages import MessageType, Plain
+    from rmpa.ros.node.node import Node, Publisher
+    from rmpa.ros.types.messages import MessageType, Plain
 
 _ONCE_SECONDS: Final = 3.0
 """How long a single message stays latched for subscribers to find us, as ``rostopic pub -1`` has it."""
@@ -100,8 +100,8 @@ def pub(
     master: str | None,
 ) -> None:
     """Publish VALUES, in YAML or JSON, as messages of a TYPE on a TOPIC."""
-    from rmpa.ros.definitions import UnknownTypeError
-    from rmpa.ros.find_types import find_message_type
+    from rmpa.ros.types.definitions import UnknownTypeError
+    from rmpa.ros.types.find import find_message_type
 
     wanted = read_topic(topic)
     if wanted.peer is not None:
@@ -167,7 +167,7 @@ async def _version(node: Node, topic: str, found: MessageType | str) -> MessageT
     Raises:
         DefinitionError: It is not known here, and no publisher tells it.
     """
-    from rmpa.ros.aio.learn import find_or_learn, learn_type
+    from rmpa.ros.node.learn_type import find_or_learn, learn_type
 
     if isinstance(found, str):
         return await find_or_learn(node.master_uri, node.name, found, topic)

@@ -17,18 +17,18 @@ from rmpa.bridge.proxy_names import proxied_node
 from rmpa.cli.master import choose_master, read_topic
 from rmpa.cli.options import agent_option, json_option, master_option
 from rmpa.cli.output import print_json, print_line, size
-from rmpa.cli.stream import Enough, Watch, run_stream, watch_topic
+from rmpa.cli.stream import Enough, StreamWatch, run_stream, watch_topic
 from rmpa.cli.topic_figures import arriving, bandwidth_text, latency_text, origin, rate_text
 from rmpa.core.errors import RmpaError
-from rmpa.core.stats import Flow, Ring, Summary
+from rmpa.core.stats import ArrivalStats, SampleRing, SampleSummary
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.cli.master import Master, TopicName
-    from rmpa.monitor.snapshot import RouteInfo
-    from rmpa.ros.aio.node import Received
-    from rmpa.ros.messages import MessageType
+    from rmpa.observe.snapshot import RouteInfo
+    from rmpa.ros.node.node import Received
+    from rmpa.ros.types.messages import MessageType
 
 _EVERY: Final = 1.0
 """Seconds between two lines, as rostopic has it."""
@@ -43,7 +43,7 @@ class Figures:
 
     def __init__(self, window: int) -> None:
         self._shown = 0
-        self.flow = Flow(window)
+        self.flow = ArrivalStats(window)
 
     def add(self, received: Received, now: float) -> None:
         """One message, at ``now`` (monotonic seconds)."""
@@ -102,7 +102,7 @@ class Bandwidth(Figures):
 
     def __init__(self, window: int) -> None:
         super().__init__(window)
-        self._sizes = Ring(window)
+        self._sizes = SampleRing(window)
 
     def add(self, received: Received, now: float) -> None:
         """One message."""
@@ -134,9 +134,9 @@ class Delay(Figures):
 
     def __init__(self, window: int, *, by_link: bool) -> None:
         super().__init__(window)
-        self._delays = Ring(window)
+        self._delays = SampleRing(window)
         self._by_link = by_link
-        from rmpa.ros.messages import MessageType
+        from rmpa.ros.types.messages import MessageType
 
         # What reads messages takes some 0.3 s to import: at the first one, that would be counted as their delay.
         MessageType("std_msgs/Header").make()
@@ -166,7 +166,7 @@ class Delay(Figures):
 
     def own(self) -> dict[str, float]:
         """Seconds, by the header's stamp."""
-        s: Summary = self._delays.summary()
+        s: SampleSummary = self._delays.summary()
         return {"delay": s.mean, "min": s.minimum, "max": s.maximum, "sd": s.sd, "window": s.count}
 
     def text(self) -> str:
@@ -211,7 +211,7 @@ def _watch(
     chosen = choose_master(master, agent, os.environ)
     figures = make(chosen)
 
-    async def body(watch: Watch) -> None:
+    async def body(watch: StreamWatch) -> None:
         if not as_json:
             print_line(f"subscribed to [{wanted}]")
         while not await watch.finished(_EVERY):

@@ -11,10 +11,10 @@ from functools import partial
 
 import click
 
-from rmpa.core.aio.log_writer import LogWriter
-from rmpa.core.config_sources import Flags, load_settings
-from rmpa.core.config_values import LOG_LEVELS
+from rmpa.config.sources import Flags, load_settings
+from rmpa.config.values import LOG_LEVELS
 from rmpa.core.log import configure_logging
+from rmpa.runtime.log_writer import LogWriter
 
 _log = logging.getLogger("rmpa.up")
 EPILOG = """\

@@ -11,13 +11,18 @@ from rmpa.cli.master import read_topic
 from rmpa.cli.options import agent_option, json_option
 from rmpa.cli.output import coloured, print_json, printable
 from rmpa.core import limits
-from rmpa.monitor.aio.control_client import ControlClient, choose_agent
-from rmpa.monitor.diagnosis import Diagnosis, Stage, Verdict
+from rmpa.observe.io.control_client import ControlClient, choose_agent
+from rmpa.observe.why.diagnosis import Diagnosis, PathStage, StageResult
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-_COLOURS: Final = {Verdict.OK: "green", Verdict.WARN: "yellow", Verdict.FAIL: "red", Verdict.UNKNOWN: "yellow"}
+_COLOURS: Final = {
+    StageResult.OK: "green",
+    StageResult.WARN: "yellow",
+    StageResult.FAIL: "red",
+    StageResult.UNKNOWN: "yellow",
+}
 EPILOG = """\
 \b
 Exit codes: 0 it flows, on every way if there are several; 1 it does not, and the first stage that fails says why.
@@ -72,19 +77,19 @@ def _lines(diagnosis: Diagnosis) -> list[str]:
     lines += [_line(stage, width) for stage in diagnosis.stages]
     failed = diagnosis.failed
     if failed is None:
-        lines.append(_paint("it can be called" if diagnosis.kind == "service" else "it flows", Verdict.OK))
+        lines.append(_paint("it can be called" if diagnosis.kind == "service" else "it flows", StageResult.OK))
     else:
-        lines.append(_paint(printable(f"it stops at: {failed.name}"), Verdict.FAIL))
+        lines.append(_paint(printable(f"it stops at: {failed.name}"), StageResult.FAIL))
         if failed.remedy:
             lines.append(printable(f"what to do: {failed.remedy}"))
     return lines
 
 
-def _line(stage: Stage, width: int) -> str:
+def _line(stage: PathStage, width: int) -> str:
     mark = _paint(f"{stage.verdict.value:<7}", stage.verdict)
-    advice = f" ({stage.remedy})" if stage.remedy and stage.verdict is Verdict.WARN else ""
+    advice = f" ({stage.remedy})" if stage.remedy and stage.verdict is StageResult.WARN else ""
     return f"  {mark}  {printable(stage.name):<{width}}  {printable(stage.text + advice)}"
 
 
-def _paint(text: str, verdict: Verdict) -> str:
+def _paint(text: str, verdict: StageResult) -> str:
     return click.style(text, fg=_COLOURS[verdict]) if coloured() else text

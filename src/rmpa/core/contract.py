@@ -137,7 +137,7 @@ def _smaller(one: float | None, other: float | None) -> float | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class ContractRule:
     """One ``[[contract]]``: what it sets, and for which topics.
 
     Args:
@@ -173,7 +173,7 @@ class Contracts:
         rules: In the order of the file.
     """
 
-    def __init__(self, rules: tuple[Rule, ...] = ()) -> None:
+    def __init__(self, rules: tuple[ContractRule, ...] = ()) -> None:
         self._rules = rules
         self._known: dict[tuple[str, str], Contract] = {}
 

@@ -650,7 +650,7 @@ SERVICE_LATENCIES: Final = 512
 AUDIENCE_MAX: Final = 64
 """Nodes that listen to one topic and are named to its publisher's agent."""
 AUDIENCES_MAX: Final = 1024
-"""Connections that stand for one peer's listeners (``bridge.audience``): 512 action servers of one module."""
+"""Connections that stand for one peer's listeners (``bridge.topics.audience``): 512 action servers of one module."""
 ASK_NAME_MAX: Final = 64
 """Characters of a question's name."""
 ASKS_AT_ONCE: Final = 64

@@ -16,7 +16,7 @@ _ESCAPE: Final = codecs.getencoder("unicode_escape")
 
 
 def room_of(logger: str) -> str:
-    """The room that a logger belongs to: ``rmpa.mesh.aio.mesh`` gives ``mesh``."""
+    """The room that a logger belongs to: ``rmpa.mesh.io.mesh`` gives ``mesh``."""
     parts = logger.split(".")
     return parts[1] if parts[0] == "rmpa" and len(parts) > 1 else parts[0]
 

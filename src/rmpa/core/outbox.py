@@ -3,8 +3,8 @@
 Pure: no socket here. A driver pushes what it could not send at once, asks for ``head()`` when the socket is
 writable again and tells how much of it was ``consumed()``.
 
-Two kinds of entries wait. What is *pushed* goes out as it is, in one piece. What is *opened* is a ``Parcel`` whose
-bytes follow while it may already be leaving (cut-through); where the outbox has a framer, a parcel leaves in
+Two kinds of entries wait. What is *pushed* goes out as it is, in one piece. What is *opened* is a ``QueuedMessage``
+whose bytes follow while it may already be leaving (cut-through); where the outbox has a framer, a parcel leaves in
 fragments, each with a header of its own, and the fragments of several keys take turns.
 """
 
@@ -29,7 +29,7 @@ ABORT: Final = 4
 """A fragment's flag: the rest of its parcel will never come."""
 
 
-class Parcel:
+class QueuedMessage:
     """One message that waits; of an opened one, bytes may still be missing.
 
     Args:
@@ -70,7 +70,7 @@ class Parcel:
         self.dropped = False
 
 
-Framer = Callable[[Parcel, int, int], bytes]
+Framer = Callable[[QueuedMessage, int, int], bytes]
 """``(parcel, length, flags)``: the header of a fragment."""
 
 
@@ -85,9 +85,9 @@ class _Terms:
 
 
 @dataclass(slots=True)
-class _Flow:
+class _KeyQueue:
     terms: _Terms
-    parcels: deque[Parcel] = field(default_factory=deque)
+    parcels: deque[QueuedMessage] = field(default_factory=deque)
     size: int = 0
     marks: int = 0
     turning: bool = False
@@ -122,7 +122,7 @@ class Outbox:
         self._frame = frame
         self._fragment = fragment
         self._urgent: deque[bytes] = deque()
-        self._flows: dict[int, _Flow] = {}
+        self._flows: dict[int, _KeyQueue] = {}
         self._turns: deque[int] = deque()
         self._committed: deque[memoryview] = deque()
         self._committed_bytes = 0
@@ -223,12 +223,12 @@ class Outbox:
         """
         if not data:
             return 0
-        parcel = Parcel(key, len(data), born=now)
+        parcel = QueuedMessage(key, len(data), born=now)
         parcel.framed = False
         parcel.pinned = pinned
         return self._enter(parcel, memoryview(data))
 
-    def extend(self, parcel: Parcel, data: bytes) -> int:
+    def extend(self, parcel: QueuedMessage, data: bytes) -> int:
         """Queue more bytes of a parcel, its first ones or further ones; return as for ``push``.
 
         Nothing happens for a parcel that was dropped.
@@ -254,7 +254,7 @@ class Outbox:
         self._turn(flow, parcel.key)
         return self._bound(parcel)
 
-    def abandon(self, parcel: Parcel) -> bool:
+    def abandon(self, parcel: QueuedMessage) -> bool:
         """The rest of a parcel will never come: drop it, and tell the other side if it has a part of it.
 
         Returns:
@@ -399,7 +399,7 @@ class Outbox:
             return True
         return False
 
-    def _commit_turn(self, flow: _Flow, parcel: Parcel) -> None:
+    def _commit_turn(self, flow: _KeyQueue, parcel: QueuedMessage) -> None:
         """Commit one turn's bytes of a parcel that has some."""
         flags = 0 if parcel.sent else FIRST
         if not parcel.sent and not parcel.pinned:  # begun from here on: no longer counted against the bound
@@ -424,11 +424,11 @@ class Outbox:
         for part in parts:
             self._commit_bytes(part)
 
-    def _enter(self, parcel: Parcel, data: memoryview) -> int:
+    def _enter(self, parcel: QueuedMessage, data: memoryview) -> int:
         """Put a parcel, with its first bytes, at the end of its flow."""
         flow = self._flows.get(parcel.key)
         if flow is None:
-            flow = self._flows[parcel.key] = _Flow(self._special.get(parcel.key, self._terms))
+            flow = self._flows[parcel.key] = _KeyQueue(self._special.get(parcel.key, self._terms))
         dropped = 0
         if parcel.pinned:
             flow.marks += 1
@@ -446,12 +446,12 @@ class Outbox:
         self._turn(flow, parcel.key)
         return dropped + self._bound(parcel)
 
-    def _turn(self, flow: _Flow, key: int) -> None:
+    def _turn(self, flow: _KeyQueue, key: int) -> None:
         if not flow.turning and flow.parcels and flow.parcels[0].chunks:
             flow.turning = True
             self._turns.append(key)
 
-    def _bound(self, newest: Parcel) -> int:
+    def _bound(self, newest: QueuedMessage) -> int:
         dropped = 0
         while self._data_bytes > self._max_bytes:
             count = self._drop_largest(newest)
@@ -460,7 +460,7 @@ class Outbox:
             dropped += count
         return dropped
 
-    def _release(self, flow: _Flow, parcel: Parcel) -> None:
+    def _release(self, flow: _KeyQueue, parcel: QueuedMessage) -> None:
         """Let go of a parcel's bytes, and of their account."""
         if parcel.sent or parcel.pinned:
             self._begun_bytes -= parcel.held
@@ -470,12 +470,12 @@ class Outbox:
         parcel.held = 0
         parcel.chunks.clear()
 
-    def _forget(self, key: int, flow: _Flow) -> None:
+    def _forget(self, key: int, flow: _KeyQueue) -> None:
         del self._flows[key]
         if flow.turning:
             self._turns.remove(key)
 
-    def _drop_oldest(self, flow: _Flow, newest: Parcel) -> bool:
+    def _drop_oldest(self, flow: _KeyQueue, newest: QueuedMessage) -> bool:
         """Drop a flow's oldest parcel that was not begun and is not ``newest``; whether there was one."""
         index = 0
         while index < len(flow.parcels) and (flow.parcels[index].sent or flow.parcels[index].pinned):
@@ -489,7 +489,7 @@ class Outbox:
         self.dropped[parcel.key] += 1
         return True
 
-    def _drop_largest(self, newest: Parcel) -> int:
+    def _drop_largest(self, newest: QueuedMessage) -> int:
         """Drop the oldest of the key that holds the most bytes, but never the entry just pushed.
 
         Half of what the key holds may go at once, so that room for one large entry is not searched for by
@@ -515,7 +515,7 @@ class Outbox:
             self._forget(key, flow)
         return dropped
 
-    def _expire(self, flow: _Flow, key: int, now: float) -> None:
+    def _expire(self, flow: _KeyQueue, key: int, now: float) -> None:
         """Drop what has waited for too long: unless ``strict``, never the newest."""
         terms = flow.terms
         if terms.max_age is None:

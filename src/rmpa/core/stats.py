@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Summary:
+class SampleSummary:
     """What a set of samples says, in the samples' own unit; ``nan`` where there are too few samples to say it."""
 
     count: int
@@ -25,7 +25,7 @@ class Summary:
     p99: float
 
     @classmethod
-    def of(cls, samples: Iterable[float]) -> Summary:
+    def of(cls, samples: Iterable[float]) -> SampleSummary:
         """Summarise; the standard deviation is the population's, as in ``rostopic hz``."""
         data = sorted(samples)
         if not data:
@@ -55,7 +55,7 @@ def percentile(ordered: list[float], percent: float) -> float:
     return ordered[low] + (ordered[high] - ordered[low]) * (position - low)
 
 
-class Ring:
+class SampleRing:
     """The last ``size`` samples; adding one costs the same however many there were.
 
     Args:
@@ -93,12 +93,12 @@ class Ring:
             yield from self._data[self._next :]
         yield from self._data[: self._next]
 
-    def summary(self) -> Summary:
+    def summary(self) -> SampleSummary:
         """Summarise what the ring holds."""
-        return Summary.of(self)
+        return SampleSummary.of(self)
 
 
-class Flow:
+class ArrivalStats:
     """Arrivals of one stream of messages: their periods and bytes, over the last ``window`` messages.
 
     Args:
@@ -106,8 +106,8 @@ class Flow:
     """
 
     def __init__(self, window: int = 1000) -> None:
-        self._periods = Ring(window)
-        self._sizes = Ring(window)
+        self._periods = SampleRing(window)
+        self._sizes = SampleRing(window)
         self._last: float | None = None
         self.messages = 0
         """Messages ever seen."""
@@ -128,7 +128,7 @@ class Flow:
         """When the last message came, or ``None``."""
         return self._last
 
-    def periods(self) -> Summary:
+    def periods(self) -> SampleSummary:
         """Seconds between messages."""
         return self._periods.summary()
 

@@ -15,7 +15,7 @@ Address = tuple[str, int]
 """A numeric IPv4 address and a UDP port, as sockets want it."""
 
 
-class Heard(Enum):
+class HeardBy(Enum):
     """How a peer was heard."""
 
     MULTICAST = "multicast"
@@ -54,7 +54,7 @@ class PeerFound:
 
     identity: Identity
     source: Address | None
-    heard: Heard
+    heard: HeardBy
 
     @property
     def guid(self) -> Guid:
@@ -103,7 +103,7 @@ class PeerLost:
 
 
 @dataclass(frozen=True, slots=True)
-class Conflict:
+class PeerConflict:
     """Two live peers claim one thing. ``str`` says what to do; told once until it clears.
 
     Args:
@@ -133,13 +133,13 @@ class Conflict:
 
 @dataclass(frozen=True, slots=True)
 class ConflictCleared:
-    """Only one of the two peers of a ``Conflict`` over a GUID address is left."""
+    """Only one of the two peers of a ``PeerConflict`` over a GUID address is left."""
 
     kind: ConflictKind
     identity: Identity
 
 
-Event = PeerFound | PeerChanged | PeerRestarted | PeerLost | Conflict | ConflictCleared
+Event = PeerFound | PeerChanged | PeerRestarted | PeerLost | PeerConflict | ConflictCleared
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,8 +179,8 @@ class PeerView:
     identity: Identity
     since: float
     heard: float
-    found_by: Heard
-    heard_by: Heard
+    found_by: HeardBy
+    heard_by: HeardBy
     source: Address | None
     linked: bool
     conflicts: tuple[str, ...]

@@ -6,22 +6,24 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 from rmpa.core import limits
-from rmpa.core.bucket import Bucket
+from rmpa.core.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rmpa.core.guid import Guid
-    from rmpa.discovery.seat import Voice
+    from rmpa.discovery.endpoint import PeerInstance
 
 
-class GossipTurn:
+class GossipSelector:
     """Chooses the peers that one beacon passes on."""
 
     def __init__(self) -> None:
         self._turn = 0
 
-    def choose(self, voices: Sequence[Voice], to: Voice | None, now: float, *, near: bool) -> tuple[Guid, ...]:
+    def choose(
+        self, voices: Sequence[PeerInstance], to: PeerInstance | None, now: float, *, near: bool
+    ) -> tuple[Guid, ...]:
         """GUIDs to pass on, in order; where they are too many for one beacon, in turn.
 
         Who has no link and was not heard of late is left out: others would greet it for as long as we speak of it.
@@ -48,17 +50,19 @@ class GossipTurn:
         return tuple(guids)
 
 
-class Whispers:
+class UnicastHeartbeats:
     """Chooses who gets a heartbeat by unicast: all that are linked; of the others, who may be invented, a few."""
 
     def __init__(self) -> None:
         self._turn = 0
-        self._allowed = Bucket(limits.WHISPERS_PER_SECOND, limits.WHISPERS_PER_SECOND * limits.HEARTBEAT_INTERVAL)
-        self._waiting: deque[Voice] = deque()
+        self._allowed = TokenBucket(
+            limits.WHISPERS_PER_SECOND, limits.WHISPERS_PER_SECOND * limits.HEARTBEAT_INTERVAL
+        )
+        self._waiting: deque[PeerInstance] = deque()
         self.at: float | None = None
         """When ``some`` has somebody."""
 
-    def choose(self, voices: Sequence[Voice], now: float) -> tuple[list[Voice], bool]:
+    def choose(self, voices: Sequence[PeerInstance], now: float) -> tuple[list[PeerInstance], bool]:
         """Those of ``voices`` who get one now, the others in turn from call to call; whether that is all of them."""
         chosen = [voice for voice in voices if voice.linked]
         others = [voice for voice in voices if not voice.linked]
@@ -70,7 +74,7 @@ class Whispers:
             self._turn = (self._turn + 1) % len(others)
         return chosen, True
 
-    def plan(self, voices: Sequence[Voice], now: float) -> bool:
+    def plan(self, voices: Sequence[PeerInstance], now: float) -> bool:
         """Let those whom ``choose`` chooses have one; whether that is all of them."""
         chosen, everybody = self.choose(voices, now)
         waiting = set(map(id, self._waiting))
@@ -78,7 +82,7 @@ class Whispers:
         self.at = now if self._waiting else None
         return everybody
 
-    def some(self) -> list[Voice]:
+    def some(self) -> list[PeerInstance]:
         """The next of them; so few that whoever else has something to do need not wait."""
         few = [self._waiting.popleft() for _ in range(min(limits.WHISPERS_AT_ONCE, len(self._waiting)))]
         if not self._waiting:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from rmpa.core import limits
 from rmpa.core.backoff import Backoff
-from rmpa.core.bucket import Bucket
-from rmpa.core.timetable import Timetable
+from rmpa.core.timer_queue import TimerQueue
+from rmpa.core.token_bucket import TokenBucket
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -60,8 +60,8 @@ class Greetings:
     def __init__(self, rng: Callable[[], float]) -> None:
         self._rng = rng
         self._all: dict[Address, _Greeting] = {}
-        self._due: Timetable[Address] = Timetable()
-        self._allowed = Bucket(limits.GREETINGS_PER_SECOND, limits.GREETINGS_MAX)
+        self._due: TimerQueue[Address] = TimerQueue()
+        self._allowed = TokenBucket(limits.GREETINGS_PER_SECOND, limits.GREETINGS_MAX)
         self._resume = float("-inf")
 
     def __contains__(self, address: Address) -> bool:

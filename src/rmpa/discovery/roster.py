@@ -9,21 +9,23 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
-from rmpa.core.bucket import Bucket
 from rmpa.core.clock import earliest
 from rmpa.core.counters import Counters
 from rmpa.core.identity import Identity
+from rmpa.core.token_bucket import TokenBucket
 from rmpa.discovery.beacon import Beacon, BeaconKind
+from rmpa.discovery.endpoint import Endpoint, EndpointChange, PeerInstance
+from rmpa.discovery.endpoint_table import EndpointTable
 from rmpa.discovery.events import (
     Address,
-    Conflict,
     ConflictCleared,
     ConflictKind,
     Event,
-    Heard,
+    HeardBy,
     LossReason,
     Output,
     PeerChanged,
+    PeerConflict,
     PeerFound,
     PeerLost,
     PeerRestarted,
@@ -31,10 +33,8 @@ from rmpa.discovery.events import (
     SendMulticast,
     SendUnicast,
 )
-from rmpa.discovery.gossip import GossipTurn, Whispers
+from rmpa.discovery.gossip import GossipSelector, UnicastHeartbeats
 from rmpa.discovery.greeting import AnswerLimit, Greetings
-from rmpa.discovery.seat import Seat, Verdict, Voice
-from rmpa.discovery.seats import Seats
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -70,8 +70,8 @@ class Roster:
         self._rng = rng
         self._multicast = multicast
         self._lease_ms = round(lease * 1000)
-        self._seats = Seats()
-        self._room = Bucket(limits.ROSTER_EVICTIONS_PER_SECOND, limits.ROSTER_EVICTIONS_PER_SECOND)
+        self._seats = EndpointTable()
+        self._room = TokenBucket(limits.ROSTER_EVICTIONS_PER_SECOND, limits.ROSTER_EVICTIONS_PER_SECOND)
         self._no_room_until = _NEVER
         self._named: set[frozenset[bytes]] = set()
         self._answers = AnswerLimit()
@@ -82,8 +82,8 @@ class Roster:
         self._spread_at: float | None = None
         self._spread_last = _NEVER
         self._sequence = 0
-        self._gossip_turn = GossipTurn()
-        self._whispers = Whispers()
+        self._gossip_turn = GossipSelector()
+        self._whispers = UnicastHeartbeats()
         self._closed = False
         self._outputs: list[Output] = []
         self._events: list[Event] = []
@@ -92,8 +92,8 @@ class Roster:
 
     def start(self, now: float) -> None:
         """Announce ourselves: a burst, then silence but for the heartbeat."""
-        own = Voice(self._own, now, now, limits.ROSTER_LEASE, Heard.LINK, Heard.LINK, linked=True)
-        self._seats.add(self._own.guid.place, Seat(own, own=True))
+        own = PeerInstance(self._own, now, now, limits.ROSTER_LEASE, HeardBy.LINK, HeardBy.LINK, linked=True)
+        self._seats.add(self._own.guid.place, Endpoint(own, own=True))
         self._burst = self._burst_times(now, limits.BURST_OFFSETS)
         self._heartbeat_at = self._next_heartbeat(now)
         self.handle_timer(now)
@@ -117,20 +117,20 @@ class Roster:
             if len(self._seats) >= limits.ROSTER_PEERS_MAX and not self._evict_silent(now):
                 self.counters.add("roster.full")
                 return
-            seat = self._seats.add(key, Seat())
+            seat = self._seats.add(key, Endpoint())
         previous = seat.current.identity if seat.current is not None else None
         verdict = seat.hear(beacon, now, source, multicast=multicast)
-        if verdict in {Verdict.KNOWN, Verdict.STALE}:
+        if verdict in {EndpointChange.KNOWN, EndpointChange.STALE}:
             self._seats.heard(key)
         else:
             self._seats.changed(key)
         greeted = [self._greetings.heard(address) for address in {identity.guid.endpoint, source}]
         self._judge(seat, verdict, now, previous=previous, source=source)
-        if verdict in {Verdict.NEW, Verdict.RESTARTED} and not multicast and seat.current is not None:
+        if verdict in {EndpointChange.NEW, EndpointChange.RESTARTED} and not multicast and seat.current is not None:
             self._presume(seat.current, beacon, source, now, greeted=any(greeted))
-        if verdict is Verdict.STALE:
+        if verdict is EndpointChange.STALE:
             self.counters.add("beacon.late")
-        elif verdict in {Verdict.NEW, Verdict.RESTARTED, Verdict.KNOWN, Verdict.CHANGED}:
+        elif verdict in {EndpointChange.NEW, EndpointChange.RESTARTED, EndpointChange.KNOWN, EndpointChange.CHANGED}:
             self._answer(seat, verdict, beacon, now, multicast=multicast)
             self._hearsay(beacon, now)
         self._drop_if_empty(key)
@@ -149,7 +149,7 @@ class Roster:
             if len(self._seats) >= limits.ROSTER_PEERS_MAX and not self._evict():
                 self.counters.add("roster.full")
                 return
-            seat = self._seats.add(key, Seat())
+            seat = self._seats.add(key, Endpoint())
         if seat.own:
             self.counters.add("roster.own_link")
             return
@@ -180,12 +180,12 @@ class Roster:
             return
         verdict = seat.link_down(now)
         self._seats.changed(key)
-        if verdict is Verdict.CONFLICT:
+        if verdict is EndpointChange.CONFLICT:
             self._lost(seat, LossReason.CONFLICT)
             return
         source = seat.current.source
         self._judge(seat, verdict, now, previous=previous, source=source)
-        if verdict is Verdict.RESTARTED:
+        if verdict is EndpointChange.RESTARTED:
             self._send_answer(seat.current, now)
         self._drop_if_empty(key)
 
@@ -299,41 +299,47 @@ class Roster:
     # --- verdicts to events -----------------------------------------------------------------------------------
 
     def _judge(
-        self, seat: Seat, verdict: Verdict, now: float, *, previous: Identity | None, source: Address | None
+        self,
+        seat: Endpoint,
+        verdict: EndpointChange,
+        now: float,
+        *,
+        previous: Identity | None,
+        source: Address | None,
     ) -> None:
         current = seat.current
         if current is None:
             return
-        if verdict is Verdict.KNOWN and seat.present:
+        if verdict is EndpointChange.KNOWN and seat.present:
             self._check_name(seat)
-        elif verdict is Verdict.NEW:
+        elif verdict is EndpointChange.NEW:
             self._found(seat, now)
-        elif verdict is Verdict.CHANGED and previous is not None and seat.present:
+        elif verdict is EndpointChange.CHANGED and previous is not None and seat.present:
             self._events.append(PeerChanged(current.identity, previous))
             self._check_name(seat)
-        elif verdict is Verdict.RESTARTED and previous is not None:
+        elif verdict is EndpointChange.RESTARTED and previous is not None:
             if seat.present:
                 self._events.append(PeerRestarted(current.identity, previous, source))
                 self._check_name(seat)
                 self._news(now)
             elif not seat.conflict:
                 self._found(seat, now)
-        elif verdict is Verdict.LEAVING and not current.linked:
+        elif verdict is EndpointChange.LEAVING and not current.linked:
             self._lost(seat, LossReason.GOODBYE)
             seat.vacate()
             self._settle(seat, now)
             self._seats.changed(current.identity.guid.place)
-        elif verdict is Verdict.CONFLICT:
+        elif verdict is EndpointChange.CONFLICT:
             kind = ConflictKind.OWN_GUID if seat.own else ConflictKind.GUID
             rival = max(seat.rivals(), key=lambda v: v.heard)
-            self._events.append(Conflict(kind, rival.identity, current.identity))
+            self._events.append(PeerConflict(kind, rival.identity, current.identity))
             if not current.linked:
                 self._lost(seat, LossReason.CONFLICT)
-        elif verdict is Verdict.WAITING:
+        elif verdict is EndpointChange.WAITING:
             self._settle(seat, now)
             self._seats.changed(current.identity.guid.place)
 
-    def _found(self, seat: Seat, now: float) -> None:
+    def _found(self, seat: Endpoint, now: float) -> None:
         voice = seat.current
         if voice is None or seat.own:
             return
@@ -345,14 +351,14 @@ class Roster:
         self._check_name(seat)
         self._news(now)
 
-    def _lost(self, seat: Seat, reason: LossReason) -> None:
+    def _lost(self, seat: Endpoint, reason: LossReason) -> None:
         if seat.present and seat.current is not None:
             seat.present = False
             self._seats.changed(seat.current.identity.guid.place)
             self._events.append(PeerLost(seat.current.identity, reason))
             self._named = {pair for pair in self._named if seat.current.identity.instance not in pair}
 
-    def _retire_ghosts(self, seat: Seat, voice: Voice) -> None:
+    def _retire_ghosts(self, seat: Endpoint, voice: PeerInstance) -> None:
         """A killed agent that starts again at another port: one name, one machine, and the old one has no link.
 
         If the old one lives all the same, its next beacon brings it back.
@@ -373,16 +379,16 @@ class Roster:
                 self._seats.changed(key)
                 self._drop_if_empty(key)
 
-    def _check_name(self, seat: Seat) -> None:
+    def _check_name(self, seat: Endpoint) -> None:
         """Say once that two peers share a name, if both live beyond doubt: a ghost is none's namesake."""
         for one, other in self._namesakes(seat):
             pair = frozenset({one.identity.instance, other.identity.instance})
             if pair not in self._named:
                 self._named.add(pair)
-                self._events.append(Conflict(ConflictKind.NAME, one.identity, other.identity))
+                self._events.append(PeerConflict(ConflictKind.NAME, one.identity, other.identity))
                 return
 
-    def _namesakes(self, seat: Seat) -> list[tuple[Voice, Voice]]:
+    def _namesakes(self, seat: Endpoint) -> list[tuple[PeerInstance, PeerInstance]]:
         """This seat's peer with each other of its name, the newer of both first."""
         mine = seat.current
         if mine is None:
@@ -398,7 +404,7 @@ class Roster:
                 pairs.append((newer, older))
         return pairs
 
-    def _settle(self, seat: Seat, now: float) -> None:
+    def _settle(self, seat: Endpoint, now: float) -> None:
         """After somebody of this seat fell silent or left: is a conflict over?"""
         seat.forget(now)
         if seat.conflict and seat.current is not None and not seat.rivals():
@@ -502,19 +508,21 @@ class Roster:
         if self._spread_at is None and self._heartbeat_at is not None and len(self._seats.present()) > 1:
             self._spread_at = max(now, self._spread_last + limits.SPREAD_INTERVAL)
 
-    def _answer(self, seat: Seat, verdict: Verdict, beacon: Beacon, now: float, *, multicast: bool) -> None:
+    def _answer(
+        self, seat: Endpoint, verdict: EndpointChange, beacon: Beacon, now: float, *, multicast: bool
+    ) -> None:
         """Tell the sender of us if it does not know us, or may not."""
         voice = seat.current
         if voice is None or voice.linked or seat.conflict or beacon.kind is BeaconKind.ANSWER:
             return
-        unknown = verdict in {Verdict.NEW, Verdict.RESTARTED}
+        unknown = verdict in {EndpointChange.NEW, EndpointChange.RESTARTED}
         # A heartbeat by unicast says that its sender hears no multicast of ours; if we hear none of its either
         # our own heartbeat goes there by unicast anyway.
         deaf = not multicast and now - voice.multicast_at <= limits.MULTICAST_SILENCE
         if unknown or deaf or beacon.kind is BeaconKind.ANNOUNCE:
             self._send_answer(voice, now)
 
-    def _send_answer(self, voice: Voice, now: float) -> None:
+    def _send_answer(self, voice: PeerInstance, now: float) -> None:
         gossip: tuple[Guid, ...] | None = None
         for address in _addresses(voice):
             if self._answers.allows(address, now):
@@ -523,10 +531,10 @@ class Roster:
             else:
                 self.counters.add("beacon.answer_limited")
 
-    def _presume(self, voice: Voice, beacon: Beacon, source: Address, now: float, *, greeted: bool) -> None:
+    def _presume(self, voice: PeerInstance, beacon: Beacon, source: Address, now: float, *, greeted: bool) -> None:
         """Whoever answers without having been greeted has heard our multicast: expect to hear its, for a while."""
         if greeted:
-            voice.found_by = Heard.GOSSIP
+            voice.found_by = HeardBy.GOSSIP
         elif beacon.kind is BeaconKind.ANSWER and self._multicast and source not in self._seeds:
             voice.multicast_at = now - limits.HEARTBEAT_INTERVAL
 
@@ -553,13 +561,13 @@ class Roster:
         near = self._own.guid.is_loopback
         return [a for a in addresses if a not in met and (near or not a[0].startswith("127."))]
 
-    def _gossip(self, voices: list[Voice], to: Voice | None, now: float) -> tuple[Guid, ...]:
+    def _gossip(self, voices: list[PeerInstance], to: PeerInstance | None, now: float) -> tuple[Guid, ...]:
         identity = to.identity if to is not None else self._own
         return self._gossip_turn.choose(voices, to, now, near=identity.guid.is_loopback)
 
     # --- small reads ------------------------------------------------------------------------------------------
 
-    def _unheard_by_multicast(self, now: float) -> list[Voice]:
+    def _unheard_by_multicast(self, now: float) -> list[PeerInstance]:
         """Peers that get their heartbeats by unicast."""
         silence = limits.MULTICAST_SILENCE
         return [v for v in self._seats.present() if not self._multicast or now - v.multicast_at > silence]
@@ -570,15 +578,15 @@ class Roster:
     def _next_heartbeat(self, now: float) -> float:
         return now + limits.HEARTBEAT_INTERVAL * (1.0 - limits.HEARTBEAT_JITTER * self._rng())
 
-    def _view(self, seat: Seat, voice: Voice) -> PeerView:
+    def _view(self, seat: Endpoint, voice: PeerInstance) -> PeerView:
         conflicts = []
         if seat.conflict and seat.current is not None:
             rivals = seat.rivals()
             other = seat.current if voice is not seat.current else rivals[0] if rivals else voice
             kind = ConflictKind.OWN_GUID if seat.own else ConflictKind.GUID
-            conflicts.append(str(Conflict(kind, voice.identity, other.identity)))
+            conflicts.append(str(PeerConflict(kind, voice.identity, other.identity)))
         conflicts += [
-            str(Conflict(ConflictKind.NAME, one.identity, other.identity))
+            str(PeerConflict(ConflictKind.NAME, one.identity, other.identity))
             for one, other in (self._namesakes(seat) if voice is seat.current else ())
         ]
         return PeerView(
@@ -586,7 +594,7 @@ class Roster:
             voice.since,
             voice.heard,
             voice.found_by,
-            voice.heard_by if not voice.linked else Heard.LINK,
+            voice.heard_by if not voice.linked else HeardBy.LINK,
             voice.source,
             voice.linked,
             tuple(conflicts),
@@ -594,7 +602,7 @@ class Roster:
         )
 
 
-def _addresses(voice: Voice) -> tuple[Address, ...]:
+def _addresses(voice: PeerInstance) -> tuple[Address, ...]:
     """Where a peer's unicast goes: its GUID's endpoint, and where its packets come from if that differs."""
     endpoint, source = voice.identity.guid.endpoint, voice.source
     return (endpoint,) if source is None or source == endpoint else (endpoint, source)

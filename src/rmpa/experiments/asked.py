@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
-from rmpa.core.config_values import did_you_mean
+from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, StartError
 from rmpa.experiments.model import Plan
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core.config_values import did_you_mean
+from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:

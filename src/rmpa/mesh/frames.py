@@ -19,7 +19,7 @@ from rmpa.core.outbox import ABORT, FIRST, LAST
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.core.outbox import Parcel
+    from rmpa.core.outbox import QueuedMessage
 
 Buffer = bytes | bytearray | memoryview
 
@@ -35,7 +35,7 @@ WHOLE: Final = FIRST | LAST
 """The flags of a message in one piece."""
 
 
-class Kind(IntEnum):
+class FrameKind(IntEnum):
     """Kinds of frames."""
 
     HELLO = 1
@@ -53,17 +53,17 @@ class Kind(IntEnum):
 
 PAYLOAD_MAX: Final[Mapping[int, int]] = MappingProxyType(
     {
-        Kind.HELLO: limits.HELLO_PAYLOAD_MAX,
-        Kind.WELCOME: limits.HELLO_PAYLOAD_MAX,
-        Kind.REFUSE: limits.HELLO_PAYLOAD_MAX,
-        Kind.PING: 0,
-        Kind.PONG: _STAMPS.size,
-        Kind.CONTROL: limits.CONTROL_PAYLOAD_MAX,
-        Kind.DATA: limits.DATA_PAYLOAD_MAX,
-        Kind.BYE: limits.HELLO_PAYLOAD_MAX,
-        Kind.ACK: 0,
-        Kind.FENCE: 0,
-        Kind.FENCED: 0,
+        FrameKind.HELLO: limits.HELLO_PAYLOAD_MAX,
+        FrameKind.WELCOME: limits.HELLO_PAYLOAD_MAX,
+        FrameKind.REFUSE: limits.HELLO_PAYLOAD_MAX,
+        FrameKind.PING: 0,
+        FrameKind.PONG: _STAMPS.size,
+        FrameKind.CONTROL: limits.CONTROL_PAYLOAD_MAX,
+        FrameKind.DATA: limits.DATA_PAYLOAD_MAX,
+        FrameKind.BYE: limits.HELLO_PAYLOAD_MAX,
+        FrameKind.ACK: 0,
+        FrameKind.FENCE: 0,
+        FrameKind.FENCED: 0,
     }
 )
 """The most bytes of payload that a frame of each kind may claim."""
@@ -83,7 +83,7 @@ def pack_data_header(length: int, route: int, sequence: int, stamp_ns: int) -> b
         raise LocalProtocolError(f"route {route} or stamp {stamp_ns} does not fit its field: {error}") from None
 
 
-def pack_fragment_header(parcel: Parcel, length: int, flags: int) -> bytes:
+def pack_fragment_header(parcel: QueuedMessage, length: int, flags: int) -> bytes:
     """The 24 bytes in front of a fragment of ``length`` bytes; the parcel's key is the route."""
     return _pack(length, 7, flags, 0, parcel.key, parcel.sequence & 0xFFFFFFFF, parcel.stamp_ns)
 
@@ -99,10 +99,12 @@ def check_header(length: int, kind: int, flags: int) -> None:
     if limit is None:
         raise RemoteProtocolError(f"frame of unknown kind {kind}")
     if length > limit:
-        raise LimitExceeded(f"{Kind(kind).name.lower()} frame", length, limit)
-    if kind != Kind.DATA:
+        raise LimitExceeded(f"{FrameKind(kind).name.lower()} frame", length, limit)
+    if kind != FrameKind.DATA:
         if flags & WHOLE != WHOLE:
-            raise RemoteProtocolError(f"{Kind(kind).name.lower()} frame is a fragment; only data comes in fragments")
+            raise RemoteProtocolError(
+                f"{FrameKind(kind).name.lower()} frame is a fragment; only data comes in fragments"
+            )
     elif flags & ABORT:
         if length or flags & WHOLE != LAST:
             raise RemoteProtocolError(f"data frame that aborts its message has {length} bytes, flags {flags:#x}")
@@ -123,7 +125,7 @@ class Frame:
         flags: ``FIRST`` and ``LAST``; both on a whole message.
     """
 
-    kind: Kind
+    kind: FrameKind
     payload: bytes = b""
     route: int = 0
     sequence: int = 0
@@ -148,7 +150,7 @@ class Frame:
         if len(data) < end:
             return None
         payload = bytes(data[limits.FRAME_HEADER_BYTES : end])
-        return cls(Kind(kind), payload, route, sequence, stamp_ns, flags), end
+        return cls(FrameKind(kind), payload, route, sequence, stamp_ns, flags), end
 
     def serialize(self) -> bytes:
         """The bytes on the wire.
@@ -165,7 +167,7 @@ class Frame:
     def __str__(self) -> str:
         """``DATA route=7 #12 1048580 bytes``; never the payload."""
         parts = [self.kind.name]
-        if self.kind is Kind.DATA:
+        if self.kind is FrameKind.DATA:
             parts.append(f"route={self.route} #{self.sequence}")
         if self.flags & WHOLE != WHOLE:
             parts.append(f"flags={self.flags}")
@@ -176,7 +178,7 @@ class Frame:
 
 def pong(ping_stamp_ns: int, came_ns: int, stamp_ns: int) -> Frame:
     """The answer to a ping: its stamp (t1), when it came (t2), and now (t3)."""
-    return Frame(Kind.PONG, _STAMPS.pack(ping_stamp_ns, came_ns), stamp_ns=stamp_ns)
+    return Frame(FrameKind.PONG, _STAMPS.pack(ping_stamp_ns, came_ns), stamp_ns=stamp_ns)
 
 
 def parse_pong(payload: Buffer) -> tuple[int, int]:

@@ -7,7 +7,7 @@
          └─ refused, time out, error: CLOSED
 
 The driver feeds ``receive``, sends what ``take_output`` gives, calls ``handle_timer`` when ``next_timer`` is due
-and closes the socket at ``Closed``. Events and data come in the order of the bytes, from within ``receive``.
+and closes the socket at ``LinkClosed``. Events and data come in the order of the bytes, from within ``receive``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rmpa.core.clock import earliest
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import frames
-from rmpa.mesh.frames import Frame, Kind
+from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import HandshakeError, Hello, Lane, Refuse, judge_welcome
 from rmpa.mesh.timing import LinkClock
 
@@ -35,20 +35,20 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _HEADER: Final = limits.FRAME_HEADER_BYTES
-_DATA: Final = int(Kind.DATA)
+_DATA: Final = int(FrameKind.DATA)
 _WHOLE: Final = frames.WHOLE
 _FIRST_PART: Final = 4
 """Bytes of a message without which its first part says nothing: its length."""
 
 
-class Role(Enum):
+class LinkRole(Enum):
     """Who connected."""
 
     DIALLER = auto()
     ACCEPTOR = auto()
 
 
-class State(Enum):
+class LinkState(Enum):
     """Where a link is in its life."""
 
     HANDSHAKING = auto()
@@ -64,27 +64,36 @@ class _Act(Enum):
     ENDED = auto()
 
 
-_NEXT: Final[Mapping[tuple[State, _Act], State]] = MappingProxyType(
+_NEXT: Final[Mapping[tuple[LinkState, _Act], LinkState]] = MappingProxyType(
     {
-        (State.HANDSHAKING, _Act.WELCOMED): State.UP,
-        (State.HANDSHAKING, _Act.REFUSING): State.CLOSING,
-        (State.HANDSHAKING, _Act.LEAVING): State.CLOSING,
-        (State.HANDSHAKING, _Act.ENDED): State.CLOSED,
-        (State.UP, _Act.LEAVING): State.CLOSING,
-        (State.UP, _Act.ENDED): State.CLOSED,
-        (State.CLOSING, _Act.ENDED): State.CLOSED,
+        (LinkState.HANDSHAKING, _Act.WELCOMED): LinkState.UP,
+        (LinkState.HANDSHAKING, _Act.REFUSING): LinkState.CLOSING,
+        (LinkState.HANDSHAKING, _Act.LEAVING): LinkState.CLOSING,
+        (LinkState.HANDSHAKING, _Act.ENDED): LinkState.CLOSED,
+        (LinkState.UP, _Act.LEAVING): LinkState.CLOSING,
+        (LinkState.UP, _Act.ENDED): LinkState.CLOSED,
+        (LinkState.CLOSING, _Act.ENDED): LinkState.CLOSED,
     }
 )
 
 _TALK: Final[frozenset[int]] = frozenset(
-    {Kind.PING, Kind.PONG, Kind.CONTROL, Kind.DATA, Kind.BYE, Kind.ACK, Kind.FENCE, Kind.FENCED}
-)
-_ALLOWED: Final[Mapping[tuple[Role, State], frozenset[int]]] = MappingProxyType(
     {
-        (Role.DIALLER, State.HANDSHAKING): frozenset({int(Kind.WELCOME), int(Kind.REFUSE)}),
-        (Role.ACCEPTOR, State.HANDSHAKING): frozenset({int(Kind.HELLO)}),
-        (Role.DIALLER, State.UP): _TALK,
-        (Role.ACCEPTOR, State.UP): _TALK,
+        FrameKind.PING,
+        FrameKind.PONG,
+        FrameKind.CONTROL,
+        FrameKind.DATA,
+        FrameKind.BYE,
+        FrameKind.ACK,
+        FrameKind.FENCE,
+        FrameKind.FENCED,
+    }
+)
+_ALLOWED: Final[Mapping[tuple[LinkRole, LinkState], frozenset[int]]] = MappingProxyType(
+    {
+        (LinkRole.DIALLER, LinkState.HANDSHAKING): frozenset({int(FrameKind.WELCOME), int(FrameKind.REFUSE)}),
+        (LinkRole.ACCEPTOR, LinkState.HANDSHAKING): frozenset({int(FrameKind.HELLO)}),
+        (LinkRole.DIALLER, LinkState.UP): _TALK,
+        (LinkRole.ACCEPTOR, LinkState.UP): _TALK,
     }
 )
 
@@ -129,7 +138,7 @@ class Ponged:
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """No link: one of the two said no. ``Closed`` follows.
+    """No link: one of the two said no. ``LinkClosed`` follows.
 
     Args:
         refuse: Why.
@@ -141,7 +150,7 @@ class Refused:
 
 
 @dataclass(frozen=True, slots=True)
-class Closed:
+class LinkClosed:
     """The link is over: send what is left, close the socket.
 
     Args:
@@ -163,18 +172,18 @@ class Marked:
         sequence: Up to which message; the fence's number.
     """
 
-    kind: Kind
+    kind: FrameKind
     route: int
     sequence: int
 
 
-Event = HelloReceived | Up | ControlReceived | Ponged | Marked | Refused | Closed
+Event = HelloReceived | Up | ControlReceived | Ponged | Marked | Refused | LinkClosed
 OnEvent = Callable[[Event], None]
 OnData = Callable[[int, int, int, memoryview], None]
 OnPart = Callable[[int, int, int, int, memoryview], None]
 
 
-class Link:
+class LinkProtocol:
     """One side of one link.
 
     Args:
@@ -194,7 +203,7 @@ class Link:
 
     def __init__(
         self,
-        role: Role,
+        role: LinkRole,
         ours: Identity,
         now: float,
         *,
@@ -219,7 +228,7 @@ class Link:
         self._rest = (0, 0, 0, 0)
         self._expected = expected
         self._label = label
-        self._state = State.HANDSHAKING
+        self._state = LinkState.HANDSHAKING
         self._promise(lease)
         self._deadline = now + limits.HANDSHAKE_TIMEOUT
         self._reason = ""
@@ -229,12 +238,12 @@ class Link:
         self._sent = now
         self._pinged = now
         self._output = bytearray()
-        if role is Role.DIALLER:
+        if role is LinkRole.DIALLER:
             hello = Hello.of(ours, lease=lease, expected=expected, lane=lane)
-            self._send(Frame(Kind.HELLO, hello.serialize()))
+            self._send(Frame(FrameKind.HELLO, hello.serialize()))
 
     @property
-    def state(self) -> State:
+    def state(self) -> LinkState:
         """Where the link is in its life."""
         return self._state
 
@@ -276,7 +285,7 @@ class Link:
                 offset = self._take_rest(view)
             while size - offset >= _HEADER:
                 length, kind, flags, _, route, sequence, stamp_ns = frames.unpack_header(view, offset)
-                if (kind != _DATA or self._state is not State.UP) and not self._admit(kind):
+                if (kind != _DATA or self._state is not LinkState.UP) and not self._admit(kind):
                     return size, 0
                 # One comparison each on the data path; what is wrong is said by check_header.
                 if kind != _DATA or length > limits.DATA_PAYLOAD_MAX or flags != _WHOLE:
@@ -293,7 +302,7 @@ class Link:
                     return size, 0
                 offset = end
                 if kind != _DATA:
-                    self._handle(Kind(kind), view[start:end], route, sequence, stamp_ns, now)
+                    self._handle(FrameKind(kind), view[start:end], route, sequence, stamp_ns, now)
                 elif flags == _WHOLE:
                     self.on_data(route, sequence, stamp_ns, view[start:end])
                 else:
@@ -301,7 +310,7 @@ class Link:
         except RemoteProtocolError as error:
             self._end(f"{self._name} broke the protocol: {error}")
             raise
-        return (size if self._state is State.CLOSED else offset), 0
+        return (size if self._state is LinkState.CLOSED else offset), 0
 
     def accept(self, now: float) -> None:
         """Acceptor, after ``HelloReceived``: welcome the other side; the link is up.
@@ -313,7 +322,7 @@ class Link:
         if hello.lane == Lane.BULK:
             self._promise(limits.BULK_LEASE)
         welcome = Hello.of(self._ours, lease=self._lease, expected=hello.guid, lane=hello.lane)
-        self._send(Frame(Kind.WELCOME, welcome.serialize()))
+        self._send(Frame(FrameKind.WELCOME, welcome.serialize()))
         self._raise_up(hello, now)
 
     def refuse(self, refuse: Refuse, now: float) -> None:
@@ -331,25 +340,25 @@ class Link:
         Raises:
             LocalProtocolError: It is too long.
         """
-        return Frame(Kind.CONTROL, payload, stamp_ns=self._wall_ns()).serialize()
+        return Frame(FrameKind.CONTROL, payload, stamp_ns=self._wall_ns()).serialize()
 
     def close(self, reason: str, now: float) -> None:
-        """Say bye and leave; ``Closed`` comes from ``drained`` or the timer. Without effect once leaving."""
-        if self._state in (State.CLOSING, State.CLOSED):
+        """Say bye and leave; ``LinkClosed`` comes from ``drained`` or the timer. Without effect once leaving."""
+        if self._state in (LinkState.CLOSING, LinkState.CLOSED):
             return
-        if self._state is State.UP:
-            self._send(Frame(Kind.BYE, frames.text_payload(reason), stamp_ns=self._wall_ns()))
+        if self._state is LinkState.UP:
+            self._send(Frame(FrameKind.BYE, frames.text_payload(reason), stamp_ns=self._wall_ns()))
         self._leave(_Act.LEAVING, reason, now)
 
     def drained(self) -> None:
         """The driver has sent all that was to be sent; the end of ``CLOSING``."""
-        if self._state is State.CLOSING:
+        if self._state is LinkState.CLOSING:
             self._end(self._reason, orderly=True)
 
     def lost(self, reason: str) -> None:
         """The connection is gone; without effect once closed."""
-        if self._state is not State.CLOSED:
-            self._end(self._reason or reason, orderly=self._state is State.CLOSING)
+        if self._state is not LinkState.CLOSED:
+            self._end(self._reason or reason, orderly=self._state is LinkState.CLOSING)
 
     def ping(self, now: float) -> int:
         """Measure a round trip on demand; ``Ponged`` with the stamp that this returns is the answer.
@@ -357,15 +366,15 @@ class Link:
         Raises:
             LocalProtocolError: The link is not up.
         """
-        if self._state is not State.UP:
+        if self._state is not LinkState.UP:
             raise LocalProtocolError(f"no ping on a link that is {self._state.name}")
         return self._ping(now)
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due, in monotonic seconds."""
-        if self._state is State.CLOSED:
+        if self._state is LinkState.CLOSED:
             return None
-        if self._state is State.UP:
+        if self._state is LinkState.UP:
             ping = min(self._sent + self._keepalive, self._pinged + limits.CLOCK_INTERVAL)
             return earliest(self._lease_over, ping)
         return self._deadline
@@ -377,9 +386,9 @@ class Link:
             return
         if now - due > limits.PAUSE_NOTICED:
             self._excuse(min(now - due, now - self._heard))
-        if self._state is State.CLOSING:
+        if self._state is LinkState.CLOSING:
             self._end(self._reason, orderly=True)
-        elif self._state is State.HANDSHAKING:
+        elif self._state is LinkState.HANDSHAKING:
             self._end(f"{self._name} did not finish the handshake within {limits.HANDSHAKE_TIMEOUT:g} s")
         elif now >= self._lease_over:
             excused = self._excused_now
@@ -410,7 +419,7 @@ class Link:
     @property
     def _awaited_lease(self) -> float:
         """How long the other side may be silent now, in seconds that we looked."""
-        awaited = self.role is Role.ACCEPTOR and self._heard <= self._welcomed
+        awaited = self.role is LinkRole.ACCEPTOR and self._heard <= self._welcomed
         return max(self._remote_lease, limits.HANDSHAKE_TIMEOUT) if awaited else self._remote_lease
 
     @property
@@ -427,17 +436,19 @@ class Link:
 
     def _admit(self, kind: int) -> bool:
         """Whether a frame of this kind is read now; ``False`` when we are leaving and read nothing more."""
-        if self._state in (State.CLOSING, State.CLOSED):
+        if self._state in (LinkState.CLOSING, LinkState.CLOSED):
             return False
-        if kind not in _ALLOWED[self.role, self._state] or (self.remote is not None and self._state is not State.UP):
-            what = Kind(kind).name.lower() if kind in frames.PAYLOAD_MAX else f"kind {kind}"
+        if kind not in _ALLOWED[self.role, self._state] or (
+            self.remote is not None and self._state is not LinkState.UP
+        ):
+            what = FrameKind(kind).name.lower() if kind in frames.PAYLOAD_MAX else f"kind {kind}"
             raise RemoteProtocolError(f"{what} frame while {self._state.name.lower()}")
         return True
 
     def _promise(self, lease: float) -> None:
         self._lease = lease
         self._keepalive = lease * limits.KEEPALIVE_INTERVAL / limits.LINK_LEASE
-        if self.role is Role.ACCEPTOR:
+        if self.role is LinkRole.ACCEPTOR:
             # A little later than the dialler's, so that its pongs are all that an idle link needs of it.
             self._keepalive *= limits.KEEPALIVE_ANSWERED
 
@@ -445,30 +456,32 @@ class Link:
         """Hand on what has come of a data frame that was begun; return how many bytes that were."""
         count = min(self._left, len(view))
         self._left -= count
-        if self._state is State.UP:
+        if self._state is LinkState.UP:
             route, sequence, stamp_ns, last = self._rest
             self.on_part(route, sequence, stamp_ns, 0 if self._left else last, view[:count])
         return count
 
-    def _handle(self, kind: Kind, payload: memoryview, route: int, sequence: int, stamp_ns: int, now: float) -> None:
+    def _handle(
+        self, kind: FrameKind, payload: memoryview, route: int, sequence: int, stamp_ns: int, now: float
+    ) -> None:
         if _log.isEnabledFor(logging.DEBUG):
             _log.debug("< %s: %s, %d bytes", self._name, kind.name, len(payload))
-        if kind is Kind.PING:
+        if kind is FrameKind.PING:
             came = self._wall_ns()
             self._send(frames.pong(stamp_ns, came, self._wall_ns()))
             self._sent = now
-        elif kind is Kind.PONG:
+        elif kind is FrameKind.PONG:
             t1, t2 = frames.parse_pong(payload)
             sample = self.clock.ponged(t1, t2, stamp_ns, self._wall_ns(), now)
             if sample is not None:
                 self.on_event(Ponged(t1, sample.rtt))
-        elif kind is Kind.CONTROL:
+        elif kind is FrameKind.CONTROL:
             self.on_event(ControlReceived(bytes(payload)))
-        elif kind in {Kind.ACK, Kind.FENCE, Kind.FENCED}:
+        elif kind in {FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED}:
             self.on_event(Marked(kind, route, sequence))
-        elif kind is Kind.BYE:
+        elif kind is FrameKind.BYE:
             self._end(f"{self._name} left: {frames.parse_text(payload)}", orderly=True)
-        elif kind is Kind.REFUSE:
+        elif kind is FrameKind.REFUSE:
             refuse = Refuse.parse(payload)
             self.on_event(Refused(refuse, by_us=False))
             self._end(f"{self._label} refused: {refuse}", orderly=True)
@@ -481,7 +494,7 @@ class Link:
         except HandshakeError as error:
             self._refuse(error.refuse, now)
             return
-        if self.role is Role.ACCEPTOR:
+        if self.role is LinkRole.ACCEPTOR:
             self.remote = hello
             self.on_event(HelloReceived(hello))
         elif refuse := judge_welcome(hello, self._ours, self._expected):
@@ -490,7 +503,7 @@ class Link:
             self._raise_up(hello, now)
 
     def _unanswered(self) -> Hello:
-        if self.role is not Role.ACCEPTOR or self.remote is None or self._state is not State.HANDSHAKING:
+        if self.role is not LinkRole.ACCEPTOR or self.remote is None or self._state is not LinkState.HANDSHAKING:
             raise LocalProtocolError(f"no hello waits for an answer (state {self._state.name})")
         return self.remote
 
@@ -503,7 +516,9 @@ class Link:
         self.on_event(Up(hello))
 
     def _refuse(self, refuse: Refuse, now: float) -> None:
-        self._send(Frame(Kind.REFUSE, refuse.serialize()) if self.role is Role.ACCEPTOR else _bye(refuse.text))
+        self._send(
+            Frame(FrameKind.REFUSE, refuse.serialize()) if self.role is LinkRole.ACCEPTOR else _bye(refuse.text)
+        )
         self._leave(_Act.REFUSING, f"refused: {refuse}", now)
         self.on_event(Refused(refuse, by_us=True))
 
@@ -514,17 +529,17 @@ class Link:
         _log.debug("= %s: closing: %s", self._name, reason)
 
     def _end(self, reason: str, *, orderly: bool = False) -> None:
-        if self._state is State.CLOSED:
+        if self._state is LinkState.CLOSED:
             return
         self._state = _NEXT[self._state, _Act.ENDED]
         self._reason = reason
         _log.debug("= %s: closed: %s", self._name, reason)
-        self.on_event(Closed(reason, orderly))
+        self.on_event(LinkClosed(reason, orderly))
 
     def _ping(self, now: float) -> int:
         stamp = self._wall_ns()
         self.clock.pinged(stamp, now)
-        self._send(Frame(Kind.PING, stamp_ns=stamp))
+        self._send(Frame(FrameKind.PING, stamp_ns=stamp))
         self._sent = self._pinged = now
         return stamp
 
@@ -539,4 +554,4 @@ def _no_parts(_route: int, _sequence: int, _stamp_ns: int, _flags: int, _part: m
 
 
 def _bye(text: str) -> Frame:
-    return Frame(Kind.BYE, frames.text_payload(text))
+    return Frame(FrameKind.BYE, frames.text_payload(text))

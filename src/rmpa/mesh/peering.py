@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from rmpa.core import limits
 from rmpa.core.backoff import Backoff
-from rmpa.core.bucket import Bucket
 from rmpa.core.clock import earliest
-from rmpa.core.timetable import Timetable
+from rmpa.core.timer_queue import TimerQueue
+from rmpa.core.token_bucket import TokenBucket
 from rmpa.mesh.handshake import Hello, KnownLink, Refusal, Refuse, Verdict, judge
 
 if TYPE_CHECKING:
@@ -168,14 +168,14 @@ class Peering:
         self._peers: dict[int, _Peer] = {}
         self._by_link: dict[int, _Peer] = {}
         self._outputs: list[Output] = []
-        self._timers: Timetable[int] = Timetable()
+        self._timers: TimerQueue[int] = TimerQueue()
         self._strangers: set[int] = set()
         # Strangers whose dials are due, who came first in front, and of these the ones that were never dialled.
         self._line: dict[int, None] = {}
         self._untried: dict[int, None] = {}
         self._untried_next = True
         self._line_at: float | None = None
-        self._allowed = Bucket(limits.DIAL_STRANGERS_RATE, limits.DIAL_STRANGERS_BURST)
+        self._allowed = TokenBucket(limits.DIAL_STRANGERS_RATE, limits.DIAL_STRANGERS_BURST)
 
     # --- what discovery says --------------------------------------------------------------------------------
 

@@ -356,7 +356,7 @@ class ReliableSender:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class ReceiveResult:
     """What to do with a message that came.
 
     Args:
@@ -368,9 +368,9 @@ class Verdict:
     gap: int = 0
 
 
-DELIVER: Final = Verdict(deliver=True)
+DELIVER: Final = ReceiveResult(deliver=True)
 """Hand it on; nothing is missing before it."""
-DUPLICATE: Final = Verdict(deliver=False)
+DUPLICATE: Final = ReceiveResult(deliver=False)
 """Do not hand it on."""
 
 
@@ -429,16 +429,16 @@ class ReliableReceiver:
         self.gap_total += gap
         return gap
 
-    def judge(self, sequence: int, epoch: int) -> Verdict:
+    def judge(self, sequence: int, epoch: int) -> ReceiveResult:
         """What ``accept`` would say, at a message's first fragment; nothing changes until its last one has come."""
         if epoch != self._epoch:
             return DELIVER if self._epoch is None else DUPLICATE
         gap = 0 if self._next is None else (sequence - self._next) & _MASK
         if not gap:
             return DELIVER
-        return DUPLICATE if gap >= _HALF else Verdict(deliver=True, gap=gap)
+        return DUPLICATE if gap >= _HALF else ReceiveResult(deliver=True, gap=gap)
 
-    def accept(self, sequence: int, epoch: int, now: float, size: int = 0) -> Verdict:
+    def accept(self, sequence: int, epoch: int, now: float, size: int = 0) -> ReceiveResult:
         """A whole message of ``size`` bytes has come at ``now``, in monotonic seconds."""
         if epoch != self._epoch:
             if self._epoch is not None:
@@ -457,7 +457,7 @@ class ReliableReceiver:
         if not gap:
             return DELIVER
         self.gap_total += gap
-        return Verdict(deliver=True, gap=gap)
+        return ReceiveResult(deliver=True, gap=gap)
 
     def due_ack(self, now: float) -> int | None:
         """The sequence to acknowledge now, up to which all has come; it counts as acknowledged. ``None``: not yet."""

@@ -9,7 +9,7 @@ from rmpa.core import limits
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class ClockSample:
     """One exchange.
 
     Args:
@@ -32,7 +32,7 @@ class LinkClock:
 
     def __init__(self) -> None:
         self._pings: dict[int, float] = {}
-        self._samples: deque[Sample] = deque(maxlen=limits.CLOCK_SAMPLES)
+        self._samples: deque[ClockSample] = deque(maxlen=limits.CLOCK_SAMPLES)
         self.rtt: float | None = None
         """The last round trip, in seconds; ``None`` before the first."""
 
@@ -42,7 +42,7 @@ class LinkClock:
         while len(self._pings) > limits.CLOCK_SAMPLES:
             del self._pings[next(iter(self._pings))]
 
-    def ponged(self, t1: int, t2: int, t3: int, t4: int, now: float) -> Sample | None:
+    def ponged(self, t1: int, t2: int, t3: int, t4: int, now: float) -> ClockSample | None:
         """A pong came at wall time ``t4``; all stamps in ns. One that answers no ping of ours says nothing."""
         sent = self._pings.pop(t1, None)
         if sent is None:
@@ -52,7 +52,7 @@ class LinkClock:
             # A wall clock was set in between: what we knew of the two is void.
             self._samples.clear()
             return None
-        sample = Sample(rtt, ((t2 - t1) + (t3 - t4)) / 2e9, now)
+        sample = ClockSample(rtt, ((t2 - t1) + (t3 - t4)) / 2e9, now)
         if self._samples and self._contradicts(sample):
             self._samples.clear()
         self._samples.append(sample)
@@ -64,11 +64,11 @@ class LinkClock:
         best = min(self._samples, key=lambda s: self._error(s, now), default=None)
         return None if best is None else (best.offset, self._error(best, now))
 
-    def _contradicts(self, sample: Sample) -> bool:
+    def _contradicts(self, sample: ClockSample) -> bool:
         """Whether two exchanges cannot both be true: a clock was set."""
         offset, error = self.estimate(sample.taken) or (sample.offset, 0.0)
         return abs(sample.offset - offset) > error + sample.rtt / 2 + 1e-6
 
     @staticmethod
-    def _error(sample: Sample, now: float) -> float:
+    def _error(sample: ClockSample, now: float) -> float:
         return sample.rtt / 2 + limits.CLOCK_DRIFT * max(0.0, now - sample.taken)

@@ -11,19 +11,28 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rmpa.resource.answer import Answer
-from rmpa.resource.declare import Resource, Wish, at_least, at_most, between, exactly
+from rmpa.resource.declare.answer import RequirementAnswer
+from rmpa.resource.declare.resource import QoSRequest, Resource, at_least, at_most, between, exactly
 
 if TYPE_CHECKING:
-    from rmpa.resource.aio.client import ResourceClient
+    from rmpa.resource.run.client import ResourceClient
 
-__all__ = ["Answer", "Resource", "ResourceClient", "Wish", "at_least", "at_most", "between", "exactly"]
+__all__ = [
+    "QoSRequest",
+    "RequirementAnswer",
+    "Resource",
+    "ResourceClient",
+    "at_least",
+    "at_most",
+    "between",
+    "exactly",
+]
 
 
 def __getattr__(name: str) -> object:
     """Load the client only where it is used: it brings asyncio and sockets."""
     if name == "ResourceClient":
-        from rmpa.resource.aio.client import ResourceClient  # noqa: PLC0415 - as said
+        from rmpa.resource.run.client import ResourceClient  # noqa: PLC0415 - as said
 
         return ResourceClient
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

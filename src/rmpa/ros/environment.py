@@ -17,7 +17,7 @@ from rmpa.core.names import is_legal_name, resolve_name
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from rmpa.ros.xmlrpc import XmlRpcValue
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 DEFAULT_MASTER_URI: Final = "http://localhost:11311"
 _URI: Final = re.compile(r"http://(?P<host>\[[0-9A-Fa-f:.]+\]|[^\s/:\[\]]+):(?P<port>[0-9]{1,5})/?")

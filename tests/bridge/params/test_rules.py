@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.bridge.params.rules import ParamPolicy, follow_rules, key_problem, leaves
-from rmpa.core.config import FollowRule, ParamSettings, TimeSettings
+from rmpa.config.settings import FollowRule, ParamSettings, TimeSettings
 
 if TYPE_CHECKING:
-    from rmpa.ros.xmlrpc import XmlRpcValue
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 POLICY = ParamPolicy(
     ParamSettings(

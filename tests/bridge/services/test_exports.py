@@ -14,21 +14,21 @@ from rmpa.bridge.messages import (
     ServiceOpened,
 )
 from rmpa.bridge.services.exports import (
-    About,
     EndRoute,
     LocalService,
     Probe,
     ServerGone,
     ServeRoute,
+    ServiceAbout,
     ServiceExports,
 )
+from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings
 from rmpa.core import limits
-from rmpa.core.config import PeerRule, PolicySettings, ServiceSettings
 from rmpa.core.errors import RemoteProtocolError
 from tests.bridge.services.test_rules import obey, rules
 
 ADD = LocalService("/adder", "rosrpc://127.0.0.1:5")
-ABOUT = About("a/Add", "6a2e34150c00229791cc89ff309fff21")
+ABOUT = ServiceAbout("a/Add", "6a2e34150c00229791cc89ff309fff21")
 ROUTE = limits.SERVICE_ROUTES + 1
 
 

@@ -13,7 +13,7 @@ from rmpa.bridge.messages import (
     ServiceOffer,
     ServiceOpened,
 )
-from rmpa.bridge.services.exports import About
+from rmpa.bridge.services.exports import ServiceAbout
 from rmpa.bridge.services.imports import (
     EndedService,
     ForgetAbout,
@@ -23,8 +23,8 @@ from rmpa.bridge.services.imports import (
     SessionState,
     Withdraw,
 )
+from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings
 from rmpa.core import limits
-from rmpa.core.config import PeerRule, PolicySettings, ServiceSettings
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from tests.bridge.services.test_rules import obey, rules
 
@@ -49,11 +49,11 @@ def imports() -> ServiceImports:
 def opened(imports: ServiceImports) -> None:
     assert imports.want(1, "/add", 0.0) == [Send(1, OpenService(ROUTE, "/add"))]
     assert imports.opened(1, ServiceOpened(ROUTE, REQUESTS, "a/Add", MD5)) == [
-        OpenedService(1, "/add", ROUTE, REQUESTS, About("a/Add", MD5))
+        OpenedService(1, "/add", ROUTE, REQUESTS, ServiceAbout("a/Add", MD5))
     ]
 
 
-def about(imports: ServiceImports) -> About | None:
+def about(imports: ServiceImports) -> ServiceAbout | None:
     remote = imports.get(1, "/add")
     assert remote is not None
     return remote.about
@@ -111,7 +111,7 @@ def test_an_opened_service_is_known_until_its_server_is_another_one(imports: Ser
     assert imports.want(1, "/add", 1.0) == [], "it is open"
     closing = imports.release(1, "/add")
     assert closing[0] == Send(1, CloseService(ROUTE))
-    assert about(imports) == About("a/Add", MD5)
+    assert about(imports) == ServiceAbout("a/Add", MD5)
     assert imports.advertised(1, offer("/add")) == [ForgetAbout(1, "/add")]
     assert about(imports) is None
     assert imports.want(1, "/add", 2.0) == [Send(1, OpenService(ROUTE + 2, "/add"))], "a route is never used again"
@@ -196,7 +196,7 @@ def test_names_here_are_made_by_the_peers_rules() -> None:
 
 
 def test_two_of_one_peer_that_would_have_one_name_here() -> None:
-    from rmpa.core.config import Remap
+    from rmpa.config.settings import Remap
 
     made = ServiceImports(rules(peers=(PeerRule("robot", remap_in=(Remap("/a", "/b"),)),)))
     made.link_up(1, "robot", 1)

@@ -21,13 +21,13 @@ from rmpa.bridge.messages import (
     encode,
 )
 from rmpa.bridge.services.exports import (
-    About,
     EndRoute,
     ExportAction,
     LocalService,
     Probe,
     ServerGone,
     ServeRoute,
+    ServiceAbout,
     ServiceExports,
 )
 from rmpa.bridge.services.imports import (
@@ -40,13 +40,13 @@ from rmpa.bridge.services.imports import (
     SessionState,
     Withdraw,
 )
+from rmpa.config.settings import ServiceSettings
 from rmpa.core import limits
-from rmpa.core.config import ServiceSettings
 from rmpa.core.errors import RemoteProtocolError
 from tests.bridge.services.test_rules import obey, rules
 
 SERVICES = ["/a", "/b", "/c"]
-ABOUT = About("a/Add", "6a2e34150c00229791cc89ff309fff21")
+ABOUT = ServiceAbout("a/Add", "6a2e34150c00229791cc89ff309fff21")
 OPEN, STRICT = rules(), rules(ServiceSettings(deny=("/b",)))
 
 

@@ -9,7 +9,7 @@ import pytest
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.rules import ServiceRules
-from rmpa.core.config import PeerRule, PolicySettings, ServiceRule, ServiceSettings
+from rmpa.config.settings import PeerRule, PolicySettings, ServiceRule, ServiceSettings
 
 if TYPE_CHECKING:
     from rmpa.bridge.services.exports import ServiceExports

@@ -22,7 +22,7 @@ from rmpa.experiments.nodes.node import (
     velocity_options,
 )
 from rmpa.experiments.nodes.own_ends import DATA, KIND, framed
-from rmpa.ros.messages import MessageType
+from rmpa.ros.types.messages import MessageType
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -17,12 +17,12 @@ from collections.abc import Callable, Iterator
 
 import psutil
 
-from rmpa.bridge.messages import Advertise, Description, Offer, Open, Opened, encode
+from rmpa.bridge.messages import Advertise, Description, OpenRoute, RouteOpened, TopicOffer, encode
 from rmpa.core import limits
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.discovery.beacon import Beacon, BeaconKind
-from rmpa.mesh.frames import Frame, Kind
+from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Hello
 
 RNG = random.Random(7)
@@ -95,11 +95,11 @@ class Link:
         self.sock.settimeout(5.0)
         self.data = b""
         identity = Identity(Guid.of(here, port), os.urandom(limits.INSTANCE_ID_BYTES), "eve", 0)
-        self.send(Kind.HELLO, Hello.of(identity, lease=60.0, expected=there).serialize())
+        self.send(FrameKind.HELLO, Hello.of(identity, lease=60.0, expected=there).serialize())
         answer = self.frame()
-        assert answer.kind is Kind.WELCOME, answer.payload
+        assert answer.kind is FrameKind.WELCOME, answer.payload
 
-    def send(self, kind: Kind, payload: bytes, route: int = 0) -> None:
+    def send(self, kind: FrameKind, payload: bytes, route: int = 0) -> None:
         """Send one frame."""
         self.sock.sendall(Frame(kind, payload, route, 1, 1).serialize())
 
@@ -117,8 +117,8 @@ class Link:
     def outlives(self) -> bool:
         """Whether the other side still answers; reads away what came before."""
         with contextlib.suppress(OSError, EOFError):
-            self.send(Kind.PING, b"")
-            while self.frame().kind is not Kind.PONG:
+            self.send(FrameKind.PING, b"")
+            while self.frame().kind is not FrameKind.PONG:
                 pass
             return True
         return False
@@ -130,42 +130,44 @@ def garbage(link: Link) -> None:
 
 def unknown_routes(link: Link) -> None:
     for route in range(10_000):
-        link.send(Kind.DATA, struct.pack("<I", 3) + b"abc", route)
+        link.send(FrameKind.DATA, struct.pack("<I", 3) + b"abc", route)
 
 
 def wrong_length(link: Link) -> None:
     """Offer a topic that somebody over there wants, and send what is not a message on its route."""
-    link.send(Kind.CONTROL, encode(Advertise((Offer("/evil", "/eve", "std_msgs/String"),), full=True)))
+    link.send(FrameKind.CONTROL, encode(Advertise((TopicOffer("/evil", "/eve", "std_msgs/String"),), full=True)))
     while True:
         frame = link.frame()
-        if frame.kind is Kind.CONTROL and json.loads(frame.payload)["op"] == "open":
+        if frame.kind is FrameKind.CONTROL and json.loads(frame.payload)["op"] == "open":
             break
-        if frame.kind is Kind.PING:
-            link.send(Kind.PONG, struct.pack(">QQ", frame.stamp_ns, frame.stamp_ns))
+        if frame.kind is FrameKind.PING:
+            link.send(FrameKind.PONG, struct.pack(">QQ", frame.stamp_ns, frame.stamp_ns))
     route = json.loads(frame.payload)["route"]
-    link.send(Kind.CONTROL, encode(Opened(route, Description("std_msgs/String", MD5, "string data\n", False))))
-    link.send(Kind.DATA, struct.pack("<I", 6) + struct.pack("<I", 2) + b"ok", route)
-    link.send(Kind.DATA, struct.pack("<I", 0xFFFFFF) + b"short", route)
+    link.send(
+        FrameKind.CONTROL, encode(RouteOpened(route, Description("std_msgs/String", MD5, "string data\n", False)))
+    )
+    link.send(FrameKind.DATA, struct.pack("<I", 6) + struct.pack("<I", 2) + b"ok", route)
+    link.send(FrameKind.DATA, struct.pack("<I", 0xFFFFFF) + b"short", route)
 
 
 def control(text: bytes) -> Callable[[Link], None]:
     def send(link: Link) -> None:
-        link.send(Kind.CONTROL, text)
+        link.send(FrameKind.CONTROL, text)
 
     return send
 
 
 def offer(topic: str, node: str = "/n", kind: str = "a/B") -> Callable[[Link], None]:
-    return control(encode(Advertise((Offer(topic, node, kind),), full=True)))
+    return control(encode(Advertise((TopicOffer(topic, node, kind),), full=True)))
 
 
 def huge_frame(link: Link) -> None:
-    link.sock.sendall(struct.pack(">IBBHIIQ", 0xFFFFFFFF, Kind.DATA, 3, 0, 1, 1, 1))
+    link.sock.sendall(struct.pack(">IBBHIIQ", 0xFFFFFFFF, FrameKind.DATA, 3, 0, 1, 1, 1))
 
 
 def opens_of_nothing(link: Link) -> None:
     """100,000 requests whose answers nobody reads."""
-    one = [Frame(Kind.CONTROL, encode(Open(n, "/none", "/none"))).serialize() for n in range(1, 1001)]
+    one = [Frame(FrameKind.CONTROL, encode(OpenRoute(n, "/none", "/none"))).serialize() for n in range(1, 1001)]
     for _ in range(100):
         link.sock.sendall(b"".join(one))
 
@@ -173,14 +175,16 @@ def opens_of_nothing(link: Link) -> None:
 def opens_of_one(link: Link) -> None:
     """100,000 requests for one real source: it must not be sent 100,000 times."""
     for start in range(1, 100_001, 1000):
-        many = (Open(n, "/to_b", "/speaker") for n in range(start, start + 1000))
-        link.sock.sendall(b"".join(Frame(Kind.CONTROL, encode(o)).serialize() for o in many))
+        many = (OpenRoute(n, "/to_b", "/speaker") for n in range(start, start + 1000))
+        link.sock.sendall(b"".join(Frame(FrameKind.CONTROL, encode(o)).serialize() for o in many))
     link.sock.settimeout(20.0)
 
 
 def many_nodes(link: Link) -> None:
     """Offer too much, and stay until it was taken in: that goes a little at a time."""
-    link.send(Kind.CONTROL, encode(Advertise(tuple(Offer("/many", f"/n{n}", "a/B") for n in range(16_000)))))
+    link.send(
+        FrameKind.CONTROL, encode(Advertise(tuple(TopicOffer("/many", f"/n{n}", "a/B") for n in range(16_000))))
+    )
     for _ in range(40):
         link.outlives()
         time.sleep(0.05)

@@ -7,11 +7,19 @@ import pytest
 
 from rmpa.core import limits
 from rmpa.ros.master.api import MasterApi
-from rmpa.ros.master.effects import Effect, GraphChange, GraphState, Kind, ParamUpdate, PublisherUpdate, Shutdown
-from rmpa.ros.xmlrpc import RosFault, XmlRpcValue, serialize_response
+from rmpa.ros.master.effects import (
+    Effect,
+    GraphChange,
+    GraphState,
+    ParamUpdate,
+    PublisherUpdate,
+    RegistrationKind,
+    Shutdown,
+)
+from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, serialize_response
 
 if TYPE_CHECKING:
-    from rmpa.ros.xmlrpc import Reply
+    from rmpa.ros.wire.xmlrpc import RosReply
 
 A, B, C = "http://a:1/", "http://b:2/", "http://c:3/"
 STRING = "std_msgs/String"
@@ -27,7 +35,7 @@ class Master:
         self.effects: list[Effect] = []
         self.changes: list[GraphChange] = []
 
-    def __call__(self, method: str, *params: XmlRpcValue) -> Reply:
+    def __call__(self, method: str, *params: XmlRpcValue) -> RosReply:
         reply = self.api.call(method, params)
         self.effects, self.changes = self.api.take()
         serialize_response(list(reply))  # whatever is answered can be said
@@ -49,7 +57,7 @@ def test_a_publisher_is_told_its_subscribers_and_they_of_it(master: Master) -> N
     assert master.effects == []
     assert master.value("registerPublisher", "/p", "/t", STRING, A) == [B]
     assert master.effects == [PublisherUpdate(B, "/t", (A,))]
-    assert master.changes == [GraphChange(Kind.PUBLISHER, True, "/t", "/p", A, STRING)]
+    assert master.changes == [GraphChange(RegistrationKind.PUBLISHER, True, "/t", "/p", A, STRING)]
 
 
 @pytest.mark.trap(32)
@@ -73,11 +81,11 @@ def test_a_new_type_is_a_change(master: Master) -> None:
     master("registerSubscriber", "/s", "/t", "*", B)
     assert master.value("getTopicTypes", "/x") == []
     master("registerSubscriber", "/s", "/t", STRING, B)
-    assert master.changes == [GraphChange(Kind.SUBSCRIBER, True, "/t", "/s", B, STRING)]
+    assert master.changes == [GraphChange(RegistrationKind.SUBSCRIBER, True, "/t", "/s", B, STRING)]
     master("registerPublisher", "/p", "/t", "*", A)
     assert master.value("getTopicTypes", "/x") == [["/t", STRING]]
     master("registerPublisher", "/p", "/t", "std_msgs/Int8", A)
-    assert master.changes == [GraphChange(Kind.PUBLISHER, True, "/t", "/p", A, "std_msgs/Int8")]
+    assert master.changes == [GraphChange(RegistrationKind.PUBLISHER, True, "/t", "/p", A, "std_msgs/Int8")]
 
 
 def test_a_withdrawn_publisher_leaves_the_list(master: Master) -> None:
@@ -128,7 +136,9 @@ def test_a_node_of_the_same_name_is_pushed_out(master: Master, taking: tuple[str
     gone = [change for change in master.changes if not change.added]
     assert master.value("lookupNode", "/x", "/twin") == C
     assert [(change.kind, change.name, change.api) for change in gone] == [
-        (Kind.PUBLISHER, "/t", A), (Kind.SUBSCRIBER, "/u", A), (Kind.SERVICE, "/s", A),
+        (RegistrationKind.PUBLISHER, "/t", A),
+        (RegistrationKind.SUBSCRIBER, "/u", A),
+        (RegistrationKind.SERVICE, "/s", A),
     ]  # fmt: skip
     master("setParam", "/x", "/p", 1)
     assert ParamUpdate(A, "/p/", 1) not in master.effects
@@ -182,7 +192,10 @@ def test_a_dead_node_is_purged_and_its_subscribers_told(master: Master) -> None:
     assert registrations.purge("/dead", A)
     effects, changes = master.api.take()
     assert effects == [PublisherUpdate(B, "/t", ())]
-    assert [(change.kind, change.added) for change in changes] == [(Kind.PUBLISHER, False), (Kind.SERVICE, False)]
+    assert [(change.kind, change.added) for change in changes] == [
+        (RegistrationKind.PUBLISHER, False),
+        (RegistrationKind.SERVICE, False),
+    ]
     assert master("lookupNode", "/x", "/dead").code == -1
     assert master("lookupService", "/x", "/srv")[0] == -1
     master("setParam", "/x", "/p", 1)

@@ -13,7 +13,7 @@ from rmpa.core import limits
 from rmpa.ros.master.awaited import NodeRecord
 from rmpa.ros.master.kept import NODE, PARAM, UnkeepableError, changed_params, packed, param_key, read
 from rmpa.ros.master.parameters import Parameters
-from rmpa.ros.xmlrpc_writer import legal_text
+from rmpa.ros.wire.xmlrpc_writer import legal_text
 
 if TYPE_CHECKING:
     from rmpa.ros.master.kept import Key

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.master.api import MasterApi
-from rmpa.ros.master.effects import GraphChange, Kind
+from rmpa.ros.master.effects import GraphChange, RegistrationKind
 from rmpa.ros.master.mirror import Call, Mirror, leftovers
 from rmpa.ros.master.survey import lookup_calls, read_lookups, read_survey, survey_calls
 
 if TYPE_CHECKING:
     from rmpa.ros.master.survey import Survey
-    from rmpa.ros.xmlrpc import XmlRpcValue
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 OURS: Final = "http://127.0.0.1:1/"
 THEIRS: Final = "http://127.0.0.1:2/"
@@ -86,7 +86,7 @@ def test_what_others_registered_is_learnt_with_types_and_places(pair: Pair) -> N
     pair.theirs("registerSubscriber", "/s", "/t", "*", MOVED)
     pair.theirs("registerService", "/p", "/srv", "rosrpc://h:9", THEIRS)
     assert pair.look() == []
-    assert GraphChange(Kind.PUBLISHER, True, "/t", "/p", THEIRS, STRING) in pair.mirror.take_changes()
+    assert GraphChange(RegistrationKind.PUBLISHER, True, "/t", "/p", THEIRS, STRING) in pair.mirror.take_changes()
     state = pair.mirror.state()
     assert state == pair.master.registrations.state()
     assert state.services == {"/srv": {"/p": "rosrpc://h:9"}}

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from rmpa.config.param_rules import SIM_TIME, overlap, untouchable
+from rmpa.config.settings import FollowRule, ParamSettings, TimeSettings
 from rmpa.core import limits
-from rmpa.core.config import FollowRule, ParamSettings, TimeSettings
-from rmpa.core.config_param import SIM_TIME, overlap, untouchable
 from rmpa.core.names import matches
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from rmpa.ros.xmlrpc import XmlRpcValue
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 _OF_OTHERS: Final = "it is followed from {owner} ([[param]]); ask or set it there"
 

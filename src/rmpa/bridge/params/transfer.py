@@ -1,8 +1,8 @@
 """How a parameter crosses in portions, and what two agents ask each other about parameters.
 
-Values cross as the text of an XML-RPC response (``ros.xmlrpc``), so that their types survive: JSON knows neither
-binary data nor dates. Each question of ``bridge.aio.asks`` carries at most ``limits.PARAM_PORTION`` characters of it,
-and the next is asked when the last was answered: megabytes hold up no command. ::
+Values cross as the text of an XML-RPC response (``ros.wire.xmlrpc``), so that their types survive: JSON knows neither
+binary data nor dates. Each question of ``bridge.session.peer_rpc`` carries at most ``limits.PARAM_PORTION``
+characters of it, and the next is asked when the last was answered: megabytes hold up no command. ::
 
     param.get {key}                       → {size, text, reading}     reading: 0, or the number for param.more
     param.names {}                        → likewise; a list of the names of all parameters that may be read

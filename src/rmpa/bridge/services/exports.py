@@ -1,6 +1,7 @@
 """Which services of the local graph the peers are told of, and which of them they have open to call.
 
-Sans-I/O, like ``bridge.exports`` for topics: the driver tells what the local graph provides, what peers ask for and
+Sans-I/O, like ``bridge.topics.exports`` for topics: the driver tells what the local graph provides, what peers ask
+for and
 what a server said of itself; it gets back actions. A peer opens a service once, however many clients it has there::
 
     open ──server known──► ServiceOpened, ServeRoute ──closed, gone, restarted──► EndRoute
@@ -27,8 +28,8 @@ from rmpa.bridge.messages import (
     is_crossing_name,
 )
 from rmpa.bridge.relay import may_have
+from rmpa.config.settings import LimitSettings
 from rmpa.core import limits
-from rmpa.core.config import LimitSettings
 from rmpa.core.errors import RemoteProtocolError
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class LocalService:
 
 
 @dataclass(frozen=True, slots=True)
-class About:
+class ServiceAbout:
     """What a server says of its service, as far as a peer must know it."""
 
     type: str
@@ -106,7 +107,7 @@ ExportAction = Send | Warn | Probe | ServeRoute | EndRoute | ServerGone
 
 
 @dataclass(slots=True)
-class _Session:
+class _ServiceSession:
     """One peer's wish to call a service.
 
     Args:
@@ -121,7 +122,7 @@ class _Session:
 
 
 @dataclass(slots=True)
-class _Peer:
+class _ServiceExportPeer:
     """One link.
 
     Args:
@@ -139,7 +140,7 @@ class _Peer:
     news: dict[str, None]
     told: dict[str, tuple[str, LocalService]] = field(default_factory=dict)
     wires: dict[str, str] = field(default_factory=dict)
-    sessions: dict[int, _Session] = field(default_factory=dict)
+    sessions: dict[int, _ServiceSession] = field(default_factory=dict)
     routes: int = 0
     beginning: bool = True
     instance: str = ""
@@ -166,8 +167,8 @@ class ServiceExports:
         self._too_many: OrderedDict[str, None] = OrderedDict()
         self._seen: dict[str, LocalService] = {}
         self._crossing: dict[str, LocalService] = {}
-        self._about: dict[str, About] = {}
-        self._peers: dict[int, _Peer] = {}
+        self._about: dict[str, ServiceAbout] = {}
+        self._peers: dict[int, _ServiceExportPeer] = {}
 
     @property
     def seen(self) -> Mapping[str, LocalService]:
@@ -184,7 +185,7 @@ class ServiceExports:
         """What is offered to no peer because there is too much (``limits.services``)."""
         return Beyond("services", self._most.services, len(self._too_many))
 
-    def about(self, service: str) -> About | None:
+    def about(self, service: str) -> ServiceAbout | None:
         """What is known of a service of ours."""
         return self._about.get(service)
 
@@ -272,7 +273,7 @@ class ServiceExports:
 
     def link_up(self, peer: int, name: str, instance: str = "") -> list[ExportAction]:
         """A link is up: ``tell`` begins with all we have, but for what came from that very run of the peer."""
-        self._peers[peer] = _Peer(name, dict.fromkeys(self._crossing), instance=instance)
+        self._peers[peer] = _ServiceExportPeer(name, dict.fromkeys(self._crossing), instance=instance)
         return [Send(peer, self._next(self._peers[peer], full=True))]
 
     def link_down(self, peer: int) -> list[ExportAction]:
@@ -292,7 +293,7 @@ class ServiceExports:
                     actions.append(Send(number, message))
         return actions
 
-    def _next(self, peer: _Peer, *, full: bool = False) -> AdvertiseServices:
+    def _next(self, peer: _ServiceExportPeer, *, full: bool = False) -> AdvertiseServices:
         added: list[ServiceOffer] = []
         removed: list[str] = []
         for service in tuple(islice(peer.news, limits.ADVERTISED_AT_ONCE)):
@@ -311,7 +312,7 @@ class ServiceExports:
         peer.beginning = peer.beginning and bool(peer.news)
         return AdvertiseServices(added=tuple(added), removed=tuple(removed), full=full, more=peer.beginning)
 
-    def _wire(self, peer: _Peer, service: str, server: LocalService) -> str | None:
+    def _wire(self, peer: _ServiceExportPeer, service: str, server: LocalService) -> str | None:
         """What a peer is to know a service by, if it may at all."""
         if server.origin is not None and not may_have(peer.instance, server.origin):
             return None
@@ -343,7 +344,7 @@ class ServiceExports:
         waiting = any(
             s.service == service and not s.requests for p in self._peers.values() for s in p.sessions.values()
         )
-        peer.sessions[message.route] = _Session(service, message.timeout)
+        peer.sessions[message.route] = _ServiceSession(service, message.timeout)
         if service in self._about:
             return self._start(service)
         return [] if waiting else [Probe(service, server)]
@@ -355,7 +356,7 @@ class ServiceExports:
             return []
         return [EndRoute(number, message.route, session.requests)]
 
-    def described(self, service: str, server: LocalService, about: About) -> list[ExportAction]:
+    def described(self, service: str, server: LocalService, about: ServiceAbout) -> list[ExportAction]:
         """A server has said what its service is."""
         if self._crossing.get(service) != server:
             return []  # it is another one by now
@@ -391,7 +392,7 @@ class ServiceExports:
                 ]
         return actions
 
-    def _drop(self, number: int, peer: _Peer, route: int, reason: str) -> list[ExportAction]:
+    def _drop(self, number: int, peer: _ServiceExportPeer, route: int, reason: str) -> list[ExportAction]:
         session = peer.sessions.pop(route)
         closed = Send(number, ServiceClosed(route, reason[: limits.CONTROL_TEXT_MAX]))
         return [EndRoute(number, route, session.requests), closed] if session.requests else [closed]

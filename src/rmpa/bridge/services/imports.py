@@ -1,6 +1,7 @@
 """Which services of the peers appear in the local graph, and which of them are open to be called.
 
-Sans-I/O, like ``bridge.imports`` for topics: the driver tells what peers say, what the local graph provides itself
+Sans-I/O, like ``bridge.topics.imports`` for topics: the driver tells what peers say, what the local graph provides
+itself
 and what somebody local wants to call; it gets back actions. A graph has one provider for each service, so of several
 one is shown: a local one always, else that of the peer with the lowest GUID; the others are hidden, with the reason,
 and come when it goes. Each service of each peer is in one state of this table::
@@ -31,10 +32,10 @@ from rmpa.bridge.messages import (
     ServiceOpened,
     is_crossing_name,
 )
-from rmpa.bridge.relay import Linked, Ways
-from rmpa.bridge.services.exports import About
+from rmpa.bridge.relay import LinkedPeer, RelayPaths
+from rmpa.bridge.services.exports import ServiceAbout
+from rmpa.config.settings import LimitSettings
 from rmpa.core import limits
-from rmpa.core.config import LimitSettings
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.core.guid import Guid
 
@@ -97,7 +98,7 @@ class OpenedService:
     service: str
     route: int
     requests: int
-    about: About
+    about: ServiceAbout
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,13 +151,13 @@ class RemoteService:
     route: int = 0
     requests: int = 0
     due: float = 0.0
-    about: About | None = None
+    about: ServiceAbout | None = None
     problem: str = ""
     origin: Origin | None = None
 
 
 @dataclass(slots=True)
-class _Peer:
+class _ServiceImportPeer:
     """What one run of a peer offers.
 
     Args:
@@ -196,8 +197,8 @@ class ServiceImports:
     def __init__(self, rules: ServiceRules, most: LimitSettings = _DEFAULT_LIMITS) -> None:
         self._rules = rules
         self._most = most
-        self._peers: dict[int, _Peer] = {}
-        self.ways = Ways()
+        self._peers: dict[int, _ServiceImportPeer] = {}
+        self.ways = RelayPaths()
         """By which of its ways each module is reached whose services relays offer."""
         self._local: dict[str, str] = {}
         # By the name here: who offers it.
@@ -240,12 +241,12 @@ class ServiceImports:
         known = self._peers.get(peer)
         if known is None:
             places: bounds.NodePlaces[str] = bounds.NodePlaces(self._most.nodes)
-            self._peers[peer] = _Peer(name, rank, places, bounds.Surplus(limits.SURPLUS_MAX))
+            self._peers[peer] = _ServiceImportPeer(name, rank, places, bounds.Surplus(limits.SURPLUS_MAX))
         else:
             known.away = False
             known.serial = -1
             known.rank = rank
-        return self._choose_of(self.ways.linked(peer, Linked(name, instance, Guid(rank)))) if instance else []
+        return self._choose_of(self.ways.linked(peer, LinkedPeer(name, instance, Guid(rank)))) if instance else []
 
     def unlinked(self, peer: int) -> list[ImportAction]:
         """Behind ``gone``: relays may bring on what the peer brought."""
@@ -318,7 +319,7 @@ class ServiceImports:
                 return
             yield self._offer(peer, known, offer)
 
-    def _offer(self, peer: int, known: _Peer, offer: ServiceOffer) -> list[ImportAction]:
+    def _offer(self, peer: int, known: _ServiceImportPeer, offer: ServiceOffer) -> list[ImportAction]:
         before = known.services.get(offer.service)
         actions: list[ImportAction] = []
         if before is not None and (before.node, before.origin) == (offer.node, offer.origin):
@@ -369,7 +370,7 @@ class ServiceImports:
             actions += self._choose_of({remote.origin.instance})
         return actions + self._next_in(known)
 
-    def _next_in(self, known: _Peer) -> list[ImportAction]:
+    def _next_in(self, known: _ServiceImportPeer) -> list[ImportAction]:
         """A node of a peer may have left its place to another one."""
         actions: list[ImportAction] = []
         for waiting in known.nodes.next_in():
@@ -420,7 +421,7 @@ class ServiceImports:
         local = self._local.get(service)
         seen: str | None = f"{local} of this module provides it itself" if local is not None else None
         new: tuple[int, RemoteService] | None = None
-        left: list[_Peer] = []
+        left: list[_ServiceImportPeer] = []
         actions: list[ImportAction] = []
         for number in sorted(claims, key=lambda number: (self._peers[number].rank, number)):
             remote = claims[number]
@@ -501,7 +502,7 @@ class ServiceImports:
         self._enter(remote, SessionState.OPEN)
         remote.requests = message.requests
         remote.problem = ""
-        remote.about = About(message.type, message.md5, message.request_type, message.response_type)
+        remote.about = ServiceAbout(message.type, message.md5, message.request_type, message.response_type)
         return [OpenedService(peer, remote.name, message.route, message.requests, remote.about)]
 
     def closed(self, peer: int, message: ServiceClosed) -> list[ImportAction]:

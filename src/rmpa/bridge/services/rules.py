@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.naming import Names
-from rmpa.bridge.policy import Decision, is_own
+from rmpa.bridge.policy import PolicyDecision, is_own
 from rmpa.core.names import matches
 
 if TYPE_CHECKING:
     from rmpa.bridge.policy import Policy
-    from rmpa.core.config import ServiceSettings
+    from rmpa.config.settings import ServiceSettings
 
 OWN_SERVICES: Final = "/rmpa/**"
 LOGGERS: Final = ("**/get_loggers", "**/set_logger_level")
@@ -31,24 +31,26 @@ class ServiceRules:
         self._policy = policy
         self._names = names if names is not None else Names()
 
-    def judge(self, service: str, node: str) -> Decision:
+    def judge(self, service: str, node: str) -> PolicyDecision:
         """Decide about one service, by its name here and its node; the first "no" wins."""
         settings = self._settings
         if is_own(node):
-            return Decision(False, f"{node} stands for a node of another module, or is the agent itself")
+            return PolicyDecision(False, f"{node} stands for a node of another module, or is the agent itself")
         if matches(OWN_SERVICES, service):
-            return Decision(False, "built in: the agent's own services stay home")
+            return PolicyDecision(False, "built in: the agent's own services stay home")
         if not settings.loggers and any(matches(pattern, service) for pattern in LOGGERS):
-            return Decision(False, "built in: a node's log is set at home; services.loggers = true lets it cross")
+            return PolicyDecision(
+                False, "built in: a node's log is set at home; services.loggers = true lets it cross"
+            )
         for pattern in settings.deny:
             if matches(pattern, service):
-                return Decision(False, f"services.deny has {pattern!r}")
+                return PolicyDecision(False, f"services.deny has {pattern!r}")
         for pattern in settings.allow:
             if matches(pattern, service):
-                return Decision(True, f"services.allow has {pattern!r}")
-        return Decision(False, f"no glob of services.allow fits {service}")
+                return PolicyDecision(True, f"services.allow has {pattern!r}")
+        return PolicyDecision(False, f"no glob of services.allow fits {service}")
 
-    def judge_for(self, peer: str, service: str, wire: str) -> Decision:
+    def judge_for(self, peer: str, service: str, wire: str) -> PolicyDecision:
         """Decide whether what ``judge`` lets cross may do so between us and one peer."""
         return self._policy.judge_for(peer, service, wire=wire)
 

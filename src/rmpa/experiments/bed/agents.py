@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rmpa.experiments.bed.namespaces import Host
-    from rmpa.monitor.snapshot import Snapshot
+    from rmpa.observe.snapshot import Snapshot
 
 RMPA: Final = Path(sys.executable).with_name("rmpa")
 _numbers = itertools.count(1)

@@ -19,7 +19,7 @@ from rmpa.core.errors import UnreachableError
 from rmpa.experiments.bed.agents import RMPA, Agent, last_link
 from rmpa.experiments.bed.processes import BedError, Deadline
 from rmpa.experiments.bed.ros import NODES, PYTHON, Ros, compiled, words
-from rmpa.monitor.aio.control_client import ControlClient, choose_agent
+from rmpa.observe.io.control_client import ControlClient, choose_agent
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rmpa.experiments.bed.processes import Process
     from rmpa.experiments.bed.system import Kind
     from rmpa.experiments.model import Client
-    from rmpa.monitor.snapshot import Snapshot
+    from rmpa.observe.snapshot import Snapshot
 
 _UP: Final = 30.0
 """Seconds until a node must have said ``up``."""

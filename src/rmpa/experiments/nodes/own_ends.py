@@ -8,12 +8,12 @@ import struct
 from typing import TYPE_CHECKING, Final
 
 from rmpa.experiments.nodes.node import Subscribers
-from rmpa.ros.aio.node import Node
+from rmpa.ros.node.node import Node
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from rmpa.ros.aio.node import Publisher
+    from rmpa.ros.node.node import Publisher
 
 KIND: Final = "std_msgs/UInt8MultiArray"
 _LAYOUT: Final = struct.Struct("<III")

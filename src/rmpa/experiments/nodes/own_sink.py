@@ -17,7 +17,7 @@ from rmpa.experiments.nodes.own_ends import DATA, KIND, run
 if TYPE_CHECKING:
     import asyncio
 
-    from rmpa.ros.aio.node import Node, Received
+    from rmpa.ros.node.node import Node, Received
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ from rmpa.experiments.nodes.node import say, serve_rounds, source_options
 from rmpa.experiments.nodes.own_ends import KIND, framed, run, watch
 
 if TYPE_CHECKING:
-    from rmpa.ros.aio.node import Node
+    from rmpa.ros.node.node import Node
 
 
 def main() -> None:

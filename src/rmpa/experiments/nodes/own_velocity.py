@@ -15,7 +15,7 @@ from rmpa.experiments.nodes.node import Newest, say, serve_polls, velocity_optio
 from rmpa.experiments.nodes.own_ends import KIND, run, watch
 
 if TYPE_CHECKING:
-    from rmpa.ros.aio.node import Node, Received
+    from rmpa.ros.node.node import Node, Received
 
 
 def main() -> None:

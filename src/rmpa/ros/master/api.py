@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.ros.master import parameters as params
 from rmpa.ros.master import validators as v
-from rmpa.ros.master.effects import Effect, GraphChange, GraphState, Kind
+from rmpa.ros.master.effects import Effect, GraphChange, GraphState, RegistrationKind
 from rmpa.ros.master.registrations import Registrations
 from rmpa.ros.master.resolution import with_slash
-from rmpa.ros.xmlrpc import Reply, RosFault, XmlRpcValue, brief
+from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, brief
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rmpa.core.breathing import Breathing
+    from rmpa.core.yielding import Yielder
 
 _log = logging.getLogger(__name__)
 
@@ -33,7 +33,7 @@ ERROR: Final = -1
 class _Method:
     """One method of the API: its parameters behind ``caller_id``, and the value of a reply that says no."""
 
-    function: Callable[..., Reply]
+    function: Callable[..., RosReply]
     parameters: tuple[tuple[str, v.Validator], ...]
     error_value: XmlRpcValue
 
@@ -48,9 +48,7 @@ class MasterApi:
         breathing: For what takes long in a graph of thousands, or with large parameters.
     """
 
-    def __init__(
-        self, uri: str, pid: int, on_shutdown: Callable[[str], None], *, breathing: Breathing = iter
-    ) -> None:
+    def __init__(self, uri: str, pid: int, on_shutdown: Callable[[str], None], *, breathing: Yielder = iter) -> None:
         self._breathing = breathing
         self.uri = uri
         self._pid = pid
@@ -66,7 +64,7 @@ class MasterApi:
         """The names of all methods, in order."""
         return sorted([*self._methods, "system.listMethods", "system.multicall"])
 
-    def call(self, method: str, arguments: Sequence[XmlRpcValue]) -> Reply:
+    def call(self, method: str, arguments: Sequence[XmlRpcValue]) -> RosReply:
         """Call a method of the Master or Parameter Server API.
 
         Args:
@@ -84,17 +82,17 @@ class MasterApi:
             raise RosFault(1, f"this master has no method {brief(method)}; system.listMethods names them")
         if len(arguments) != 1 + len(found.parameters):
             wanted = ", ".join(["caller_id", *(name for name, _ in found.parameters)])
-            return Reply(ERROR, f"{method} takes ({wanted}), not {len(arguments)} parameters", found.error_value)
+            return RosReply(ERROR, f"{method} takes ({wanted}), not {len(arguments)} parameters", found.error_value)
         caller_id, *rest = arguments
         if not isinstance(caller_id, str):
-            return Reply(ERROR, f"caller_id must be a string, not {brief(caller_id)}", found.error_value)
+            return RosReply(ERROR, f"caller_id must be a string, not {brief(caller_id)}", found.error_value)
         try:
             checked = [
                 check(value, name, caller_id) for (name, check), value in zip(found.parameters, rest, strict=True)
             ]
         except v.InvalidParameterError as error:
             _log.info("! %s: %s: %s", caller_id, method, error)
-            return Reply(ERROR, str(error), found.error_value)
+            return RosReply(ERROR, str(error), found.error_value)
         return found.function(caller_id, *checked)
 
     def answer(self, method: str, arguments: Sequence[XmlRpcValue]) -> XmlRpcValue:
@@ -140,136 +138,136 @@ class MasterApi:
 
     # --- the node's own API -----------------------------------------------------------------------------------
 
-    def _shutdown(self, caller_id: str, reason: XmlRpcValue) -> Reply:
+    def _shutdown(self, caller_id: str, reason: XmlRpcValue) -> RosReply:
         _log.warning("< %s asks this core to end: %s", caller_id, brief(reason))
         self._on_shutdown(f"{caller_id}: {brief(reason)}")
-        return Reply(SUCCESS, "the core ends", 0)
+        return RosReply(SUCCESS, "the core ends", 0)
 
-    def _get_uri(self, _caller_id: str) -> Reply:
-        return Reply(SUCCESS, "", self.uri)
+    def _get_uri(self, _caller_id: str) -> RosReply:
+        return RosReply(SUCCESS, "", self.uri)
 
-    def _get_pid(self, _caller_id: str) -> Reply:
-        return Reply(SUCCESS, "", self._pid)
+    def _get_pid(self, _caller_id: str) -> RosReply:
+        return RosReply(SUCCESS, "", self._pid)
 
     # --- parameters -------------------------------------------------------------------------------------------
 
-    def _delete_param(self, _caller_id: str, key: str) -> Reply:
+    def _delete_param(self, _caller_id: str, key: str) -> RosReply:
         try:
             self.parameters.delete(key)
         except KeyError:
-            return Reply(ERROR, f"there is no parameter {key} to delete", 0)
+            return RosReply(ERROR, f"there is no parameter {key} to delete", 0)
         self.registrations.effects += params.updates(self.registrations.param_subscribers(), key, {})
-        return Reply(SUCCESS, f"deleted {key}", 0)
+        return RosReply(SUCCESS, f"deleted {key}", 0)
 
-    def _set_param(self, caller_id: str, key: str, value: XmlRpcValue) -> Reply:
+    def _set_param(self, caller_id: str, key: str, value: XmlRpcValue) -> RosReply:
         if params.holds_nil(value, self._breathing):
             text = "value is nil or contains one, which ROS does not have"
             _log.info("! %s: setParam: %s", caller_id, text)
-            return Reply(ERROR, text, 0)
+            return RosReply(ERROR, text, 0)
         try:
             self.parameters.set(key, value)
         except TypeError as error:
-            return Reply(ERROR, str(error), 0)
+            return RosReply(ERROR, str(error), 0)
         subscribers = self.registrations.param_subscribers()
         self.registrations.effects += params.updates(subscribers, key, value, caller_id, self._breathing)
-        return Reply(SUCCESS, f"set {key}", 0)
+        return RosReply(SUCCESS, f"set {key}", 0)
 
-    def _get_param(self, _caller_id: str, key: str) -> Reply:
+    def _get_param(self, _caller_id: str, key: str) -> RosReply:
         try:
-            return Reply(SUCCESS, f"the value of {key}", self.parameters.get(key))
+            return RosReply(SUCCESS, f"the value of {key}", self.parameters.get(key))
         except KeyError:
-            return Reply(ERROR, f"there is no parameter {key}", 0)
+            return RosReply(ERROR, f"there is no parameter {key}", 0)
 
-    def _search_param(self, caller_id: str, key: str) -> Reply:
+    def _search_param(self, caller_id: str, key: str) -> RosReply:
         try:
             found = self.parameters.search(caller_id, key)
         except ValueError as error:
-            return Reply(FAILURE, str(error), 0)
+            return RosReply(FAILURE, str(error), 0)
         if found is None:
-            return Reply(ERROR, f"there is no {key} in {caller_id} or above", "")
-        return Reply(SUCCESS, f"found {found}", found)
+            return RosReply(ERROR, f"there is no {key} in {caller_id} or above", "")
+        return RosReply(SUCCESS, f"found {found}", found)
 
-    def _subscribe_param(self, caller_id: str, api: str, key: str) -> Reply:
+    def _subscribe_param(self, caller_id: str, api: str, key: str) -> RosReply:
         value = self.parameters.get(key) if self.parameters.has(key) else {}
         self.registrations.subscribe_param(with_slash(key), caller_id, api)
-        return Reply(SUCCESS, f"subscribed to parameter {key}", value)
+        return RosReply(SUCCESS, f"subscribed to parameter {key}", value)
 
-    def _unsubscribe_param(self, caller_id: str, api: str, key: str) -> Reply:
-        self.registrations.unregister(Kind.PARAM, with_slash(key), caller_id, api)
+    def _unsubscribe_param(self, caller_id: str, api: str, key: str) -> RosReply:
+        self.registrations.unregister(RegistrationKind.PARAM, with_slash(key), caller_id, api)
         # Whether it was subscribed or not: rosmaster says 1.
-        return Reply(SUCCESS, f"not subscribed to parameter {key}", 1)
+        return RosReply(SUCCESS, f"not subscribed to parameter {key}", 1)
 
-    def _has_param(self, _caller_id: str, key: str) -> Reply:
+    def _has_param(self, _caller_id: str, key: str) -> RosReply:
         # The name is the status: clients of old look there.
-        return Reply(SUCCESS, key, self.parameters.has(key))
+        return RosReply(SUCCESS, key, self.parameters.has(key))
 
-    def _get_param_names(self, _caller_id: str) -> Reply:
-        return Reply(SUCCESS, "the names of all parameters", list(self._breathing(self.parameters.names())))
+    def _get_param_names(self, _caller_id: str) -> RosReply:
+        return RosReply(SUCCESS, "the names of all parameters", list(self._breathing(self.parameters.names())))
 
     # --- services ---------------------------------------------------------------------------------------------
 
-    def _register_service(self, caller_id: str, service: str, uri: str, api: str) -> Reply:
+    def _register_service(self, caller_id: str, service: str, uri: str, api: str) -> RosReply:
         self.registrations.register_service(service, uri, caller_id, api)
-        return Reply(SUCCESS, f"{caller_id} provides {service}", 1)
+        return RosReply(SUCCESS, f"{caller_id} provides {service}", 1)
 
-    def _unregister_service(self, caller_id: str, service: str, uri: str) -> Reply:
+    def _unregister_service(self, caller_id: str, service: str, uri: str) -> RosReply:
         found = self.registrations.unregister_service(service, uri, caller_id)
         return _unregistered(caller_id, service, found=found)
 
-    def _lookup_service(self, _caller_id: str, service: str) -> Reply:
+    def _lookup_service(self, _caller_id: str, service: str) -> RosReply:
         uri = self.registrations.service_uri(service)
         if uri is None:
-            return Reply(ERROR, f"nobody provides {service}", "")
-        return Reply(SUCCESS, f"the provider of {service}", uri)
+            return RosReply(ERROR, f"nobody provides {service}", "")
+        return RosReply(SUCCESS, f"the provider of {service}", uri)
 
     # --- topics -----------------------------------------------------------------------------------------------
 
-    def _register_subscriber(self, caller_id: str, topic: str, topic_type: str, api: str) -> Reply:
+    def _register_subscriber(self, caller_id: str, topic: str, topic_type: str, api: str) -> RosReply:
         self.registrations.register_subscriber(topic, topic_type, caller_id, api)
-        publishers = self.registrations.apis(Kind.PUBLISHER, topic)
-        return Reply(SUCCESS, f"{caller_id} subscribes to {topic}", publishers)
+        publishers = self.registrations.apis(RegistrationKind.PUBLISHER, topic)
+        return RosReply(SUCCESS, f"{caller_id} subscribes to {topic}", publishers)
 
-    def _unregister_subscriber(self, caller_id: str, topic: str, api: str) -> Reply:
-        found = self.registrations.unregister(Kind.SUBSCRIBER, topic, caller_id, api)
+    def _unregister_subscriber(self, caller_id: str, topic: str, api: str) -> RosReply:
+        found = self.registrations.unregister(RegistrationKind.SUBSCRIBER, topic, caller_id, api)
         return _unregistered(caller_id, topic, found=found)
 
-    def _register_publisher(self, caller_id: str, topic: str, topic_type: str, api: str) -> Reply:
+    def _register_publisher(self, caller_id: str, topic: str, topic_type: str, api: str) -> RosReply:
         self.registrations.register_publisher(topic, topic_type, caller_id, api)
-        subscribers = self.registrations.apis(Kind.SUBSCRIBER, topic)
-        return Reply(SUCCESS, f"{caller_id} publishes {topic}", subscribers)
+        subscribers = self.registrations.apis(RegistrationKind.SUBSCRIBER, topic)
+        return RosReply(SUCCESS, f"{caller_id} publishes {topic}", subscribers)
 
-    def _unregister_publisher(self, caller_id: str, topic: str, api: str) -> Reply:
-        found = self.registrations.unregister(Kind.PUBLISHER, topic, caller_id, api)
+    def _unregister_publisher(self, caller_id: str, topic: str, api: str) -> RosReply:
+        found = self.registrations.unregister(RegistrationKind.PUBLISHER, topic, caller_id, api)
         return _unregistered(caller_id, topic, found=found)
 
     # --- the graph --------------------------------------------------------------------------------------------
 
-    def _lookup_node(self, _caller_id: str, node: str) -> Reply:
+    def _lookup_node(self, _caller_id: str, node: str) -> RosReply:
         api = self.registrations.node_api(node)
         if api is None:
-            return Reply(ERROR, f"no node {node} is registered here", "")
-        return Reply(SUCCESS, f"the API of {node}", api)
+            return RosReply(ERROR, f"no node {node} is registered here", "")
+        return RosReply(SUCCESS, f"the API of {node}", api)
 
-    def _get_published_topics(self, _caller_id: str, subgraph: str) -> Reply:
+    def _get_published_topics(self, _caller_id: str, subgraph: str) -> RosReply:
         prefix = subgraph if not subgraph or subgraph.endswith("/") else f"{subgraph}/"
         types = self.registrations.types()
         published = self._breathing(self.registrations.published())
         found = [[topic, types[topic]] for topic in published if topic.startswith(prefix)]
-        return Reply(SUCCESS, "the topics that somebody publishes", found)
+        return RosReply(SUCCESS, "the topics that somebody publishes", found)
 
-    def _get_topic_types(self, _caller_id: str) -> Reply:
+    def _get_topic_types(self, _caller_id: str) -> RosReply:
         types = self._breathing(list(self.registrations.types().items()))
-        return Reply(SUCCESS, "the topics and their types", [list(item) for item in types])
+        return RosReply(SUCCESS, "the topics and their types", [list(item) for item in types])
 
-    def _get_system_state(self, _caller_id: str) -> Reply:
+    def _get_system_state(self, _caller_id: str) -> RosReply:
         tables: list[XmlRpcValue] = []
-        for kind in (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE):
+        for kind in (RegistrationKind.PUBLISHER, RegistrationKind.SUBSCRIBER, RegistrationKind.SERVICE):
             providers = self._breathing(self.registrations.providers(kind))
             tables.append([[key, list(nodes)] for key, nodes in providers])
-        return Reply(SUCCESS, "publishers, subscribers and services", tables)
+        return RosReply(SUCCESS, "publishers, subscribers and services", tables)
 
     def _table(self) -> dict[str, _Method]:
-        def method(function: Callable[..., Reply], error_value: XmlRpcValue, **parameters: v.Validator) -> _Method:
+        def method(function: Callable[..., RosReply], error_value: XmlRpcValue, **parameters: v.Validator) -> _Method:
             return _Method(function, tuple(parameters.items()), error_value)
 
         return {
@@ -304,7 +302,7 @@ class MasterApi:
         }
 
 
-def _unregistered(caller_id: str, name: str, *, found: bool) -> Reply:
+def _unregistered(caller_id: str, name: str, *, found: bool) -> RosReply:
     if found:
-        return Reply(SUCCESS, f"{caller_id} is no longer registered for {name}", 1)
-    return Reply(SUCCESS, f"{caller_id} was not registered for {name} with that URI", 0)
+        return RosReply(SUCCESS, f"{caller_id} is no longer registered for {name}", 1)
+    return RosReply(SUCCESS, f"{caller_id} was not registered for {name} with that URI", 0)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from rmpa.ros.master.effects import Kind
+from rmpa.ros.master.effects import RegistrationKind
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -33,16 +33,16 @@ class NodeRecord(msgspec.Struct, omit_defaults=True):
         """As JSON."""
         return msgspec.json.encode(self)
 
-    def of(self, kind: Kind) -> dict[str, str] | dict[str, None]:
+    def of(self, kind: RegistrationKind) -> dict[str, str] | dict[str, None]:
         """What it registered of one kind."""
         match kind:
-            case Kind.PUBLISHER:
+            case RegistrationKind.PUBLISHER:
                 return self.publishers
-            case Kind.SUBSCRIBER:
+            case RegistrationKind.SUBSCRIBER:
                 return self.subscribers
-            case Kind.SERVICE:
+            case RegistrationKind.SERVICE:
                 return self.services
-            case Kind.PARAM:
+            case RegistrationKind.PARAM:
                 return self.params
 
 
@@ -76,13 +76,13 @@ class Awaited:
             self._forget_publisher(topic, node)
         return record
 
-    def withdraw(self, kind: Kind, key: str, node: str, api: str) -> bool:
+    def withdraw(self, kind: RegistrationKind, key: str, node: str, api: str) -> bool:
         """Take one registration away, if ``api`` is that node's; whether it was there."""
         record = self._records.get(node)
         if record is None or record.api != api or key not in record.of(kind):
             return False
         del record.of(kind)[key]
-        if kind is Kind.PUBLISHER:
+        if kind is RegistrationKind.PUBLISHER:
             self._forget_publisher(key, node)
         return True
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 if TYPE_CHECKING:
-    from rmpa.ros.xmlrpc import XmlRpcValue
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Shutdown:
 Effect: TypeAlias = PublisherUpdate | ParamUpdate | Shutdown
 
 
-class Kind(enum.Enum):
+class RegistrationKind(enum.Enum):
     """What a node registered."""
 
     PUBLISHER = "publisher"
@@ -65,7 +65,7 @@ class GraphChange:
         type: The topic's type as far as known: ``pkg/Name``, ``*`` or empty; empty for services.
     """
 
-    kind: Kind
+    kind: RegistrationKind
     added: bool
     name: str
     node: str

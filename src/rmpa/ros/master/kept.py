@@ -19,16 +19,16 @@ import msgspec
 
 from rmpa.core import limits
 from rmpa.ros.master.awaited import NodeRecord
-from rmpa.ros.master.effects import Kind
-from rmpa.ros.xmlrpc import brief
-from rmpa.ros.xmlrpc_writer import legal_text
+from rmpa.ros.master.effects import RegistrationKind
+from rmpa.ros.wire.xmlrpc import brief
+from rmpa.ros.wire.xmlrpc_writer import legal_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-    from rmpa.core.breathing import Breathing
+    from rmpa.core.yielding import Yielder
     from rmpa.ros.master.parameters import Tree
-    from rmpa.ros.xmlrpc import XmlRpcValue
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 NODE: Final = "node"
 PARAM: Final = "param"
@@ -52,7 +52,7 @@ class UnkeepableError(Exception):
 
 
 @dataclass(slots=True)
-class Kept:
+class StoredRegistrations:
     """What the rows of a file say.
 
     Args:
@@ -116,7 +116,7 @@ def _leaves(path: Path, tree: Mapping[str, Any]) -> Iterator[Path]:
                 yield (*above, name)
 
 
-def packed(value: XmlRpcValue, breathing: Breathing = iter) -> bytes:
+def packed(value: XmlRpcValue, breathing: Yielder = iter) -> bytes:
     """A parameter's value as MessagePack.
 
     Raises:
@@ -171,9 +171,9 @@ _unpack = msgspec.msgpack.Decoder(ext_hook=_unpacked_ext).decode
 # --- reading --------------------------------------------------------------------------------------------------
 
 
-def read(rows: Iterable[Row]) -> Kept:
+def read(rows: Iterable[Row]) -> StoredRegistrations:
     """What was kept. Rows that are damaged, or say what no node could have said, are named in ``lost``."""
-    kept = Kept()
+    kept = StoredRegistrations()
     for kind, name, value in rows:
         try:
             match kind:
@@ -196,7 +196,7 @@ def _node(name: str, row: bytes) -> NodeRecord:
     if not record.api.startswith("http://"):
         raise ValueError(f"{brief(record.api)} is no URI of a slave API")
     _check_text(name + record.api)
-    for kind in Kind:
+    for kind in RegistrationKind:
         for key, value in record.of(kind).items():
             _check_text(f"{key} {value}")
     return record

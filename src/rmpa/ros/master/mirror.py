@@ -9,32 +9,32 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from rmpa.ros.master.effects import GraphChange, GraphState, Kind
+from rmpa.ros.master.effects import GraphChange, GraphState, RegistrationKind
 from rmpa.ros.master.registrations import ANY_TYPE, Registrations
-from rmpa.ros.xmlrpc import Reply, XmlRpcValue, brief
+from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue, brief
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from rmpa.core.breathing import Breathing
+    from rmpa.core.yielding import Yielder
     from rmpa.ros.master.survey import Survey
 
 Call: TypeAlias = tuple[str, tuple[XmlRpcValue, ...]]
 """A method of the Master API and its parameters."""
-Entry: TypeAlias = tuple[Kind, str, str]
+Entry: TypeAlias = tuple[RegistrationKind, str, str]
 """One registration: its kind, the topic, service or parameter, and the node."""
 
 _REGISTER: Final = {
-    "registerPublisher": Kind.PUBLISHER,
-    "registerSubscriber": Kind.SUBSCRIBER,
-    "registerService": Kind.SERVICE,
-    "subscribeParam": Kind.PARAM,
+    "registerPublisher": RegistrationKind.PUBLISHER,
+    "registerSubscriber": RegistrationKind.SUBSCRIBER,
+    "registerService": RegistrationKind.SERVICE,
+    "subscribeParam": RegistrationKind.PARAM,
 }
 _UNREGISTER: Final = {
-    "unregisterPublisher": Kind.PUBLISHER,
-    "unregisterSubscriber": Kind.SUBSCRIBER,
-    "unregisterService": Kind.SERVICE,
-    "unsubscribeParam": Kind.PARAM,
+    "unregisterPublisher": RegistrationKind.PUBLISHER,
+    "unregisterSubscriber": RegistrationKind.SUBSCRIBER,
+    "unregisterService": RegistrationKind.SERVICE,
+    "unsubscribeParam": RegistrationKind.PARAM,
 }
 REGISTRATIONS: Final = frozenset({*_REGISTER, *_UNREGISTER})
 """The methods that ``Mirror.apply`` takes."""
@@ -56,7 +56,7 @@ class Mirror:
         breathing: For surveys of thousands of topics.
     """
 
-    def __init__(self, *, breathing: Breathing = iter) -> None:
+    def __init__(self, *, breathing: Yielder = iter) -> None:
         self._breathing = breathing
         self._known = Registrations()
         self._own: dict[Entry, _Own] = {}
@@ -87,7 +87,7 @@ class Mirror:
 
     def publishers(self, topic: str) -> Mapping[str, str]:
         """The nodes that publish a topic, and their slave APIs."""
-        return self._known.at(Kind.PUBLISHER, topic)
+        return self._known.at(RegistrationKind.PUBLISHER, topic)
 
     def type_of(self, topic: str) -> str:
         """The type of a topic; ``*`` for none."""
@@ -114,7 +114,7 @@ class Mirror:
 
     # --- our own registrations --------------------------------------------------------------------------------
 
-    def apply(self, method: str, params: Sequence[XmlRpcValue]) -> Reply:
+    def apply(self, method: str, params: Sequence[XmlRpcValue]) -> RosReply:
         """Register or unregister something of ours, one of ``REGISTRATIONS``; the master is to be told by the caller.
 
         Returns:
@@ -126,20 +126,20 @@ class Mirror:
             return self._register(_REGISTER[method], method, words)
         if method in _UNREGISTER and len(words) == len(params) == _ARITY[method]:
             return self._unregister(_UNREGISTER[method], words)
-        return Reply(-1, f"{method} does not take {brief(params)}", 0)
+        return RosReply(-1, f"{method} does not take {brief(params)}", 0)
 
-    def _register(self, kind: Kind, method: str, words: list[str]) -> Reply:
+    def _register(self, kind: RegistrationKind, method: str, words: list[str]) -> RosReply:
         value: XmlRpcValue = 1
         match kind, words:
-            case Kind.PUBLISHER, [node, key, type_name, api]:
+            case RegistrationKind.PUBLISHER, [node, key, type_name, api]:
                 self._known.register_publisher(key, type_name, node, api)
                 undo: Call = "unregisterPublisher", (node, key, api)
-                value = self._known.apis(Kind.SUBSCRIBER, key)
-            case Kind.SUBSCRIBER, [node, key, type_name, api]:
+                value = self._known.apis(RegistrationKind.SUBSCRIBER, key)
+            case RegistrationKind.SUBSCRIBER, [node, key, type_name, api]:
                 self._known.register_subscriber(key, type_name, node, api)
                 undo = "unregisterSubscriber", (node, key, api)
-                value = self._known.apis(Kind.PUBLISHER, key)
-            case Kind.SERVICE, [node, key, uri, api]:
+                value = self._known.apis(RegistrationKind.PUBLISHER, key)
+            case RegistrationKind.SERVICE, [node, key, uri, api]:
                 self._known.register_service(key, uri, node, api)
                 undo = "unregisterService", (node, key, uri)
             case _, [node, api, key]:
@@ -148,16 +148,16 @@ class Mirror:
                 raise AssertionError(words)
         self._touched[kind, key, node] = self._asked
         self._own[kind, key, node] = _Own((method, tuple(words)), api, undo)
-        return Reply(1, "will be registered", value)
+        return RosReply(1, "will be registered", value)
 
-    def _unregister(self, kind: Kind, words: list[str]) -> Reply:
-        node, key = (words[0], words[2]) if kind is Kind.PARAM else (words[0], words[1])
+    def _unregister(self, kind: RegistrationKind, words: list[str]) -> RosReply:
+        node, key = (words[0], words[2]) if kind is RegistrationKind.PARAM else (words[0], words[1])
         self._touched[kind, key, node] = self._asked
         own = self._own.get((kind, key, node))
         if own is None or own.undo[1] != tuple(words):
-            return Reply(1, f"{node} is not registered for {key}", 0)
+            return RosReply(1, f"{node} is not registered for {key}", 0)
         self._forget(kind, key, node)
-        return Reply(1, "will be unregistered", 1)
+        return RosReply(1, "will be unregistered", 1)
 
     def forget(self, call: Call) -> None:
         """The master does not take this registration of ours: it is none."""
@@ -165,11 +165,11 @@ class Mirror:
             if own.call == call:
                 self._forget(*entry)
 
-    def _forget(self, kind: Kind, key: str, node: str) -> None:
+    def _forget(self, kind: RegistrationKind, key: str, node: str) -> None:
         own = self._own.pop((kind, key, node))
-        if kind is Kind.SERVICE:
+        if kind is RegistrationKind.SERVICE:
             self._known.unregister_service(key, str(own.undo[1][2]), node)
-        elif kind is not Kind.PARAM:
+        elif kind is not RegistrationKind.PARAM:
             self._known.unregister(kind, key, node, own.api)
 
     # --- the others -------------------------------------------------------------------------------------------
@@ -236,23 +236,25 @@ class Mirror:
 
     def _own_params(self) -> list[Call]:
         """A survey does not show who follows parameters, so a new master is told of all."""
-        return [own.call for (kind, _, _), own in self._own.items() if kind is Kind.PARAM]
+        return [own.call for (kind, _, _), own in self._own.items() if kind is RegistrationKind.PARAM]
 
-    def _drop_gone(self, kind: Kind, table: Mapping[str, Sequence[str]], passed: set[str], survey: Survey) -> None:
+    def _drop_gone(
+        self, kind: RegistrationKind, table: Mapping[str, Sequence[str]], passed: set[str], survey: Survey
+    ) -> None:
         for key, nodes in self._breathing(self._known.providers(kind)):
             there = table.get(key, ())
             for node, api in nodes.items():
                 if node in passed or self._orphans.get(node) == api:
                     continue
                 if node not in there or survey.uris.get(node) != api:
-                    if kind is Kind.SERVICE:
+                    if kind is RegistrationKind.SERVICE:
                         uri = self._known.service_uri(key)
                         self._known.unregister_service(key, uri or "", node)
                     else:
                         self._known.unregister(kind, key, node, api)
 
     def _add_new(
-        self, kind: Kind, table: Mapping[str, Sequence[str]], passed: set[str], survey: Survey, seen: int
+        self, kind: RegistrationKind, table: Mapping[str, Sequence[str]], passed: set[str], survey: Survey, seen: int
     ) -> None:
         for key, nodes in self._breathing(table.items()):
             for node in nodes:
@@ -261,18 +263,18 @@ class Mirror:
                     continue
                 known = self._known.at(kind, key).get(node) == api
                 match kind:
-                    case Kind.PUBLISHER if not known:
+                    case RegistrationKind.PUBLISHER if not known:
                         self._known.register_publisher(key, survey.types.get(key, ANY_TYPE), node, api)
-                    case Kind.SUBSCRIBER if not known:
+                    case RegistrationKind.SUBSCRIBER if not known:
                         self._known.register_subscriber(key, survey.types.get(key, ANY_TYPE), node, api)
-                    case Kind.SERVICE if key in survey.services:
+                    case RegistrationKind.SERVICE if key in survey.services:
                         self._take_service(key, survey.services[key], node, api, seen)
 
     def _take_service(self, service: str, uri: str, node: str, api: str, seen: int) -> None:
-        if self._known.service_uri(service) == uri and node in self._known.at(Kind.SERVICE, service):
+        if self._known.service_uri(service) == uri and node in self._known.at(RegistrationKind.SERVICE, service):
             return
-        for ours in tuple(self._known.at(Kind.SERVICE, service)):
-            entry = Kind.SERVICE, service, ours
+        for ours in tuple(self._known.at(RegistrationKind.SERVICE, service)):
+            entry = RegistrationKind.SERVICE, service, ours
             if entry in self._own:
                 if self._touched.get(entry, 0) > seen:
                     return
@@ -286,20 +288,20 @@ class Mirror:
         for topic, type_name in self._breathing(survey.types.items()):
             if types.get(topic) == type_name or type_name == ANY_TYPE:
                 continue
-            for node, api in self._known.at(Kind.PUBLISHER, topic).items():
+            for node, api in self._known.at(RegistrationKind.PUBLISHER, topic).items():
                 if node not in passed:
                     self._known.register_publisher(topic, type_name, node, api)
-            if topic not in types and (nodes := self._known.at(Kind.SUBSCRIBER, topic)):
+            if topic not in types and (nodes := self._known.at(RegistrationKind.SUBSCRIBER, topic)):
                 node, api = next(iter(nodes.items()))
                 self._known.register_subscriber(topic, type_name, node, api)
 
     def _missing(self, survey: Survey, seen: int, ignored: Mapping[str, str]) -> list[Call]:
         again = []
         for (kind, key, node), own in self._breathing(list(self._own.items())):
-            if kind is Kind.PARAM or self._touched.get((kind, key, node), 0) > seen or node in ignored:
+            if kind is RegistrationKind.PARAM or self._touched.get((kind, key, node), 0) > seen or node in ignored:
                 continue
             there = node in survey.holders[kind].get(key, ()) and survey.uris.get(node) == own.api
-            if not there or (kind is Kind.SERVICE and survey.services.get(key) != own.undo[1][2]):
+            if not there or (kind is RegistrationKind.SERVICE and survey.services.get(key) != own.undo[1][2]):
                 again.append(own.call)
         return again
 
@@ -314,7 +316,7 @@ class Mirror:
         return again
 
 
-def leftovers(survey: Survey, nodes: Mapping[str, str], breathing: Breathing = iter) -> Iterator[tuple[Call, Entry]]:
+def leftovers(survey: Survey, nodes: Mapping[str, str], breathing: Yielder = iter) -> Iterator[tuple[Call, Entry]]:
     """Everything that a master has of some nodes, and what takes it away.
 
     Args:
@@ -329,9 +331,9 @@ def leftovers(survey: Survey, nodes: Mapping[str, str], breathing: Breathing = i
                     continue
                 entry = kind, key, node
                 match kind:
-                    case Kind.PUBLISHER:
+                    case RegistrationKind.PUBLISHER:
                         yield ("unregisterPublisher", (node, key, nodes[node])), entry
-                    case Kind.SUBSCRIBER:
+                    case RegistrationKind.SUBSCRIBER:
                         yield ("unregisterSubscriber", (node, key, nodes[node])), entry
                     case _:
                         yield ("unregisterService", (node, key, survey.services.get(key, ""))), entry

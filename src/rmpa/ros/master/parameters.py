@@ -14,8 +14,8 @@ from rmpa.ros.master.resolution import join, with_slash
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from rmpa.core.breathing import Breathing
-    from rmpa.ros.xmlrpc import XmlRpcValue
+    from rmpa.core.yielding import Yielder
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 Tree: TypeAlias = "dict[str, XmlRpcValue]"
 
@@ -48,7 +48,7 @@ def _without(tree: Tree, parts: list[str]) -> Tree:
     return copy
 
 
-def holds_nil(value: XmlRpcValue, breathing: Breathing = iter) -> bool:
+def holds_nil(value: XmlRpcValue, breathing: Yielder = iter) -> bool:
     """Whether there is a nil in a value, at any depth; ROS has none, and it could not be written again."""
     return any(part is None for part in breathing(_all_parts(value)))
 
@@ -177,7 +177,7 @@ def updates(
     key: str,
     value: XmlRpcValue,
     setter: str | None = None,
-    breathing: Breathing = iter,
+    breathing: Yielder = iter,
 ) -> list[ParamUpdate]:
     """Who is to be told what after a parameter was set or deleted.
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from rmpa.ros.master.awaited import Awaited, NodeRecord
-from rmpa.ros.master.effects import Effect, GraphChange, GraphState, Kind, PublisherUpdate, Shutdown
+from rmpa.ros.master.effects import Effect, GraphChange, GraphState, PublisherUpdate, RegistrationKind, Shutdown
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,7 +24,9 @@ class _Node:
     """One node: where its slave API is, and what it registered (dicts, for their order)."""
 
     api: str
-    keys: dict[Kind, dict[str, None]] = field(default_factory=lambda: {kind: {} for kind in Kind})
+    keys: dict[RegistrationKind, dict[str, None]] = field(
+        default_factory=lambda: {kind: {} for kind in RegistrationKind}
+    )
 
     @property
     def empty(self) -> bool:
@@ -41,7 +43,7 @@ class Registrations:
     def __init__(self) -> None:
         self._nodes: dict[str, _Node] = {}
         # key -> node -> slave API. The inner dicts are never changed but replaced: they may have been handed out.
-        self._tables: dict[Kind, dict[str, dict[str, str]]] = {kind: {} for kind in Kind}
+        self._tables: dict[RegistrationKind, dict[str, dict[str, str]]] = {kind: {} for kind in RegistrationKind}
         self._service_uris: dict[str, str] = {}
         # service -> node -> service URI, likewise
         self._services: dict[str, dict[str, str]] = {}
@@ -72,17 +74,17 @@ class Registrations:
         """The nodes with this slave API; nodelets share one."""
         return [name for name, node in self._nodes.items() if node.api == api]
 
-    def apis(self, kind: Kind, key: str) -> list[str]:
+    def apis(self, kind: RegistrationKind, key: str) -> list[str]:
         """The slave APIs registered for a key, in order."""
         return list(self._tables[kind].get(key, {}).values())
 
-    def at(self, kind: Kind, key: str) -> dict[str, str]:
+    def at(self, kind: RegistrationKind, key: str) -> dict[str, str]:
         """The nodes registered for a key, in order, and their slave APIs; never changed afterwards."""
         return self._tables[kind].get(key, _NOBODY)
 
     def param_subscribers(self) -> dict[str, dict[str, str]]:
         """Subscribed parameters (keys end in ``/``), each with its nodes and their APIs; not to be changed."""
-        return self._tables[Kind.PARAM]
+        return self._tables[RegistrationKind.PARAM]
 
     def service_uri(self, service: str) -> str | None:
         """The ``rosrpc://`` URI of a service's provider."""
@@ -94,9 +96,9 @@ class Registrations:
 
     def published(self) -> list[str]:
         """Topics with a publisher."""
-        return list(self._tables[Kind.PUBLISHER])
+        return list(self._tables[RegistrationKind.PUBLISHER])
 
-    def providers(self, kind: Kind) -> list[tuple[str, dict[str, str]]]:
+    def providers(self, kind: RegistrationKind) -> list[tuple[str, dict[str, str]]]:
         """All keys of a kind, each with its nodes and their slave APIs; not to be changed."""
         return list(self._tables[kind].items())
 
@@ -107,8 +109,8 @@ class Registrations:
         """
         if self._state is None:
             self._state = GraphState(
-                dict(self._tables[Kind.PUBLISHER]),
-                dict(self._tables[Kind.SUBSCRIBER]),
+                dict(self._tables[RegistrationKind.PUBLISHER]),
+                dict(self._tables[RegistrationKind.SUBSCRIBER]),
                 dict(self._services),
                 dict(self._types),
                 self.nodes(),
@@ -126,7 +128,7 @@ class Registrations:
         if topic_type != ANY_TYPE or topic not in self._types:
             retyped = self._types.get(topic) != topic_type
             self._types[topic] = topic_type
-        self._register(Kind.PUBLISHER, topic, node, api, retyped=retyped)
+        self._register(RegistrationKind.PUBLISHER, topic, node, api, retyped=retyped)
         self._tell_subscribers(topic)
 
     def register_subscriber(self, topic: str, topic_type: str, node: str, api: str) -> None:
@@ -134,20 +136,20 @@ class Registrations:
         retyped = topic not in self._types and topic_type != ANY_TYPE
         if retyped:
             self._types[topic] = topic_type
-        self._register(Kind.SUBSCRIBER, topic, node, api, retyped=retyped)
+        self._register(RegistrationKind.SUBSCRIBER, topic, node, api, retyped=retyped)
 
     def register_service(self, service: str, uri: str, node: str, api: str) -> None:
         """Make this node the service's provider, in place of any other."""
         self._seat(node, api)
         retyped = self._service_uris.get(service) != uri
-        before = self.at(Kind.SERVICE, service)
+        before = self.at(RegistrationKind.SERVICE, service)
         if gone := [other for other in before if other != node]:
-            self._tables[Kind.SERVICE][service] = {n: its for n, its in before.items() if n == node}
+            self._tables[RegistrationKind.SERVICE][service] = {n: its for n, its in before.items() if n == node}
             for other in gone:
-                self._changed(Kind.SERVICE, service, other, before[other], added=False)
+                self._changed(RegistrationKind.SERVICE, service, other, before[other], added=False)
         self._service_uris[service] = uri
         self._services[service] = {node: uri}
-        self._register(Kind.SERVICE, service, node, api, retyped=retyped)
+        self._register(RegistrationKind.SERVICE, service, node, api, retyped=retyped)
 
     def subscribe_param(self, key: str, node: str, api: str) -> None:
         """Tell this node of changes below ``key``, which ends in ``/``.
@@ -157,9 +159,9 @@ class Registrations:
         logs that it was asked to end, and its log asks for a parameter with ``getCached``.
         """
         if self._evicted.get(node) != api:
-            self._register(Kind.PARAM, key, node, api)
+            self._register(RegistrationKind.PARAM, key, node, api)
 
-    def unregister(self, kind: Kind, key: str, node: str, api: str) -> bool:
+    def unregister(self, kind: RegistrationKind, key: str, node: str, api: str) -> bool:
         """Take a publisher, subscriber or parameter's subscriber away, if ``api`` is still that node's.
 
         Returns:
@@ -169,7 +171,7 @@ class Registrations:
         found = self._tables[kind].get(key, {}).get(node) == api
         if found:
             self._remove(kind, key, node, api)
-        if kind is Kind.PUBLISHER and (found or withdrawn):
+        if kind is RegistrationKind.PUBLISHER and (found or withdrawn):
             self._tell_subscribers(key)
         self._forget_if_empty(node)
         return found or withdrawn
@@ -180,13 +182,13 @@ class Registrations:
         Returns:
             Whether it was so.
         """
-        api = self._tables[Kind.SERVICE].get(service, {}).get(node)
+        api = self._tables[RegistrationKind.SERVICE].get(service, {}).get(node)
         found = api is not None and self._service_uris.get(service) == uri
         if api is not None and found:
-            self._remove(Kind.SERVICE, service, node, api)
+            self._remove(RegistrationKind.SERVICE, service, node, api)
         record = self.awaited.get(node)
         if record is not None and record.services.get(service) == uri:
-            found = self._withdraw(Kind.SERVICE, service, node, record.api)
+            found = self._withdraw(RegistrationKind.SERVICE, service, node, record.api)
         self._forget_if_empty(node)
         return found
 
@@ -199,7 +201,7 @@ class Registrations:
         found = self._nodes.get(node)
         if found is None or found.api != api:
             return False
-        topics = list(found.keys[Kind.PUBLISHER])
+        topics = list(found.keys[RegistrationKind.PUBLISHER])
         self._empty(node)
         self._nodes.pop(node, None)
         self._evicted.pop(node, None)
@@ -218,13 +220,17 @@ class Registrations:
         types = self._types
         record = NodeRecord(
             found.api,
-            {topic: types.get(topic, ANY_TYPE) for topic in found.keys[Kind.PUBLISHER]},
-            {topic: types.get(topic, ANY_TYPE) for topic in found.keys[Kind.SUBSCRIBER]},
-            {name: uri for name in found.keys[Kind.SERVICE] if (uri := self._services.get(name, {}).get(node))},
-            dict(found.keys[Kind.PARAM]),
+            {topic: types.get(topic, ANY_TYPE) for topic in found.keys[RegistrationKind.PUBLISHER]},
+            {topic: types.get(topic, ANY_TYPE) for topic in found.keys[RegistrationKind.SUBSCRIBER]},
+            {
+                name: uri
+                for name in found.keys[RegistrationKind.SERVICE]
+                if (uri := self._services.get(name, {}).get(node))
+            },
+            dict(found.keys[RegistrationKind.PARAM]),
         )
         if awaited is not None:
-            for kind in Kind:
+            for kind in RegistrationKind:
                 record.of(kind).update(awaited.of(kind))  # type: ignore[arg-type] # both of one kind
         return record
 
@@ -247,20 +253,20 @@ class Registrations:
             return [], []
         self._taken_up.add(node)
         for topic in record.publishers:
-            self._register(Kind.PUBLISHER, topic, node, record.api)
+            self._register(RegistrationKind.PUBLISHER, topic, node, record.api)
         for topic in record.subscribers:
-            self._register(Kind.SUBSCRIBER, topic, node, record.api)
+            self._register(RegistrationKind.SUBSCRIBER, topic, node, record.api)
         for service, uri in record.services.items():
             if service not in self._service_uris:
                 self.register_service(service, uri, node, record.api)
         for key in record.params:
-            self._register(Kind.PARAM, key, node, record.api)
+            self._register(RegistrationKind.PARAM, key, node, record.api)
         self._touch(node)
         return list(record.publishers), list(record.subscribers)
 
     def tell(self, topic: str, node: str) -> None:
         """Tell one subscriber who publishes a topic."""
-        api = self.at(Kind.SUBSCRIBER, topic).get(node)
+        api = self.at(RegistrationKind.SUBSCRIBER, topic).get(node)
         if api is not None:
             publishers = self._publishers(topic, awaited=node in self._taken_up)
             self.effects.append(PublisherUpdate(api, topic, publishers))
@@ -277,12 +283,12 @@ class Registrations:
         """Tell the subscribers of a topic that do not know those of its publishers that were taken up."""
         self._tell_subscribers(topic, lambda node: node not in self._taken_up)
 
-    def _withdraw(self, kind: Kind, key: str, node: str, api: str) -> bool:
+    def _withdraw(self, kind: RegistrationKind, key: str, node: str, api: str) -> bool:
         """Take a registration of an awaited node away; whether it was there."""
         if not self.awaited.withdraw(kind, key, node, api):
             return False
         record = self.awaited.get(node)
-        if record is not None and not any(record.of(kind) for kind in Kind):
+        if record is not None and not any(record.of(kind) for kind in RegistrationKind):
             self.awaited.pop(node)
         self._touch(node)
         return True
@@ -307,7 +313,7 @@ class Registrations:
             self.give_up(node)
         found = self._nodes.get(node)
         if found is not None and found.api != api:
-            self.effects.append(Shutdown(found.api, node, tuple(found.keys[Kind.PUBLISHER])))
+            self.effects.append(Shutdown(found.api, node, tuple(found.keys[RegistrationKind.PUBLISHER])))
             self._empty(node)
             self._evicted[node] = found.api
             self._taken_up.discard(node)
@@ -317,7 +323,7 @@ class Registrations:
             found = self._nodes[node] = _Node(api)
         return found
 
-    def _register(self, kind: Kind, key: str, node: str, api: str, *, retyped: bool = False) -> None:
+    def _register(self, kind: RegistrationKind, key: str, node: str, api: str, *, retyped: bool = False) -> None:
         keys = self._seat(node, api).keys[kind]
         if retyped or key not in keys:
             keys[key] = None
@@ -330,13 +336,13 @@ class Registrations:
         if new or retyped:
             self._changed(kind, key, node, api, added=True)
 
-    def _remove(self, kind: Kind, key: str, node: str, api: str) -> None:
+    def _remove(self, kind: RegistrationKind, key: str, node: str, api: str) -> None:
         providers = self._tables[kind][key]
         if len(providers) > 1:
             self._tables[kind][key] = {other: its for other, its in providers.items() if other != node}
         else:
             del self._tables[kind][key]
-            if kind is Kind.SERVICE:
+            if kind is RegistrationKind.SERVICE:
                 del self._service_uris[key]
                 del self._services[key]
         self._nodes[node].keys[kind].pop(key, None)
@@ -358,15 +364,15 @@ class Registrations:
             self._state = None
             self._touch(node)
 
-    def _changed(self, kind: Kind, key: str, node: str, api: str, *, added: bool) -> None:
+    def _changed(self, kind: RegistrationKind, key: str, node: str, api: str, *, added: bool) -> None:
         self._state = None
-        if kind is not Kind.PARAM:
-            topic_type = "" if kind is Kind.SERVICE else self._types.get(key, "")
+        if kind is not RegistrationKind.PARAM:
+            topic_type = "" if kind is RegistrationKind.SERVICE else self._types.get(key, "")
             self.changes.append(GraphChange(kind, added, key, node, api, topic_type))
 
     def _publishers(self, topic: str, *, awaited: bool) -> tuple[str, ...]:
         """The slave APIs of a topic's publishers, with or without those of the run before."""
-        apis = self.apis(Kind.PUBLISHER, topic)
+        apis = self.apis(RegistrationKind.PUBLISHER, topic)
         more = self.awaited.publishers(topic) if awaited else ()
         return tuple(dict.fromkeys([*apis, *more])) if more else tuple(apis)
 
@@ -378,7 +384,7 @@ class Registrations:
         known = self._publishers(topic, awaited=False)
         old = self._publishers(topic, awaited=True)
         told: dict[str, tuple[str, ...]] = {}
-        for node, api in self.at(Kind.SUBSCRIBER, topic).items():
+        for node, api in self.at(RegistrationKind.SUBSCRIBER, topic).items():
             if api not in told and (
                 which is None or which(node)
             ):  # nodelets of one process share an API: it is told once

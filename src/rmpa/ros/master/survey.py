@@ -10,15 +10,15 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.ros.master.effects import Kind
-from rmpa.ros.xmlrpc import XmlRpcValue, brief
+from rmpa.ros.master.effects import RegistrationKind
+from rmpa.ros.wire.xmlrpc import XmlRpcValue, brief
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from rmpa.core.breathing import Breathing
+    from rmpa.core.yielding import Yielder
 
-_KINDS: Final = (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)
+_KINDS: Final = (RegistrationKind.PUBLISHER, RegistrationKind.SUBSCRIBER, RegistrationKind.SERVICE)
 """In the order of ``getSystemState``."""
 _HEAD: Final = ("getSystemState", "getTopicTypes", "getPid")
 
@@ -38,7 +38,7 @@ class Survey:
         services: ``rosrpc://`` URIs, of the services that were looked up and are there.
     """
 
-    holders: dict[Kind, Holders]
+    holders: dict[RegistrationKind, Holders]
     types: dict[str, str]
     run: str
     uris: dict[str, str] = field(default_factory=dict)
@@ -50,7 +50,7 @@ class Survey:
 
     def holders_of_services(self) -> Holders:
         """Every service of it, and its node."""
-        return self.holders[Kind.SERVICE]
+        return self.holders[RegistrationKind.SERVICE]
 
     def with_more(self, uris: Mapping[str, str], services: Mapping[str, str]) -> Survey:
         """The same with more that was looked up."""
@@ -76,7 +76,7 @@ def lookup_calls(caller_id: str, nodes: Iterable[str], services: Iterable[str]) 
 
 
 def read_survey(
-    answer: XmlRpcValue, nodes: Sequence[str], services: Sequence[str], *, breathing: Breathing = iter
+    answer: XmlRpcValue, nodes: Sequence[str], services: Sequence[str], *, breathing: Yielder = iter
 ) -> Survey:
     """Read the answer to ``survey_calls`` with the same nodes and services.
 
@@ -97,7 +97,7 @@ def read_survey(
 
 
 def read_lookups(
-    answer: XmlRpcValue, nodes: Sequence[str], services: Sequence[str], *, breathing: Breathing = iter
+    answer: XmlRpcValue, nodes: Sequence[str], services: Sequence[str], *, breathing: Yielder = iter
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Read the answer to ``lookup_calls`` with the same nodes and services: where they are, those that are.
 
@@ -120,7 +120,7 @@ def _value(answer: XmlRpcValue) -> XmlRpcValue:
     return None
 
 
-def _holders(table: XmlRpcValue, breathing: Breathing) -> Holders:
+def _holders(table: XmlRpcValue, breathing: Yielder) -> Holders:
     found: Holders = {}
     for entry in breathing(table) if isinstance(table, list) else ():
         match entry:

@@ -8,7 +8,7 @@ from typing import TypeAlias
 from rmpa.core import limits
 from rmpa.ros.master.registrations import ANY_TYPE
 from rmpa.ros.master.resolution import resolve
-from rmpa.ros.xmlrpc import XmlRpcValue, brief
+from rmpa.ros.wire.xmlrpc import XmlRpcValue, brief
 
 
 class InvalidParameterError(Exception):

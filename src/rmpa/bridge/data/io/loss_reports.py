@@ -1,0 +1,135 @@
+"""What of a source does not reach its listeners, said in the log and to the agent at the other end.
+
+Reliable messages that were given up, and messages that are too long to cross.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any, Final
+
+from rmpa.bridge.data.qos_events import shown_seconds
+from rmpa.bridge.messages import Source
+from rmpa.core import limits
+from rmpa.core.errors import RemoteProtocolError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.bridge.data.io.absent_peers import AbsentPeers
+    from rmpa.bridge.data.io.flows import ExportFlow
+    from rmpa.bridge.io.bridge import PeerSession
+    from rmpa.bridge.session.peer_rpc import PeerRpc
+    from rmpa.bridge.topics.exports import Exports
+    from rmpa.core.counters import Counters, RefusalLog
+
+OVERSIZED: Final = "message.oversized"
+"""The news that a publisher sends messages that are too long."""
+_NAMED: Final = 3
+"""Sources of several that a line of the log names."""
+
+
+class LossReports:
+    """Both ends of it, for all peers.
+
+    Args:
+        exports: Finds the peers that a source goes to.
+        attached: Finds a peer by its number.
+        absent: Those that were given up.
+        asks: Brings news to the peers, and from them.
+        counters: ``message.given_up``, ``route.given_up``.
+        refusals: Says and counts ``route.missed``, ``message.oversized`` and ``message.oversized_there``.
+    """
+
+    def __init__(
+        self,
+        exports: Exports,
+        attached: Callable[[int], PeerSession | None],
+        absent: AbsentPeers,
+        asks: PeerRpc,
+        counters: Counters,
+        refusals: RefusalLog,
+    ) -> None:
+        self._exports = exports
+        self._attached = attached
+        self._absent = absent
+        self._asks = asks
+        self._counters = counters
+        self._refusals = refusals
+        asks.on_tell(OVERSIZED, self._oversized_there)
+
+    def away(self, peer: int) -> tuple[str, float]:
+        """A peer that is away: its name, and for how many seconds it has been."""
+        now = asyncio.get_running_loop().time()
+        if (attached := self._attached(peer)) is not None:
+            return attached.link.name, now - attached.away_since
+        if (absent := self._absent.get(peer)) is not None:
+            return absent.identity.name, now - absent.since
+        return "a peer", 0.0
+
+    def let_go(self, keys: list[tuple[int, Source]], lost: Callable[[Source, int], int]) -> None:
+        """Messages are not kept any more for peers that are away, only counted.
+
+        Args:
+            keys: Each peer with a source.
+            lost: Says how many messages of a source a peer misses.
+        """
+        for peer in dict.fromkeys(peer for peer, _ in keys):
+            sources = [source for one, source in keys if one == peer]
+            name, seconds = self.away(peer)
+            shown = ", ".join(str(source) for source in sources[:_NAMED])
+            if len(sources) > _NAMED:
+                shown += f" and {len(sources) - _NAMED} others"
+            count = sum(lost(source, peer) for source in sources)
+            text = f"{name} has been away for {shown_seconds(seconds)}: {count} messages for it are given up, "
+            text += (
+                f"of {shown}; further ones are only counted (the contract's outage is for how long they are kept, "
+            )
+            text += f"at most {limits.RESUME_BYTES_MAX >> 20} MiB over all)"
+            self._counters.add("route.given_up", len(sources) - 1)
+            self._say("route.given_up", name, text)
+
+    def missed(self, source: Source, peer: int, count: int, why: str) -> None:
+        """It is known for good how many messages of a reliable source a peer has missed."""
+        attached = self._attached(peer)
+        name = attached.link.name if attached is not None else "a peer"
+        self._counters.add("message.given_up", count)
+        self._say("route.missed", f"{name} {source}", f"{source}: {name} has missed {count} messages: {why}")
+
+    def uncounted(self, source: Source) -> None:
+        """Too many routes are counted for peers that are away."""
+        text = f"what peers that are away miss is counted for {limits.RESUMES_COUNTED_MAX} routes, and no more for"
+        self._say("route.uncounted", str(source), f"{text} {source}")
+
+    def oversized(self, source: Source, flow: ExportFlow) -> None:
+        """A local publisher sends messages that are too long: say it here, and to those that listen to it."""
+        text = (
+            f"{source}: a message of {flow.oversized_bytes} bytes is left out, at most {limits.TCPROS_MESSAGE_MAX} "
+        )
+        self._say("message.oversized", str(source), text + "cross; others do: send it in parts, or compressed")
+        for peer in self._exports.flowing(source):
+            self.tell_oversized(source, flow, peer)
+
+    def tell_oversized(self, source: Source, flow: ExportFlow, peer: int) -> None:
+        """Say to one of them what was left out until now, if anything was."""
+        attached, offer = self._attached(peer), self._exports.offer(peer, source)
+        if flow.oversized and attached is not None and attached.away is None and offer is not None:
+            told = {"topic": offer.topic, "node": offer.node, "count": flow.oversized, "size": flow.oversized_bytes}
+            self._asks.tell(attached, OVERSIZED, told)
+
+    def _oversized_there(self, attached: PeerSession, args: dict[str, Any]) -> None:
+        """A peer has left out messages of its publisher."""
+        names = (args.get("topic"), args.get("node"))
+        numbers = (args.get("count"), args.get("size"))
+        match names, numbers:
+            case (str(topic), str(node)), (int(count), int(size)) if count > 0 and size > 0:
+                source = Source(topic, node)
+            case _:
+                raise RemoteProtocolError(f"{OVERSIZED} names no source, or no number of messages")
+        if attached.inbound.left_out(source, count, size):
+            who = f"{attached.link.name}: {source}"
+            text = f"{who}: its messages of {size} bytes are too long to cross and are left out ({count} until now)"
+            self._say("message.oversized_there", who, text)
+
+    def _say(self, kind: str, who: str, text: str) -> None:
+        self._refusals.refuse(asyncio.get_running_loop().time(), kind, who, text)

@@ -1,1 +1,0 @@
-"""Questions answered, owners followed, the local core read and written."""

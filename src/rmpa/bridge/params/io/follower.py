@@ -1,0 +1,276 @@
+"""Keeps the parameters that this module follows as their owners have them (``[[param]]``, ``[time]``)."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Any
+
+from rmpa.bridge.params import transfer
+from rmpa.bridge.params.io.core import ParamCore, read_text
+from rmpa.bridge.params.rules import Following, learn
+from rmpa.core import limits
+from rmpa.core.counters import Counters, RefusalLog
+from rmpa.core.errors import RemoteProtocolError, RmpaError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from rmpa.bridge.io.bridge import PeerSession
+    from rmpa.bridge.params.rules import Followed
+    from rmpa.bridge.session.peer_rpc import PeerRpc
+    from rmpa.config.settings import FollowRule
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+
+_log = logging.getLogger(__name__)
+
+
+class ParamFollower:
+    """The side that has parameters of others.
+
+    Args:
+        core: The local core.
+        asks: Asks the owners; gets the handler of their news.
+        attached: The peers that are linked now.
+        rules: What is followed.
+        counters: Counts ``param.put_back`` and ``param.refused``.
+    """
+
+    def __init__(
+        self,
+        core: ParamCore,
+        asks: PeerRpc,
+        attached: Callable[[], Iterable[PeerSession]],
+        rules: Iterable[FollowRule],
+        counters: Counters,
+    ) -> None:
+        self._core = core
+        self._asks = asks
+        self._attached = attached
+        self.following = Following(rules)
+        self._refusals = RefusalLog(_log, counters)
+        self._working: asyncio.Task[None] | None = None
+        self._asking: dict[int, asyncio.Task[None]] = {}
+        self._subscribed: set[str] = set()
+        self._left: set[str] = set()
+        asks.on_tell(transfer.VALUE, self._told)
+
+    # --- what the part tells -------------------------------------------------------------------------------------
+
+    def link_up(self, attached: PeerSession) -> None:
+        """A peer is linked: follow what is its."""
+        mine, others = self.following.linked(attached.peer, attached.link.name)
+        if others:
+            text = (
+                f"two peers are named {attached.link.name}; its parameters are followed from the one that came first"
+            )
+            self._refuse("param.two_owners", attached.link.name, text)
+        if mine:
+            self._ask(attached)
+
+    def link_down(self, peer: int) -> None:
+        """A link is gone: its parameters stay as they are, until their owner is back."""
+        task = self._asking.pop(peer, None)
+        if task is not None:
+            task.cancel()
+        owners = {entry.rule.owner for entry in self.following.unlinked(peer)}
+        for attached in self._attached():
+            if attached.peer != peer and attached.link.name in owners:
+                self.link_up(attached)
+
+    def touched(self, key: str) -> bool:
+        """Somebody here has changed a parameter; whether it is one that follows, or in one, or around one."""
+        found = self.following.touched(key)
+        for entry in found:
+            entry.doubted = True
+        return bool(found)
+
+    def change(self, rules: Iterable[FollowRule]) -> None:
+        """Follow these from now on."""
+        gone, _ = self.following.change(rules)
+        self._left |= {entry.rule.to for entry in gone}
+        for attached in self._attached():
+            self.following.linked(attached.peer, attached.link.name)
+            if any(attached.link.name in (e.rule.owner for e in entries) for entries in (gone, self.following)):
+                self._ask(attached)
+
+    async def look(self, *, restarted: bool) -> None:
+        """Put back what was changed here, and ask again for what was refused.
+
+        Args:
+            restarted: The core is another one than before, and knows nothing of what was set.
+        """
+        for key in [key for key in self._left if all(key != entry.rule.to for entry in self.following)]:
+            await self._core.leave(key)
+            self._subscribed.discard(key)
+        self._left.clear()
+        if restarted:
+            self._subscribed.clear()
+        for entry in self.following:
+            if restarted:
+                entry.due = entry.known and (entry.text is not None or entry.had)
+            elif entry.known and not entry.due and (entry.doubted or len(entry.text or "") <= limits.PARAM_SMALL):
+                await self._compare(entry)
+        refused = {entry.peer for entry in self.following if entry.peer is not None and not entry.known}
+        for attached in self._attached():
+            if attached.peer in refused:
+                self._ask(attached)
+        self._work_soon()
+
+    async def close(self) -> None:
+        """Follow nothing any more; the values stay."""
+        tasks = [*self._asking.values(), *([self._working] if self._working is not None else [])]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    @property
+    def subscribed(self) -> set[str]:
+        """The keys that the local core tells us of."""
+        return self._subscribed
+
+    # --- the owners ----------------------------------------------------------------------------------------------
+
+    def _ask(self, attached: PeerSession) -> None:
+        if attached.peer in self._asking:
+            return
+        task = asyncio.create_task(self._follow(attached), name=f"follow parameters of {attached.link.name}")
+        self._asking[attached.peer] = task
+        task.add_done_callback(lambda done: self._asked(attached.peer, done))
+
+    def _asked(self, peer: int, task: asyncio.Task[None]) -> None:
+        if self._asking.get(peer) is task:
+            del self._asking[peer]
+
+    async def _follow(self, attached: PeerSession) -> None:
+        peer, name = attached.peer, attached.link.name
+        keys = [entry.rule.key for entry in self.following if entry.peer == peer]
+        try:
+            answer = await self._asks.ask(attached, transfer.FOLLOW, {"keys": keys})
+            refused = answer.get("refused", {}) if isinstance(answer, dict) else {}
+        except RmpaError as error:
+            refused = dict.fromkeys(keys, str(error))
+        except Exception:  # noqa: BLE001 - a task's top
+            _log.exception("! following parameters of %s failed", name)
+            return
+        for entry in self.following:
+            if entry.peer == peer and entry.rule.key in refused:
+                self._refused(entry, str(refused[entry.rule.key]))
+
+    def _refused(self, entry: Followed, why: str) -> None:
+        entry.problem = why[: limits.CONTROL_TEXT_MAX]
+        entry.known = False
+        self._refuse("param.refused", str(entry.rule), f"{entry.rule} is not followed: {entry.problem}")
+
+    def _told(self, attached: PeerSession, args: dict[str, Any]) -> None:
+        key, exists, text, refused = (args.get(name) for name in ("key", "exists", "text", "refused"))
+        if not isinstance(key, str) or not (text is None or isinstance(text, str)):
+            raise RemoteProtocolError("news of a parameter without its key, or with a value that is no text")
+        transfer.check_size(len(text or ""))
+        if refused is not None:
+            for entry in self.following:
+                if entry.peer == attached.peer and entry.rule.key == key:
+                    self._refused(entry, str(refused))
+            return
+        for entry in self.following.told(attached.peer, key, exists=bool(exists), text=text):
+            entry.problem = ""
+        self._work_soon()
+
+    # --- the local core ------------------------------------------------------------------------------------------
+
+    def _work_soon(self) -> None:
+        if self._working is None and any(entry.ask or entry.due for entry in self.following):
+            self._working = asyncio.create_task(self._work(), name="follow parameters")
+
+    async def _work(self) -> None:
+        """Ask for large values, and set what is due; what fails is tried again by ``look``."""
+        failed: set[FollowRule] = set()
+        try:
+            while todo := [e for e in self.following if (e.ask or e.due) and e.rule not in failed]:
+                for entry in todo:
+                    try:
+                        if entry.ask:
+                            await self._read(entry)
+                        if entry.due:
+                            await self._apply(entry)
+                    except RmpaError as error:
+                        failed.add(entry.rule)
+                        entry.problem = str(error)
+                        self._refuse("param.failed", str(entry.rule), f"{entry.rule} is not as over there: {error}")
+        except Exception:  # noqa: BLE001 - a task's top
+            _log.exception("! following parameters failed")
+        finally:
+            self._working = None
+
+    async def _read(self, entry: Followed) -> None:
+        attached = next((one for one in self._attached() if one.peer == entry.peer), None)
+        entry.ask = False
+        if attached is None:
+            return
+        steps = transfer.reading(transfer.GET, {"key": entry.rule.key})
+        text = ""
+        try:
+            question = next(steps)
+            while True:
+                question = steps.send(await self._asks.ask(attached, *question, limits.PARAM_ASK_TIMEOUT))
+        except StopIteration as done:
+            text = done.value
+        except RmpaError:
+            entry.ask = entry.peer is not None  # its owner may have deleted it meanwhile, and tells that next
+            raise
+        if entry.ask or entry.peer != attached.peer:
+            return  # it has changed again since
+        learn(entry, text)
+
+    async def _apply(self, entry: Followed) -> None:
+        """Set a value here, unless it is there already. Nothing is changed by a text that does not parse."""
+        text, key = entry.text, entry.rule.to
+        entry.due = False
+        if self.following.size > limits.FOLLOWED_BYTES_MAX:
+            entry.text, entry.known = None, False
+            raise RemoteProtocolError(f"more than {limits.FOLLOWED_BYTES_MAX >> 20} MiB of parameters are followed")
+        try:
+            value = await read_text(text) if text is not None else None
+            if key not in self._subscribed:
+                await self._core.follow(key)
+                self._subscribed.add(key)
+            await self._bring(entry, value)
+        except RemoteProtocolError:
+            entry.text, entry.known = None, False
+            raise
+        except RmpaError:
+            entry.due = True
+            raise
+        entry.problem = ""
+
+    async def _bring(self, entry: Followed, value: XmlRpcValue) -> bool:
+        """Make the local value what the owner's is; whether it was another one."""
+        key, text = entry.rule.to, entry.text
+        here = await self._core.get_text(key)
+        if here == text:
+            return False
+        if text is None:
+            await self._core.delete(key)
+        else:
+            await self._core.set(key, value)
+        _log.info("= %s: %s", entry.rule, f"{len(text)} characters" if text is not None else "deleted over there")
+        return True
+
+    async def _compare(self, entry: Followed) -> None:
+        """See whether somebody here has set what is another module's; then put it back and say so."""
+        if entry.text is None and not entry.had:
+            return
+        entry.doubted = False
+        try:
+            value = await read_text(entry.text) if entry.text is not None else None
+            if await self._bring(entry, value):
+                text = (
+                    f"{entry.rule.to} was changed here, and is put back: it belongs to {entry.rule.owner} ([[param]])"
+                )
+                self._refuse("param.put_back", entry.rule.to, text)
+        except RmpaError as error:
+            entry.doubted = True
+            self._refuse("param.failed", str(entry.rule), f"{entry.rule} cannot be put back: {error}")
+
+    def _refuse(self, kind: str, who: str, text: str) -> None:
+        self._refusals.refuse(asyncio.get_running_loop().time(), kind, who, text)

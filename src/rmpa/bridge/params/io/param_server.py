@@ -1,0 +1,249 @@
+"""Answers the peers' questions about this module's parameters, and tells them of those that they follow."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections import defaultdict
+from typing import TYPE_CHECKING, Any
+
+from rmpa.bridge.params import transfer
+from rmpa.bridge.params.io.core import PEERS, ParamCore, read_text, write_text
+from rmpa.bridge.params.rules import key_problem, leaves
+from rmpa.config.param_rules import overlap
+from rmpa.core import limits
+from rmpa.core.errors import LocalProtocolError, RmpaError
+from rmpa.runtime.event_loop import yield_to_data, yielding_to_data
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from rmpa.bridge.io.bridge import PeerSession
+    from rmpa.bridge.params.rules import ParamPolicy
+    from rmpa.bridge.session.peer_rpc import PeerRpc
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+
+_log = logging.getLogger(__name__)
+
+
+class ParamServer:
+    """The side that owns parameters.
+
+    Args:
+        core: The local core.
+        policy: What peers may do.
+        asks: Gets the handlers.
+        most: How many parameters one peer may follow.
+    """
+
+    def __init__(self, core: ParamCore, policy: ParamPolicy, asks: PeerRpc, most: int = limits.FOLLOWED_MAX) -> None:
+        self._core = core
+        self.most = most
+        self.policy = policy
+        self._asks = asks
+        self._transfers: dict[int, transfer.Transfers] = defaultdict(transfer.Transfers)
+        self._followers: dict[int, tuple[PeerSession, set[str]]] = {}
+        self._last: dict[str, str | None] = {}
+        """What was told last of each followed key: its text if it is small, or absent; empty for a large one."""
+        self._left: set[str] = set()
+        self._changed: dict[str, None] = {}
+        self._telling: asyncio.Task[None] | None = None
+        asks.on(transfer.GET, self._get)
+        asks.on(transfer.NAMES, self._names)
+        asks.on(transfer.MORE, lambda attached, args: self._of(attached).more(args, self._now()))
+        asks.on(transfer.PUT, lambda attached, args: self._of(attached).put(args, self._now()))
+        asks.on(transfer.SET, self._set)
+        asks.on(transfer.DELETE, self._delete)
+        asks.on(transfer.FOLLOW, self._follow)
+
+    # --- what the part tells -------------------------------------------------------------------------------------
+
+    def link_down(self, peer: int) -> None:
+        """A peer's link is gone: what it was about is forgotten."""
+        self._transfers.pop(peer, None)
+        if self._followers.pop(peer, None) is not None:
+            self._forget_unfollowed()
+
+    def touched(self, key: str) -> bool:
+        """A parameter has changed; whether somebody follows it, what it is in, or something in it."""
+        found = [followed for followed in self._last if overlap(followed, key)]
+        self._tell_soon(found)
+        return bool(found)
+
+    async def look(self, *, restarted: bool) -> None:
+        """Compare what was told with what is, and follow again: a core may have lost a notification.
+
+        Args:
+            restarted: The core is another one than before: it follows nothing for us.
+        """
+        for key in [key for key in self._left if key not in self._last]:
+            await self._core.leave(key)
+        self._left.clear()
+        for key, last in list(self._last.items()):
+            if restarted:
+                await self._core.follow(key)
+                self._tell_soon([key])
+            elif last != "":
+                await self._core.follow(key)
+                with contextlib.suppress(LocalProtocolError):  # too large, which was said when it was told
+                    if await self._small_text(key) != last:
+                        self._tell_soon([key])
+
+    def judge_again(self) -> None:
+        """The rules have changed: tell those who may not follow any more."""
+        for attached, keys in self._followers.values():
+            for key in [key for key in keys if self.policy.why_not_follow(key)]:
+                keys.discard(key)
+                args = {"key": key, "exists": False, "size": 0, "refused": self.policy.why_not_follow(key)}
+                self._asks.tell(attached, transfer.VALUE, args)
+        self._forget_unfollowed()
+
+    async def close(self) -> None:
+        """Tell nobody any more."""
+        if self._telling is not None:
+            self._telling.cancel()
+            await asyncio.gather(self._telling, return_exceptions=True)
+
+    @property
+    def followed(self) -> Iterator[str]:
+        """The keys that some peer follows."""
+        return iter(self._last)
+
+    # --- questions ----------------------------------------------------------------------------------------------
+
+    async def _get(self, attached: PeerSession, args: dict[str, Any]) -> dict[str, object]:
+        key = self._key(args.get("key"))
+        found, value = await self._core.get(key)
+        self._refuse(self._why_not_get(key, value))
+        if not found:
+            raise RmpaError(f"there is no parameter {key}")
+        return self._of(attached).answer(await write_text(key, value), self._now())
+
+    async def _names(self, attached: PeerSession, _args: dict[str, Any]) -> dict[str, object]:
+        names = [name for name in yielding_to_data(await self._core.names()) if not self.policy.why_not_get(name)]
+        return self._of(attached).answer(await write_text("the list of parameters", names), self._now())
+
+    async def _set(self, attached: PeerSession, args: dict[str, Any]) -> dict[str, object]:
+        key = self._key(args.get("key"))
+        value = await read_text(self._of(attached).written(args, self._now()))
+        parameters = list(yielding_to_data(leaves(key, value)))
+        for name, _ in yielding_to_data(parameters):
+            self._refuse(key_problem(name) or self.policy.why_not_set(name.rstrip("/") or "/"))
+        for number, (name, one) in enumerate(parameters):
+            await self._core.set(name, one, PEERS)
+            yield_to_data()
+            if number % limits.LEARNT_AT_ONCE == 0:
+                await asyncio.sleep(0)
+        _log.info("< %s sets %d parameters at %s", attached.link.name, len(parameters), key)
+        return {"count": len(parameters)}
+
+    async def _delete(self, attached: PeerSession, args: dict[str, Any]) -> dict[str, object]:
+        key = self._key(args.get("key"))
+        self._refuse(self.policy.why_not_set(key))
+        if not await self._core.delete(key, PEERS):
+            raise RmpaError(f"there is no parameter {key}")
+        _log.info("< %s deletes parameter %s", attached.link.name, key)
+        return {}
+
+    async def _follow(self, attached: PeerSession, args: dict[str, Any]) -> dict[str, object]:
+        """From now on a peer follows these keys, and none of those that it did before."""
+        keys = args.get("keys")
+        if not isinstance(keys, list) or len(keys) > limits.FOLLOW_RULES_MAX:
+            raise RmpaError(f"keys is not a list of at most {limits.FOLLOW_RULES_MAX} parameters")
+        refused: dict[str, str] = {}
+        wanted: set[str] = set()
+        for given in keys:
+            problem = key_problem(given)
+            key = str(given).rstrip("/") or "/"
+            why = problem or self.policy.why_not_follow(key)
+            if not why and key not in wanted and len(wanted) >= self.most:
+                why = f"more parameters than limits.params = {self.most} over there; raise it, or follow a namespace"
+            if why:
+                refused[str(given)[: limits.CROSSING_NAME_MAX]] = why
+            else:
+                wanted.add(key)
+        self._followers[attached.peer] = (attached, wanted)
+        self._forget_unfollowed()
+        for key in wanted:
+            self._last.setdefault(key, "")
+            await self._core.follow(key)
+        self._tell_soon(wanted)
+        return {"refused": refused}
+
+    def _why_not_get(self, key: str, value: XmlRpcValue) -> str:
+        if not isinstance(value, dict):
+            return self.policy.why_not_get(key)
+        if self.policy.all_get or not value:
+            return "" if self.policy.all_get else self.policy.why_not_get(key)
+        return next(
+            (why for name, _ in yielding_to_data(leaves(key, value)) if (why := self.policy.why_not_get(name))), ""
+        )
+
+    def _key(self, given: object) -> str:
+        self._refuse(key_problem(given))
+        return str(given).rstrip("/") or "/"
+
+    def _refuse(self, why: str) -> None:
+        if why:
+            raise RmpaError(why)
+
+    # --- news ----------------------------------------------------------------------------------------------------
+
+    def _tell_soon(self, keys: Iterable[str]) -> None:
+        self._changed |= dict.fromkeys(keys)
+        if self._changed and self._telling is None:
+            self._telling = asyncio.create_task(self._tell(), name="tell of parameters")
+
+    async def _tell(self) -> None:
+        try:
+            while self._changed:
+                await asyncio.sleep(limits.PARAM_GATHER)
+                changed, self._changed = self._changed, {}
+                for key in changed:
+                    if key in self._last:
+                        await self._tell_one(key)
+        except Exception:  # noqa: BLE001 - a task's top
+            _log.exception("! telling peers of parameters failed")
+        finally:
+            self._telling = None
+
+    async def _tell_one(self, key: str) -> None:
+        args: dict[str, object] = {"key": key, "exists": False, "size": 0}
+        try:
+            found, value = await self._core.get(key)
+            why = self._why_not_get(key, value) if found and isinstance(value, dict) else ""
+            if why:
+                args["refused"] = why
+                found = False
+            text = await write_text(key, value) if found else None
+        except RmpaError as error:
+            # The core does not answer, or the value is too large to cross: told when that has changed (``look``).
+            _log.warning("! peers are not told of %s: %s", key, error)
+            args["refused"] = str(error)
+            text = None
+        if text is not None:
+            args |= {"exists": True, "size": len(text)}
+            if len(text) <= limits.PARAM_PORTION:
+                args["text"] = text
+        if key in self._last:
+            self._last[key] = text if text is None or len(text) <= limits.PARAM_SMALL else ""
+        for attached, keys in list(self._followers.values()):
+            if key in keys:
+                self._asks.tell(attached, transfer.VALUE, args)
+
+    async def _small_text(self, key: str) -> str | None:
+        text = await self._core.get_text(key)
+        return text if text is None or len(text) <= limits.PARAM_SMALL else ""
+
+    def _forget_unfollowed(self) -> None:
+        kept = set().union(*(keys for _, keys in self._followers.values())) if self._followers else set()
+        for key in [key for key in self._last if key not in kept]:
+            del self._last[key]
+            self._left.add(key)
+
+    def _of(self, attached: PeerSession) -> transfer.Transfers:
+        return self._transfers[attached.peer]
+
+    def _now(self) -> float:
+        return asyncio.get_running_loop().time()

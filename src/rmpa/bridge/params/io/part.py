@@ -1,0 +1,118 @@
+"""Parameters across modules: asked for, set and followed (``docs/parameters.md``)."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from typing import TYPE_CHECKING
+
+from rmpa.bridge.params.io.core import ParamCore
+from rmpa.bridge.params.io.follower import ParamFollower
+from rmpa.bridge.params.io.param_server import ParamServer
+from rmpa.bridge.params.rules import ParamPolicy, follow_rules
+from rmpa.bridge.session.part import Part
+from rmpa.core import limits
+from rmpa.core.errors import RmpaError, UnreachableError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.bridge.params.rules import Followed
+    from rmpa.config.settings import ParamSettings, Settings, TimeSettings
+    from rmpa.ros.core.api import Core
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+
+_log = logging.getLogger(__name__)
+
+
+class Params(Part):
+    """The part of the bridge that is about parameters.
+
+    Args:
+        core: The local core.
+        bridge: Its node is told of changes, its asks carry the questions; add this part to it.
+        params: What peers may do, and what is followed.
+        time: Whether time is shared, and whose is followed.
+        most: How many parameters one peer may follow here.
+    """
+
+    def __init__(
+        self,
+        core: Core,
+        bridge: Bridge,
+        params: ParamSettings,
+        time: TimeSettings,
+        most: int = limits.FOLLOWED_MAX,
+    ) -> None:
+        self._core = ParamCore(core, bridge.node)
+        self._desk = ParamServer(self._core, ParamPolicy(params, time), bridge.asks, most)
+        self._follower = ParamFollower(
+            self._core, bridge.asks, bridge.attached, follow_rules(params, time), bridge.counters
+        )
+        self._looking: asyncio.Task[None] | None = None
+        self._run: XmlRpcValue = None
+
+    @property
+    def followed(self) -> Iterable[Followed]:
+        """What is followed, and how that goes."""
+        return self._follower.following
+
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know of those that are not followed as the settings want it."""
+        found = (e for e in self._follower.following if e.problem and e.peer is not None)
+        return tuple(f"parameter {entry.rule} is not followed: {entry.problem}" for entry in found)
+
+    def reload(self, settings: Settings) -> None:
+        """Other rules hold from now on; what they do not concern goes on untouched."""
+        params, time = settings.params, settings.time
+        self._desk.policy = ParamPolicy(params, time)
+        self._desk.most = settings.limits.params
+        self._desk.judge_again()
+        self._follower.change(follow_rules(params, time))
+
+    def link_up(self, attached: PeerSession) -> None:
+        """A peer is linked."""
+        self._follower.link_up(attached)
+
+    def link_down(self, attached: PeerSession) -> None:
+        """A link is gone."""
+        self._desk.link_down(attached.peer)
+        self._follower.link_down(attached.peer)
+
+    def param_update(self, key: str) -> bool:
+        """A parameter has changed in the local core."""
+        return any((self._desk.touched(key), self._follower.touched(key)))
+
+    def reconcile(self) -> None:
+        """Look whether all is as it should be."""
+        if self._looking is None:
+            self._looking = asyncio.create_task(self._look(), name="look at parameters")
+
+    async def close(self) -> None:
+        """End; nothing of ours stays in a core that lives on but the values."""
+        if self._looking is not None:
+            self._looking.cancel()
+            await asyncio.gather(self._looking, return_exceptions=True)
+        await self._desk.close()
+        await self._follower.close()
+        with contextlib.suppress(RmpaError, TimeoutError):
+            async with asyncio.timeout(limits.PARAM_LEAVE_TIMEOUT):
+                for key in {*self._desk.followed, *self._follower.subscribed}:
+                    await self._core.leave(key)
+
+    async def _look(self) -> None:
+        try:
+            run = await self._core.run_id()
+            restarted, self._run = self._run not in (None, run), run
+            await self._desk.look(restarted=restarted)
+            await self._follower.look(restarted=restarted)
+        except UnreachableError:
+            pass  # the core itself says so
+        except RmpaError as error:
+            _log.warning("! parameters cannot be looked at: %s", error)
+        except Exception:  # noqa: BLE001 - a task's top
+            _log.exception("! looking at parameters failed")
+        finally:
+            self._looking = None

@@ -1,1 +1,0 @@
-"""The calls: endpoints of proxies, both ends of an open service, connections to the servers."""

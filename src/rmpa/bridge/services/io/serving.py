@@ -1,0 +1,192 @@
+"""Our services, called by peers: a pool of connections to each server, and the servers' lives."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import TYPE_CHECKING, Final
+
+from rmpa.bridge.services.exports import (
+    EndRoute,
+    ExportAction,
+    LocalService,
+    Probe,
+    ServerGone,
+    ServeRoute,
+    ServiceAbout,
+    ServiceExports,
+)
+from rmpa.bridge.services.io.calls import Budgets, CallStats, Server
+from rmpa.bridge.services.io.connection_pool import ServicePool
+from rmpa.core import limits
+from rmpa.core.errors import ConfigError, RmpaError
+from rmpa.core.names import is_type_name
+from rmpa.ros.core.liveness import listening_ports
+from rmpa.ros.http.client import is_own_name
+from rmpa.ros.node.local_addresses import local_addresses
+from rmpa.ros.wire.services import parse_service_uri
+from rmpa.runtime.event_loop import yielding_to_data
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Coroutine, Mapping
+
+    from rmpa.bridge.io.bridge import PeerSession
+    from rmpa.ros.core.api import Core
+
+_MD5_LENGTH: Final = 32
+_LOOK_SHARE: Final = 50
+"""A look at the servers' ports takes at most one of so many parts of a processor."""
+
+
+class Serving:
+    """Carries out what the outbound plan decides.
+
+    Args:
+        core: The local core.
+        exports: The plan; it is told what servers say.
+        attached: The peers, by number.
+        budgets: What their calls may hold, likewise.
+        act: Carries out what the plan makes of that.
+    """
+
+    def __init__(
+        self,
+        core: Core,
+        exports: ServiceExports,
+        attached: Mapping[int, PeerSession],
+        budgets: Mapping[int, Budgets],
+        act: Callable[[list[ExportAction]], None],
+    ) -> None:
+        self._core = core
+        self._exports = exports
+        self._attached = attached
+        self._budgets = budgets
+        self._act = act
+        self.stats: dict[str, CallStats] = {}
+        self._servers: dict[tuple[int, int], Server] = {}
+        self._pools: dict[str, ServicePool] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def start(self) -> None:
+        """Look after the servers from now on."""
+        self._spawn(self._look_after(), "servers' liveness")
+
+    async def close(self) -> None:
+        """End every call, and every connection to a server."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        pools, self._pools = list(self._pools.values()), {}
+        for pool in pools:
+            pool.close("the agent ends")
+            await pool.closed()
+
+    def do(self, action: ExportAction) -> None:
+        """Carry out one action."""
+        match action:
+            case Probe():
+                self._spawn(self._ask_server(action), f"describe {action.service}")
+            case ServeRoute():
+                self._serve(action)
+            case EndRoute():
+                server = self._servers.pop((action.peer, action.requests), None)
+                if server is not None:
+                    server.close()
+                attached = self._attached.get(action.peer)
+                if attached is not None:
+                    attached.takers.pop(action.requests, None)
+            case ServerGone():
+                pool = self._pools.pop(action.service, None)
+                if pool is not None:
+                    pool.close("its server has gone")
+
+    def lane_lost(self, peer: int) -> None:
+        """The bulk lane's connection to a peer is gone."""
+        for (owner, _), server in list(self._servers.items()):
+            if owner == peer:
+                server.lane_lost()
+
+    def close_idle(self, before: float) -> None:
+        """Close the connections that nobody has used since ``before`` (``loop.time()``)."""
+        for service, pool in list(self._pools.items()):
+            pool.close_idle(before)
+            if pool.unused and not self._exports.callers(service):
+                del self._pools[service]
+        for service in [one for one in self.stats if one not in self._exports.seen]:
+            del self.stats[service]
+
+    # --- inside ---------------------------------------------------------------------------------------------
+
+    def _spawn(self, work: Coroutine[None, None, None], name: str) -> None:
+        task = asyncio.get_running_loop().create_task(work, name=name)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    def _pool(self, service: str, server: LocalService) -> ServicePool:
+        pool = self._pools.get(service)
+        if pool is None or pool.server != server:
+            if pool is not None:
+                pool.close("its server has restarted")
+            pool = ServicePool(service, server, lambda: self._core.suspect(server.node))
+            self._pools[service] = pool
+        return pool
+
+    async def _ask_server(self, action: Probe) -> None:
+        try:
+            told = await self._pool(action.service, action.server).describe()
+        except RmpaError as error:
+            self._act(self._exports.refused(action.service, str(error)))
+            return
+        if not is_type_name(told.type) or len(told.md5sum) != _MD5_LENGTH:
+            text = f"service [{action.service}]: its server says neither type nor md5 sum (but {told})"
+            self._act(self._exports.refused(action.service, text))
+            return
+        about = ServiceAbout(told.type, told.md5sum, told.request_type, told.response_type)
+        self._act(self._exports.described(action.service, action.server, about))
+
+    def _serve(self, action: ServeRoute) -> None:
+        attached = self._attached.get(action.peer)
+        if attached is None or attached.away is not None:
+            return
+        server = Server(
+            attached.link,
+            action.route,
+            self._pool(action.service, action.server),
+            action.timeout,
+            self._budgets[action.peer],
+            self.stats.setdefault(action.service, CallStats()),
+        )
+        self._servers[action.peer, action.requests] = server
+        attached.takers[action.requests] = server
+
+    async def _look_after(self) -> None:
+        """Notice servers that were killed: who provides a service and does not listen any more is suspected."""
+        while True:
+            servers = dict(self._exports.offered)
+            cost = 0.0
+            if servers:
+                ports, here, cost = await asyncio.to_thread(_listening)
+                for service, server in yielding_to_data(list(servers.items())):
+                    if self._exports.offered.get(service) == server and _is_deaf(server, ports, here):
+                        self._core.suspect(server.node)
+            await asyncio.sleep(max(limits.SERVER_LOOK, _LOOK_SHARE * cost))
+
+
+def _listening() -> tuple[set[int] | None, frozenset[str], float]:
+    """Ports that somebody listens at, this machine's addresses, and the processor's seconds; for a thread."""
+    began = time.thread_time()
+    try:
+        ports, here = listening_ports(), frozenset(local_addresses())
+    except OSError:  # no file descriptor is left to ask the kernel: nothing is known this time
+        ports, here = None, frozenset()
+    return ports, here, time.thread_time() - began
+
+
+def _is_deaf(server: LocalService, ports: set[int] | None, here: Collection[str]) -> bool:
+    """Whether a server of this machine does not listen; of others nothing is known."""
+    try:
+        host, port = parse_service_uri(server.uri)
+    except ConfigError:
+        return False
+    local = is_own_name(host) or host.startswith("127.") or host in here
+    return local and ports is not None and port not in ports

@@ -1,0 +1,167 @@
+"""Questions between agents: what the parameters, ``rmpa why`` and others want to know of another module.
+
+A handler gets the asking peer and the arguments, and returns what JSON can say, at once or as an awaitable; an
+``RmpaError`` becomes the error that the asker gets.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import inspect
+import itertools
+import logging
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from rmpa.bridge.messages import Notification, Request, Response, encode
+from rmpa.bridge.session.part import Part
+from rmpa.core import limits
+from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+
+if TYPE_CHECKING:
+    from rmpa.bridge.io.bridge import PeerSession
+    from rmpa.bridge.messages import Message
+    from rmpa.core.counters import Counters
+
+_log = logging.getLogger(__name__)
+
+Handler = Callable[["PeerSession", dict[str, Any]], Awaitable[object] | object]
+Listener = Callable[["PeerSession", dict[str, Any]], None]
+
+
+class PeerRpc(Part):
+    """Asks the peers, and answers them.
+
+    Args:
+        counters: Counts ``ask.refused`` and ``ask.failed``.
+    """
+
+    def __init__(self, counters: Counters) -> None:
+        self._counters = counters
+        self._numbers = itertools.cycle(range(1, 1 << 32))
+        self._waiting: dict[tuple[int, int], tuple[asyncio.Future[Any], str]] = {}
+        self._handlers: dict[str, Handler] = {}
+        self._listeners: dict[str, Listener] = {}
+        self._answering: dict[int, set[asyncio.Task[None]]] = {}
+
+    def on(self, what: str, handler: Handler) -> None:
+        """Answer a question from now on."""
+        self._handlers[what] = handler
+
+    def on_tell(self, what: str, listener: Listener) -> None:
+        """Take news of this name from now on."""
+        self._listeners[what] = listener
+
+    def tell(self, attached: PeerSession, what: str, args: dict[str, Any]) -> None:
+        """Send news to a linked peer."""
+        attached.link.send_control(encode(Notification(what, args)))
+
+    async def ask(
+        self,
+        attached: PeerSession,
+        what: str,
+        args: dict[str, Any],
+        timeout: float = limits.ASK_TIMEOUT,  # noqa: ASYNC109 - the message names it
+    ) -> Any:
+        """Ask a linked peer.
+
+        Raises:
+            PeerRefused: It answers with an error.
+            UnreachableError: It does not answer in time, or its link ends meanwhile.
+        """
+        number = next(self._numbers)
+        future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+        self._waiting[attached.peer, number] = (future, attached.link.name)
+        try:
+            attached.link.send_control(encode(Request(number, what, args)))
+            async with asyncio.timeout(timeout):
+                return await future
+        except TimeoutError:
+            remedy = "is its agent stopped, or its version older?"
+            raise UnreachableError("agent", f"{attached.link.name} ({what}, {timeout:g} s)", remedy) from None
+        finally:
+            self._waiting.pop((attached.peer, number), None)
+
+    def link_down(self, attached: PeerSession) -> None:
+        """Nobody answers any more, and nobody waits for our answers."""
+        for (peer, _), (future, name) in list(self._waiting.items()):
+            if peer == attached.peer and not future.done():
+                future.set_exception(UnreachableError("agent", name, "its link has just ended; try again"))
+        for task in self._answering.pop(attached.peer, ()):
+            task.cancel()
+
+    def message(self, attached: PeerSession, message: Message) -> bool:
+        """Take a question or an answer."""
+        match message:
+            case Request():
+                self._answer(attached, message)
+            case Response():
+                future, name = self._waiting.get((attached.peer, message.number), (None, ""))
+                if future is not None and not future.done():
+                    if message.ok:
+                        future.set_result(message.value)
+                    else:
+                        future.set_exception(PeerRefused(name, message.error, message.remedy))
+            case Notification():
+                if (listener := self._listeners.get(message.what)) is not None:
+                    listener(attached, message.args)
+            case _:
+                return False
+        return True
+
+    async def close(self) -> None:
+        """Answer nobody any more."""
+        tasks = [task for tasks in self._answering.values() for task in tasks]
+        self._answering.clear()
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    def _answer(self, attached: PeerSession, ask: Request) -> None:
+        tasks = self._answering.setdefault(attached.peer, set())
+        if len(tasks) >= limits.ASKS_AT_ONCE:
+            self._counters.add("ask.refused")
+            self._send(attached, Response(ask.number, ok=False, error="too many questions at once"))
+            return
+        task = asyncio.create_task(self._respond(attached, ask), name=f"answer {ask.what} of {attached.link.name}")
+        tasks.add(task)
+        task.add_done_callback(functools.partial(self._answered, attached.peer))
+
+    def _answered(self, peer: int, task: asyncio.Task[None]) -> None:
+        tasks = self._answering.get(peer, set())
+        tasks.discard(task)
+        if not tasks:
+            self._answering.pop(peer, None)
+
+    async def _respond(self, attached: PeerSession, ask: Request) -> None:
+        handler = self._handlers.get(ask.what)
+        if handler is None:
+            text = f"this agent does not know the question {ask.what!r}"
+            self._send(
+                attached, Response(ask.number, ok=False, error=text, remedy="install the same release on both")
+            )
+            return
+        try:
+            value = handler(attached, ask.args)
+            if inspect.isawaitable(value):
+                value = await value
+            answer = Response(ask.number, ok=True, value=msgspec.to_builtins(value))
+        except RmpaError as error:
+            answer = Response(ask.number, ok=False, error=str(error)[: limits.CONTROL_TEXT_MAX])
+        except Exception:  # noqa: BLE001 - a task's top: one question must not end the link
+            self._counters.add("ask.failed")
+            _log.exception("! a question of %s failed: %s", attached.link.name, ask.what[: limits.ASK_NAME_MAX])
+            answer = Response(
+                ask.number, ok=False, error=f"the agent failed at {ask.what}", remedy="its log says why"
+            )
+        self._send(attached, answer)
+
+    def _send(self, attached: PeerSession, answer: Response) -> None:
+        payload = encode(answer)
+        if len(payload) > limits.CONTROL_PAYLOAD_MAX:
+            text = f"the answer has {len(payload)} bytes, more than {limits.CONTROL_PAYLOAD_MAX}"
+            payload = encode(Response(answer.number, ok=False, error=text))
+        attached.link.send_control(payload)

@@ -1,0 +1,92 @@
+"""Makes the nodes that stand for the nodes of peers: all at one pair of listening sockets, where that is possible."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core.errors import StartError
+from rmpa.ros.environment import is_loopback
+from rmpa.ros.node.shared_listener import SharedListener
+from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.runtime.descriptors import DESCRIPTORS, Use
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from rmpa.core.counters import Counters
+    from rmpa.ros.core.api import Core
+    from rmpa.ros.wire.xmlrpc import RosReply
+
+_log = logging.getLogger(__name__)
+_SOCKETS: Final = 2
+"""That of XML-RPC and that of TCPROS."""
+
+
+class ProxyNodes:
+    """The proxies' way to listen, and the nodes that were made.
+
+    On loopback they share a listener, and each has an address of its own. Where nodes of other machines must reach
+    them, or this machine does not allow it, each has two listening sockets.
+
+    Args:
+        core: The local core.
+        counters: Where refusals at the proxies' ports are counted.
+    """
+
+    def __init__(self, core: Core, counters: Counters | None = None) -> None:
+        self._core = core
+        self._counters = counters
+        self._listener: SharedListener | None = None
+        self.listening = ""
+        """How proxies listen here, ready to read: at which ports, or why each has two sockets of its own."""
+
+    def sockets(self, proxies: int) -> int:
+        """How many sockets listen for so many proxies."""
+        return _SOCKETS if self._listener is not None else _SOCKETS * proxies
+
+    async def start(self) -> None:
+        """Listen for all proxies that are made from now on, if that works here."""
+        host = self._core.node_host
+        if not is_loopback(host):
+            self.listening = f"two for each: nodes of other machines reach them, at {self._core.node_address}"
+            return
+        listener = SharedListener(self._core.uri, counters=self._counters)
+        try:
+            await listener.start()
+        except StartError as error:
+            self.listening = f"two for each, at {host}: all cannot share two ({error.problem})"
+            _log.info("= proxies listen by sockets of their own, %s", self.listening)
+            return
+        self._listener = listener
+        xmlrpc, tcpros = listener.ports
+        self.listening = f"two for all, ports {xmlrpc} and {tcpros}, and an address 127.a.b.c for each"
+
+    async def close(self) -> None:
+        """Listen no longer; the proxies are closed before."""
+        if self._listener is not None:
+            await self._listener.close()
+            self._listener = None
+
+    def make(self, name: str, on_kill: Callable[[str, str], Awaitable[RosReply]] | None = None) -> SlaveNode:
+        """A proxy, not started.
+
+        Args:
+            name: Its name in the local graph.
+            on_kill: ``(caller id, reason) -> reply``: it was asked to end (``rosnode kill``).
+
+        Raises:
+            OSError: It would have sockets of its own, and too few file descriptors are left (``EMFILE``).
+        """
+        if self._listener is None:
+            with DESCRIPTORS.open_socket(Use.PROXY, what=f"the proxy {name}"):
+                pass  # there is room for its sockets, and for those who connect to them
+        return SlaveNode(
+            name,
+            self._core.node_host,
+            self._core.uri,
+            advertised_host=self._core.node_address,
+            listener=self._listener,
+            counters=self._counters,
+            on_kill=on_kill,
+        )

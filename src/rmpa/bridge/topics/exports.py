@@ -1,0 +1,606 @@
+"""Which local sources are offered to which peers, and which are flowing (one copy a peer, on demand).
+
+Sans-I/O: the driver tells what the local graph holds, what peers ask for and what became of the connections to
+local publishers; it gets back actions.
+
+A source is connected while at least one peer wants it::
+
+    idle ──open──► connecting ──described──► live
+      ▲               │ refused, lost          │ lost, restarted, gone
+      └───────────────┴────────────────────────┘  every route of it: Closed(reason)
+
+Who lost a route asks again: the one that wants the data is the one that retries. A reliable route outlives its
+link: it is suspended, its source stays connected, and the peer's next ``OpenRoute`` goes on where it was
+(``link_away``).
+
+Peers know sources by their wire names (``bridge.naming``); here all is keyed by the local ones but for what a peer
+says and is told.
+
+A change of the graph costs what changed, however large the graph is; what peers are to hear of it is gathered, and
+told a bounded number of sources at a time.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, SuspendRoute, Warn
+from rmpa.bridge.bounds import Beyond
+from rmpa.bridge.data.losses import NOTHING_KEPT, beginning_anew, going_on
+from rmpa.bridge.messages import (
+    Advertise,
+    CloseRoute,
+    Description,
+    OpenRoute,
+    RouteClosed,
+    RouteOpened,
+    Source,
+    TopicOffer,
+    is_crossing_name,
+    is_crossing_type,
+)
+from rmpa.bridge.naming import Names, PeerNames
+from rmpa.bridge.relay import may_have
+from rmpa.config.settings import LimitSettings
+from rmpa.core import limits
+from rmpa.core.contract import Contract, Contracts, Durability, Reliability, combine
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Mapping
+
+    from rmpa.bridge.data.losses import KeptMessages
+    from rmpa.bridge.messages import Origin
+    from rmpa.bridge.policy import Policy
+
+
+@dataclass(frozen=True, slots=True)
+class LocalSource:
+    """A source of the local graph: its message type, its node's slave API, and whose it is if we relay it."""
+
+    type: str
+    uri: str
+    origin: Origin | None = None
+
+
+@dataclass(slots=True)
+class _Route:
+    """One peer's wish for a source.
+
+    Args:
+        contract: What holds for it.
+        asked: What the peer asked for.
+        live: Whether data goes there yet.
+        epoch: Of a reliable route, else 0.
+        after: Where a suspended one goes on.
+        named: The last numbering that the peer has a part of, and its last message; (0, 0) if it has none.
+    """
+
+    contract: Contract
+    asked: Contract
+    live: bool = False
+    epoch: int = 0
+    after: int | None = None
+    named: tuple[int, int] = (0, 0)
+
+
+@dataclass(slots=True)
+class _ExportedFlow:
+    """A source that some peer wants."""
+
+    uri: str
+    routes: dict[tuple[int, int], _Route] = field(default_factory=dict)
+    """By (peer, route)."""
+    away: dict[int, _Route] = field(default_factory=dict)
+    """Suspended, by peer."""
+    description: Description | None = None
+
+    @property
+    def wanted(self) -> bool:
+        return bool(self.routes or self.away)
+
+
+@dataclass(slots=True)
+class _Topic:
+    """One topic of the local graph.
+
+    Args:
+        seen: Its publishers as they were told, by node.
+        crossing: Those that policy lets cross, whether they are offered or there are too many.
+        rules: Which rules they were judged by.
+    """
+
+    seen: Mapping[str, LocalSource]
+    crossing: dict[Source, LocalSource] = field(default_factory=dict)
+    rules: int = 0
+
+
+@dataclass(slots=True)
+class _ExportPeer:
+    """One link.
+
+    Args:
+        name: The peer's.
+        names: How our names read over there.
+        ruled: Whether it may know less than others, or by other names.
+        news: Sources that it is perhaps to hear of (a dict, for its order).
+        told: Those that it knows, as it was told.
+        by_wire: The same by the names that it knows them by.
+        behind: Sources whose wire name another one has, by that name.
+        routes: What it has open.
+        beginning: Whether it has not heard everything once yet.
+        instance: The peer's run.
+    """
+
+    name: str
+    names: PeerNames
+    ruled: bool
+    news: dict[Source, None]
+    told: dict[Source, TopicOffer] = field(default_factory=dict)
+    by_wire: dict[Source, Source] = field(default_factory=dict)
+    behind: dict[Source, list[Source]] = field(default_factory=dict)
+    routes: dict[int, Source] = field(default_factory=dict)
+    beginning: bool = True
+    instance: str = ""
+
+
+_NOTHING: Final = _Topic({})
+_NO_NAMES: Final = Names()
+_DEFAULT_LIMITS: Final = LimitSettings()
+
+
+def _always(_peer: int) -> bool:
+    return True
+
+
+class Exports:
+    """The outbound half of the bridge.
+
+    Args:
+        policy: What may cross.
+        contracts: What our side promises.
+        names: How our names read at the peers.
+        most: How much is offered.
+        kept: Who keeps the messages of reliable routes.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        contracts: Contracts | None = None,
+        names: Names = _NO_NAMES,
+        most: LimitSettings = _DEFAULT_LIMITS,
+        kept: KeptMessages = NOTHING_KEPT,
+    ) -> None:
+        self._kept = kept
+        self._policy = policy
+        self._most = most
+        self._contracts = contracts if contracts is not None else Contracts()
+        self._names = names
+        self._rules = 0
+        self._epochs = 0
+        self._topics: dict[str, _Topic] = {}
+        self._local: dict[Source, LocalSource] = {}
+        self._too_many: OrderedDict[Source, LocalSource] = OrderedDict()
+        self._peers: dict[int, _ExportPeer] = {}
+        self._flows: dict[Source, _ExportedFlow] = {}
+
+    @property
+    def offered(self) -> Mapping[Source, LocalSource]:
+        """What peers are told of."""
+        return self._local
+
+    @property
+    def beyond(self) -> Beyond:
+        """What is offered to no peer because there is too much (``limits.topics``)."""
+        return Beyond("topics", self._most.topics, len(self._too_many))
+
+    def is_beyond(self, source: Source) -> bool:
+        """Whether a source is one of these."""
+        return source in self._too_many
+
+    def offer(self, peer: int, source: Source) -> TopicOffer | None:
+        """What a peer was told of a source, by the name that it has over there."""
+        return known.told.get(source) if (known := self._peers.get(peer)) is not None else None
+
+    def topics_for(self, peer: int) -> int:
+        """How many topics a peer may have."""
+        known = self._peers.get(peer)
+        sources = known.told if known is not None and known.ruled else self._local
+        return len({source.topic for source in sources})
+
+    def local(self, peer: int, wire: Source) -> Source | None:
+        """The source that a peer knows by a name, or ``None`` if it may know none by it."""
+        known = self._peers.get(peer)
+        if known is None:
+            return None
+        source = known.by_wire.get(wire)
+        if source is None and not known.ruled and wire in self._local and self._offer(known, wire) is not None:
+            return wire  # it is about to be told
+        return source if source in self._local else None
+
+    def source(self, peer: int, route: int) -> Source | None:
+        """What a peer has open on a route."""
+        return known.routes.get(route) if (known := self._peers.get(peer)) is not None else None
+
+    def flowing(self, source: Source) -> tuple[int, ...]:
+        """The peers that a source goes to now."""
+        flow = self._flows.get(source)
+        return tuple(peer for (peer, _), route in flow.routes.items() if route.live) if flow else ()
+
+    def contract(self, source: Source, peer: int) -> Contract | None:
+        """What holds for a source's route to a peer, while there is one."""
+        flow = self._flows.get(source)
+        return next((route.contract for (p, _), route in flow.routes.items() if p == peer), None) if flow else None
+
+    def description(self, source: Source) -> Description | None:
+        """What is known of a source's messages, while it flows."""
+        flow = self._flows.get(source)
+        return flow.description if flow else None
+
+    @property
+    def topics(self) -> Collection[str]:
+        """The topics that the local graph was last said to have."""
+        return self._topics.keys()
+
+    @property
+    def untold(self) -> bool:
+        """Whether there is something to ``tell``."""
+        return any(peer.news for peer in self._peers.values())
+
+    def beginning(self, peer: int) -> bool:
+        """Whether a peer has not been told everything once since its link is up."""
+        return known.beginning if (known := self._peers.get(peer)) is not None else False
+
+    def rules(
+        self, policy: Policy, contracts: Contracts, names: Names, most: LimitSettings = _DEFAULT_LIMITS
+    ) -> list[Action]:
+        """Other rules hold from now on; what they leave as it is goes on untouched.
+
+        The topics are judged by them when ``graph`` tells of each next, and the peers hear of it by ``tell``.
+        """
+        self._policy, self._contracts, self._names, self._most = policy, contracts, names, most
+        self._rules += 1
+        for peer in self._peers.values():
+            before = peer.ruled
+            peer.names, peer.ruled = self._rules_of(peer.name)
+            if before or peer.ruled:
+                peer.news.update(dict.fromkeys(self._local))
+        actions: list[Action] = []
+        for source, flow in list(self._flows.items()):
+            offered = contracts.of(source.topic, self._local[source].type)
+            for (peer_number, _), route in list(flow.routes.items()):
+                if combine(offered, route.asked) != route.contract:
+                    actions += self._end_for(source, peer_number, "its contract has changed here")
+        return actions
+
+    def graph(self, topic: str, publishers: Mapping[str, LocalSource]) -> list[Action]:
+        """Say who publishes a topic in the local graph now, by node, proxies left out; peers hear it by ``tell``."""
+        before = self._topics.get(topic, _NOTHING)
+        if before.seen == publishers and (before.rules == self._rules or not publishers):
+            return []
+        crossing = {
+            source: local for node, local in publishers.items() if self._crosses(source := Source(topic, node), local)
+        }
+        if publishers:
+            self._topics[topic] = _Topic(publishers, crossing, self._rules)
+        else:
+            del self._topics[topic]
+        actions: list[Action] = []
+        for source in before.crossing:
+            if source not in crossing:
+                actions += self._went(source)
+        for source, local in crossing.items():
+            actions += self._came(source, local)
+        return actions
+
+    def _crosses(self, source: Source, local: LocalSource) -> bool:
+        node = source.node if local.origin is None else local.origin.node
+        return (
+            is_crossing_type(local.type)
+            and is_crossing_name(source.topic)
+            and is_crossing_name(source.node)
+            and self._policy.judge(source.topic, local.type, node).allowed
+        )
+
+    def _came(self, source: Source, local: LocalSource) -> list[Action]:
+        """A source is there: new, as it was, with another type, or at another address."""
+        before = self._local.get(source)
+        if before is None and len(self._local) >= self._most.topics:
+            self._too_many[source] = local
+            text = (
+                f"this module has more topics than limits.topics = {self._most.topics}; the rest is offered to no "
+                "peer: raise it in rmpa.toml and `rmpa reload`, or deny some"
+            )
+            return [Warn("sources.too_many", "local", text)]
+        self._too_many.pop(source, None)
+        self._local[source] = local
+        if before is None or (before.type, before.origin) != (local.type, local.origin):
+            self._note(source)
+        # A new address is nobody's business but ours.
+        flow = self._flows.get(source)
+        return self._end(source, "the node has restarted") if flow is not None and flow.uri != local.uri else []
+
+    def _went(self, source: Source) -> list[Action]:
+        before = self._local.pop(source, None)
+        if before is None:
+            del self._too_many[source]
+            return []
+        self._note(source)
+        actions = self._end(source, "the node has gone")
+        if self._too_many:
+            actions += self._came(*self._too_many.popitem(last=False))
+        return actions
+
+    def _note(self, source: Source) -> None:
+        for peer in self._peers.values():
+            peer.news.setdefault(source)
+
+    def tell(self, ready: Callable[[int], bool] = _always) -> list[Action]:
+        """One message for each peer that has not heard everything and is ready; call again while ``untold``.
+
+        Of those that have rules of their own only one is told at a time, in turn: each source is judged for it.
+        """
+        actions: list[Action] = []
+        judged = False
+        for number, peer in list(self._peers.items()):
+            begins = peer.beginning
+            if not peer.news or (peer.ruled and judged) or not ready(number):
+                continue
+            if peer.ruled:
+                judged = True
+                self._peers[number] = self._peers.pop(number)
+            message, ends = self._next(number, peer)
+            actions += ends
+            if message.added or message.removed or begins is not message.more:
+                actions.append(Send(number, message))
+        return actions
+
+    def _next(self, number: int, peer: _ExportPeer, *, full: bool = False) -> tuple[Advertise, list[Action]]:
+        """The next portion of news, and what becomes of routes whose sources the peer may not have any more."""
+        added: list[TopicOffer] = []
+        removed: list[Source] = []
+        actions: list[Action] = []
+        for source in tuple(islice(peer.news, limits.ADVERTISED_AT_ONCE)):
+            del peer.news[source]
+            before, now = peer.told.get(source), self._offer(peer, source)
+            if before is not None and (now is None or now.source != before.source):
+                del peer.told[source], peer.by_wire[before.source]
+                removed.append(before.source)
+                peer.news.update(dict.fromkeys(peer.behind.pop(before.source, ())))
+                actions += self._end_for(source, number, "it is not offered here any more, or by another name")
+            if now is not None and now != before:
+                holder = peer.by_wire.setdefault(now.source, source)
+                if holder != source:
+                    peer.behind.setdefault(now.source, []).append(source)
+                    text = f"{source} would be {now.topic} at {peer.name}, as {holder.topic} is already: rename one"
+                    actions.append(Warn("names.taken", f"{number} {source}", text))
+                    continue
+                peer.told[source] = now
+                added.append(now)
+        peer.beginning = peer.beginning and bool(peer.news)
+        return Advertise(added=tuple(added), removed=tuple(removed), full=full, more=peer.beginning), actions
+
+    def _offer(self, peer: _ExportPeer, source: Source) -> TopicOffer | None:
+        """What a peer is to know of a source now."""
+        local = self._local.get(source)
+        if local is None:
+            return None
+        if local.origin is not None and not may_have(peer.instance, local.origin):
+            return None
+        if not peer.ruled:
+            return TopicOffer(source.topic, source.node, local.type, local.origin)
+        wire = peer.names.wire_name(source.topic, local.type)
+        if not is_crossing_name(wire):
+            return None
+        if not self._policy.judge_for(peer.name, source.topic, local.type, wire).allowed:
+            return None
+        return TopicOffer(wire, source.node, local.type, local.origin)
+
+    def link_up(self, peer: int, name: str = "", instance: str = "") -> list[Action]:
+        """A link is up: begin to tell all we have; ``tell`` goes on with it.
+
+        Args:
+            peer: Whose.
+            name: The peer's name, which its rules go by.
+            instance: Its run, as 32 hexadecimal digits; nothing that came from there is relayed back to it.
+        """
+        new = _ExportPeer(name, *self._rules_of(name), dict.fromkeys(self._local), instance=instance)
+        self._peers[peer] = new
+        message, actions = self._next(peer, new, full=True)
+        return [*actions, Send(peer, message)]
+
+    def _rules_of(self, name: str) -> tuple[PeerNames, bool]:
+        names = self._names.of(name)
+        return names, not names.plain or self._policy.has_rules_for(name)
+
+    def link_down(self, peer: int, *, counting: bool = False) -> list[Action]:
+        """A peer is gone, and all its routes; ``counting``: suspended ones stay, for what it misses is counted."""
+        actions: list[Action] = []
+        gone = self._peers.pop(peer, None)
+        for route, source in gone.routes.items() if gone is not None else ():
+            actions += self._remove(source, peer, route)
+        return actions if counting else actions + self.unclaimed(peer)
+
+    def unclaimed(self, peer: int) -> list[Action]:
+        """A peer does not go on with its suspended routes."""
+        actions: list[Action] = []
+        for source, flow in list(self._flows.items()):
+            if flow.away.pop(peer, None) is not None:
+                actions += [RemoveRoute(source, peer, 0), *self._disconnect(source, flow)]
+        return actions
+
+    def link_away(self, peer: int) -> tuple[list[Action], bool]:
+        """A link is gone, but its peer may come back.
+
+        Returns:
+            What to do, and whether a reliable route waits for the peer: if none does, ``link_down`` it.
+        """
+        # What the peer had not asked for again yet waits anew.
+        again = [(one, flow.away[peer].contract) for one, flow in self._flows.items() if peer in flow.away]
+        actions: list[Action] = [SuspendRoute(one, peer, contract.outage) for one, contract in again]
+        gone = self._peers.pop(peer, None)
+        for number, source in gone.routes.items() if gone is not None else ():
+            flow = self._flows.get(source)
+            route = flow.routes.get((peer, number)) if flow is not None else None
+            if flow is None or route is None or not (route.live and route.epoch):
+                actions += self._remove(source, peer, number)
+                continue
+            del flow.routes[peer, number]
+            flow.away[peer] = route
+            actions.append(SuspendRoute(source, peer, route.contract.outage))
+        return actions, self.waits_for(peer)
+
+    def given_up(self, source: Source, peer: int) -> list[Action]:
+        """A suspended route is not even counted any more."""
+        flow = self._flows.get(source)
+        if flow is None or flow.away.pop(peer, None) is None:
+            return []
+        return self._disconnect(source, flow)
+
+    def waits_for(self, peer: int) -> bool:
+        """Whether a reliable route waits for a peer without a link."""
+        return any(peer in flow.away for flow in self._flows.values())
+
+    def inherit(self, old: int, new: int) -> None:
+        """A module has another run: what the old one's routes carried is counted until the new one asks for them."""
+        for flow in self._flows.values():
+            if (route := flow.away.pop(old, None)) is not None:
+                flow.away[new] = route
+
+    def outage(self, peer: int) -> float:
+        """For how many seconds messages are kept for a peer without a link."""
+        return max(
+            (flow.away[peer].contract.outage for flow in self._flows.values() if peer in flow.away), default=0.0
+        )
+
+    def absent(self, source: Source) -> dict[int, Contract]:
+        """The peers whose suspended routes a source has, with what holds for each."""
+        return {p: route.contract for p, route in flow.away.items()} if (flow := self._flows.get(source)) else {}
+
+    def opened(self, peer: int, message: OpenRoute) -> list[Action]:
+        """A peer asks for a source."""
+        routes = self._peers[peer].routes
+        if message.route in routes:
+            return [
+                Warn("route.doubled", str(peer), f"a peer opens route {message.route} twice; the second is ignored")
+            ]
+        if len(routes) >= self._most.topics:
+            text = f"more topics are open on one link than limits.topics = {self._most.topics} over there"
+            return [Send(peer, RouteClosed(message.route, text))]
+        source = self.local(peer, message.source)
+        if source is None:
+            text = f"{message.source}: not published here, or policy keeps it home"
+            return [Send(peer, RouteClosed(message.route, text))]
+        local = self._local[source]
+        flow = self._flows.get(source)
+        if flow is not None and any(other == peer for other, _ in flow.routes):
+            # One copy a peer: more would let it multiply what we send at will.
+            return [Send(peer, RouteClosed(message.route, f"{source} is open on another route of this link"))]
+        routes[message.route] = source
+        away = flow.away.pop(peer, None) if flow is not None else None
+        route = self._route(message, source.topic, local, away)
+        if flow is None:
+            flow = self._flows[source] = _ExportedFlow(local.uri)
+            flow.routes[peer, message.route] = route
+            return [Connect(source, local.type, local.uri)]
+        flow.routes[peer, message.route] = route
+        if flow.description is None:
+            return []
+        return self._start(source, flow, flow.description)
+
+    def _route(self, message: OpenRoute, topic: str, local: LocalSource, away: _Route | None) -> _Route:
+        """The wish of a peer; it goes on where a suspended one was if it names that one's epoch."""
+        asked, named = message.contract, (message.epoch, message.after)
+        contract = combine(self._contracts.of(topic, local.type), asked)
+        if contract.reliability is not Reliability.RELIABLE:
+            return _Route(contract, asked, named=named)
+        if away is not None and away.epoch == message.epoch and away.contract == contract:
+            return _Route(contract, asked, epoch=away.epoch, after=message.after)
+        self._epochs += 1
+        return _Route(contract, asked, epoch=self._epochs, named=named)
+
+    def closed(self, peer: int, message: CloseRoute) -> list[Action]:
+        """A peer wants no more of a route; one that is not open is none of our worry (it crossed ours)."""
+        source = self._peers[peer].routes.pop(message.route, None)
+        return self._remove(source, peer, message.route, wished=True) if source is not None else []
+
+    def described(self, source: Source, description: Description) -> list[Action]:
+        """The local publisher has answered with its header."""
+        flow = self._flows.get(source)
+        if flow is None:
+            return []
+        flow.description = description
+        return self._start(source, flow, description)
+
+    def lost(self, source: Source, reason: str) -> list[Action]:
+        """The local publisher hung up, refused or does not answer."""
+        return self._end(source, reason, connected=False)
+
+    def _start(self, source: Source, flow: _ExportedFlow, description: Description) -> list[Action]:
+        actions: list[Action] = []
+        for (peer, number), route in flow.routes.items():
+            if route.live:
+                continue
+            route.live = True
+            about = description
+            if route.contract.durability is Durability.TRANSIENT_LOCAL and not about.latching:
+                about = msgspec.structs.replace(about, latching=True)
+            actions += [
+                Send(peer, self._told(RouteOpened(number, about, route.contract, route.epoch), source, peer, route)),
+                AddRoute(source, peer, number, route.contract, route.epoch, route.after),
+            ]
+        return actions
+
+    def _told(self, opened: RouteOpened, source: Source, peer: int, route: _Route) -> RouteOpened:
+        if route.after is not None:
+            return going_on(opened, self._kept.following(source, peer, route.after))
+        return beginning_anew(opened, self._kept.settle(source, peer, *route.named))
+
+    def _remove(self, source: Source, peer: int, route: int, *, wished: bool = False) -> list[Action]:
+        flow = self._flows.get(source)
+        if flow is None:
+            return []
+        gone = flow.routes.pop((peer, route), None)
+        live = gone is not None and gone.live
+        actions: list[Action] = [RemoveRoute(source, peer, route, wished=wished)] if live else []
+        return actions + self._disconnect(source, flow)
+
+    def _disconnect(self, source: Source, flow: _ExportedFlow) -> list[Action]:
+        """Leave a source that nobody wants any more."""
+        if flow.wanted:
+            return []
+        del self._flows[source]
+        return [Disconnect(source)]
+
+    def _end_for(self, source: Source, peer: int, reason: str) -> list[Action]:
+        """A source goes to one peer no longer, though others may have it."""
+        flow = self._flows.get(source)
+        if flow is None:
+            return []
+        actions: list[Action] = []
+        for number in [number for owner, number in flow.routes if owner == peer]:
+            self._peers[peer].routes.pop(number, None)
+            actions += [*self._remove(source, peer, number), Send(peer, RouteClosed(number, reason))]
+        if flow.away.pop(peer, None) is not None:
+            actions += [RemoveRoute(source, peer, 0), *self._disconnect(source, flow)]
+        return actions
+
+    def _end(self, source: Source, reason: str, *, connected: bool = True) -> list[Action]:
+        flow = self._flows.pop(source, None)
+        if flow is None:
+            return []
+        actions: list[Action] = []
+        actions += [RemoveRoute(source, peer, 0, over=True) for peer in flow.away]
+        for (peer, number), route in flow.routes.items():
+            self._peers[peer].routes.pop(number, None)
+            if route.live:
+                actions.append(RemoveRoute(source, peer, number, over=True))
+            actions.append(Send(peer, RouteClosed(number, reason)))
+        if connected:
+            actions.append(Disconnect(source))
+        return actions

@@ -1,0 +1,307 @@
+"""Drives the exports: one subscription to each local publisher that some peer wants."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Final
+
+from rmpa.bridge.data.io.flows import ExportFlow
+from rmpa.bridge.data.io.route_sender import ReliableRouteSender
+from rmpa.bridge.data.losses import LossRecords
+from rmpa.bridge.messages import Description, Source
+from rmpa.bridge.policy import OWN_NODE
+from rmpa.core import limits
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.mesh.reliable import ResumeTable
+from rmpa.ros.node.subscription import PublisherConnection
+from rmpa.ros.wire.tcpros import TopicDescription as TcprosDescription
+from rmpa.runtime.descriptors import DESCRIPTORS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    from rmpa.bridge.actions import AddRoute, Connect, RemoveRoute, SuspendRoute
+    from rmpa.bridge.data.io.route_sender import DataLink, RouteSender
+    from rmpa.bridge.data.losses import Missed
+    from rmpa.ros.core.api import Core
+    from rmpa.ros.node.slave_node import SlaveNode
+
+_log = logging.getLogger(__name__)
+_SEQUENCE_MASK: Final = (1 << 32) - 1
+_HALF: Final = 1 << 31
+_TOO_LONG: Final = "it was away for longer than they were kept"
+_ENDED: Final = "its route had ended before they had come"
+
+
+class LocalSubscriptions:
+    """Subscriptions to local publishers, as the agent's own node.
+
+    Args:
+        core: The local core; the agent's subscriptions are registered there, so that the stock tools show them.
+        node: The agent's own node.
+        on_described: Called with a source and its publisher's header.
+        on_lost: Called with a source and a reason when its publisher is no longer connected.
+        on_given_up: Called with a source and a peer that is away when what it misses cannot even be counted any more.
+        on_let_go: Called with (peer that is away, source) of which messages are not kept any more, only counted.
+        on_missed: Called with a source, a peer, the number of messages that it has missed, and why.
+        on_oversized: Called with a source and its flow when a message was left out that is too long.
+        on_malformed: Called with a source and a text when its publisher has sent what cannot be; ``on_lost`` follows.
+    """
+
+    def __init__(
+        self,
+        core: Core,
+        node: SlaveNode,
+        *,
+        on_described: Callable[[Source, Description], None],
+        on_lost: Callable[[Source, str], None],
+        on_given_up: Callable[[Source, int], None],
+        on_let_go: Callable[[list[tuple[int, Source]]], None],
+        on_missed: Callable[[Source, int, int, str], None],
+        on_oversized: Callable[[Source, ExportFlow], None],
+        on_malformed: Callable[[Source, str], None],
+    ) -> None:
+        self._on_malformed = on_malformed
+        self._on_oversized = on_oversized
+        self._core = core
+        self._node = node
+        self._on_described = on_described
+        self._on_lost = on_lost
+        self._connections: dict[Source, PublisherConnection] = {}
+        self._flows: dict[Source, ExportFlow] = {}
+        self._legs: dict[tuple[int, int], RouteSender] = {}
+        self._parked: ResumeTable[tuple[int, Source]] = ResumeTable()
+        self._timer: asyncio.TimerHandle | None = None
+        self._on_given_up = on_given_up
+        self._on_let_go = on_let_go
+        self._on_missed = on_missed
+        self._heirs: set[int] = set()
+        """Peers whose modules had another run before, and which may still ask for what that has missed."""
+        self.losses = LossRecords()
+        """What peers have missed of reliable sources whose routes have ended."""
+
+    @property
+    def flows(self) -> Mapping[Source, ExportFlow]:
+        """What flows, for the monitor."""
+        return self._flows
+
+    @property
+    def connections(self) -> Iterable[PublisherConnection]:
+        """To the local publishers."""
+        return self._connections.values()
+
+    def connect(self, action: Connect) -> None:
+        """Subscribe to one publisher; its answer comes by ``on_described`` or ``on_lost``."""
+        source = action.source
+        flow = self._flows[source] = ExportFlow()
+        if sum(s.topic == source.topic for s in self._flows) == 1:
+            self._core.call("registerSubscriber", OWN_NODE, source.topic, "*", self._node.uri)
+        _log.debug("> subscribe to %s at %s", source, action.uri)
+        connection = PublisherConnection(
+            source.topic,
+            action.uri,
+            OWN_NODE,
+            on_message=flow.message,
+            on_parts=flow,
+            on_header=lambda fields: self._header(source, fields),
+            on_refused=lambda text: self._gone(source, connection, f"its publisher refuses: {text}"),
+            on_lost=lambda reason: self._gone(source, connection, reason),
+            on_oversized=lambda size: self._left_out(source, flow, size),
+            number=self._node.next_number(),
+        )
+        self._connections[source] = connection
+        connection.start()
+
+    def disconnect(self, source: Source) -> None:
+        """Leave one publisher."""
+        connection = self._connections.pop(source, None)
+        if connection is not None:
+            connection.close()
+        self._drop(source)
+
+    def add_route(self, action: AddRoute, link: DataLink) -> None:
+        """Send a source to one more peer, or go on where its last link ended."""
+        flow = self._flows[action.source]
+        leg = flow.by_peer.get(action.peer)
+        self._claim(action.peer, action.source)
+        if action.after is not None and isinstance(leg, ReliableRouteSender) and leg.sender.epoch == action.epoch:
+            try:
+                leg.resume(link, action.route, action.after)
+            except RemoteProtocolError:
+                flow.remove(action.peer)  # the link is closed for it; the next one begins a numbering of its own
+                raise
+            if missed := leg.missed():
+                self._on_missed(action.source, action.peer, missed, _TOO_LONG)
+        else:
+            self._end(action.source, action.peer, at_least=True)
+            leg = flow.add(action.peer, link, action.route, action.contract, action.epoch)
+        self._legs[action.peer, action.route] = leg
+
+    def suspend_route(self, action: SuspendRoute) -> None:
+        """Keep a source's messages for a peer whose link is gone."""
+        flow = self._flows.get(action.source)
+        if flow is not None:
+            leg = flow.by_peer.get(action.peer)
+            self._forget(leg, action.peer)
+            if isinstance(leg, ReliableRouteSender):
+                key = (action.peer, action.source)
+                flow.suspend(action.peer, self._keeper(key))
+                until = asyncio.get_running_loop().time() + action.outage
+                self._give_up(self._parked.park(key, leg.sender, until))
+                self._set_timer()
+
+    def _keeper(self, key: tuple[int, Source]) -> Callable[[bytes, int], object]:
+        """What takes the messages of a source for a peer that is away."""
+        return lambda payload, stamp: self._give_up(self._parked.offer(key, payload, stamp))
+
+    def inherit(self, old: int, new: int) -> None:
+        """A module has another run: what the old one missed until now is told to the new one if it asks."""
+        for source, flow in self._flows.items():
+            leg = flow.inherit(old, new)
+            if isinstance(leg, ReliableRouteSender):
+                self._parked.move((old, source), (new, source))
+                leg.suspend(self._keeper((new, source)))
+        self.losses.inherit(old, new)
+        self._heirs.add(new)
+
+    def unclaimed(self, peer: int) -> None:
+        """A peer has not asked for what it, or the run before it, has missed: it does not want that."""
+        self._heirs.discard(peer)
+        self.losses.unclaimed(peer)
+
+    def forget(self, peer: int) -> None:
+        """A peer will not come back."""
+        self._heirs.discard(peer)
+        self.losses.forget(peer)
+
+    def remove_route(self, action: RemoveRoute) -> None:
+        """Send a source to a peer no longer."""
+        self._claim(action.peer, action.source)
+        self._end(action.source, action.peer, wished=action.wished, at_least=not action.over)
+
+    def following(self, source: Source, peer: int, after: int) -> int | None:
+        """The sequence of the next message of a suspended route; see ``bridge.data.losses.Kept``."""
+        flow = self._flows.get(source)
+        leg = flow.by_peer.get(peer) if flow is not None else None
+        if not isinstance(leg, ReliableRouteSender):
+            return None
+        waiting = leg.sender.following
+        # What is kept may have come: what the peer has is not sent again.
+        return waiting if waiting - after - 1 & _SEQUENCE_MASK < _HALF else after + 1 & _SEQUENCE_MASK
+
+    def settle(self, source: Source, peer: int, epoch: int, after: int) -> Missed | None:
+        """A peer asks for a source anew; see ``bridge.data.losses.Kept``."""
+        self._claim(peer, source)
+        self._end(source, peer)
+        missed = self.losses.settle(source, peer, epoch, after, inherited=peer in self._heirs)
+        if missed is not None and missed.count:
+            self._on_missed(source, peer, missed.count, _ENDED)
+        return missed
+
+    def lost(self, source: Source, peer: int) -> int:
+        """Messages that a peer has missed of a reliable source, as far as is known."""
+        flow = self._flows.get(source)
+        leg = flow.by_peer.get(peer) if flow is not None else None
+        return self.losses.count(source, peer) + (leg.sender.lost if isinstance(leg, ReliableRouteSender) else 0)
+
+    def _end(self, source: Source, peer: int, *, wished: bool = False, at_least: bool = False) -> None:
+        """Let go of the way to a peer, if there is one, and write down what the peer misses."""
+        flow = self._flows.get(source)
+        leg = flow.by_peer.get(peer) if flow is not None else None
+        if flow is None or leg is None:
+            return
+        if isinstance(leg, ReliableRouteSender):
+            self.losses.end(source, peer, leg.sender.ended(), wished=wished, at_least=at_least)
+        self._forget(leg, peer)
+        flow.remove(peer)
+
+    def _claim(self, peer: int, source: Source) -> None:
+        self._parked.claim((peer, source), None)
+        self._set_timer()
+
+    def _give_up(self, keys: list[tuple[int, Source]]) -> None:
+        """What was kept for peers that are away has gone: from now on it is only counted."""
+        if keys:
+            self._on_let_go(keys)
+        for peer, source in self._parked.forget():
+            self._end(source, peer, at_least=True)
+            self._on_given_up(source, peer)
+
+    def _set_timer(self) -> None:
+        """Let go of what is kept when its outage has lasted for too long."""
+        due = self._parked.next_timer()
+        if self._timer is not None:
+            if self._timer.when() == due:
+                return
+            self._timer.cancel()
+            self._timer = None
+        if due is not None:
+            self._timer = asyncio.get_running_loop().call_at(due, self._outlasted, due)
+
+    def _outlasted(self, due: float) -> None:
+        self._timer = None
+        self._give_up(self._parked.expire(max(due, asyncio.get_running_loop().time())))
+        self._set_timer()
+
+    def leg(self, peer: int, route: int) -> RouteSender | None:
+        """One peer's route."""
+        return self._legs.get((peer, route))
+
+    def lane_lost(self, peer: int) -> None:
+        """The connection of a peer's bulk lane is gone."""
+        for (owner, _), leg in list(self._legs.items()):
+            if owner == peer:
+                leg.lane_lost()
+
+    def _forget(self, leg: RouteSender | None, peer: int) -> None:
+        if leg is not None and self._legs.get((peer, leg.route)) is leg:
+            del self._legs[peer, leg.route]
+
+    def close(self) -> None:
+        """Leave all publishers."""
+        for source in list(self._connections):
+            self.disconnect(source)
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def _header(self, source: Source, fields: Mapping[str, str]) -> None:
+        about = TcprosDescription.from_header(fields)
+        text = about.definition.encode(errors="surrogateescape").decode("latin-1")
+        description = Description(about.type, about.md5sum, text, about.latching)
+        if description.problem:
+            self._gone(source, self._connections[source], description.problem)
+            return
+        if description.latching:
+            self._flows[source].latch()
+        self._on_described(source, description)
+
+    def _left_out(self, source: Source, flow: ExportFlow, size: int) -> None:
+        flow.left_out(size)
+        self._on_oversized(source, flow)
+
+    def _gone(self, source: Source, connection: PublisherConnection, reason: str) -> None:
+        if self._connections.get(source) is not connection:
+            return
+        self._connections.pop(source).close()
+        short = DESCRIPTORS.short  # told for the process; and the node may be well
+        _log.log(logging.DEBUG if short else logging.INFO, "= %s: %s", source, reason)
+        if connection.malformed:
+            self._on_malformed(source, reason)
+        self._on_lost(source, reason[: limits.CONTROL_TEXT_MAX])
+        self._drop(source)
+        if not short:
+            self._core.suspect(source.node)
+
+    def _drop(self, source: Source) -> None:
+        flow = self._flows.pop(source, None)
+        if flow is not None:
+            for peer in list(flow.by_peer):
+                self._claim(peer, source)
+                leg = flow.by_peer[peer]
+                self._forget(leg, peer)
+                if isinstance(leg, ReliableRouteSender):
+                    self.losses.end(source, peer, leg.sender.ended(), wished=False, at_least=False)
+            flow.close()
+        if flow is not None and not any(s.topic == source.topic for s in self._flows):
+            self._core.call("unregisterSubscriber", OWN_NODE, source.topic, self._node.uri)

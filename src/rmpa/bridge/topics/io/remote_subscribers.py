@@ -1,0 +1,169 @@
+"""Who listens over there: names the local listeners to a peer, and lets a peer's listeners be seen here.
+
+See ``bridge.topics.audience`` for the topics that need it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING
+
+from rmpa.bridge.messages import Audience, encode
+from rmpa.bridge.proxy_names import proxied_node, proxy_name
+from rmpa.bridge.session.part import Part
+from rmpa.bridge.topics.audience import audience, is_watched
+from rmpa.bridge.topics.imports import RouteState
+from rmpa.core import limits
+from rmpa.ros.node.subscription import PublisherConnection
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.bridge.io.bridge import PeerSession
+    from rmpa.bridge.messages import Message, Source
+    from rmpa.bridge.topics.exports import Exports
+    from rmpa.bridge.topics.imports import Imports
+    from rmpa.core.counters import RefusalLog
+
+_log = logging.getLogger(__name__)
+
+
+def _ignore(_: memoryview) -> None:
+    """The messages come by the bridge's own connection."""
+
+
+class _IgnoreParts:
+    """Lets large messages pass unkept."""
+
+    def begin(self, size: int) -> None:
+        """One begins."""
+
+    def part(self, part: memoryview) -> None:
+        """A part of it."""
+
+    def abort(self) -> None:
+        """The rest does not come."""
+
+
+class RemoteSubscribers(Part):
+    """Both ends of it, for all peers.
+
+    Args:
+        exports: Finds the source of a peer's route.
+        imports: Finds the route of a peer's source.
+        attached: Finds a peer by its number.
+        refusals: Says and counts ``audience.too_many``.
+    """
+
+    def __init__(
+        self,
+        exports: Exports,
+        imports: Imports,
+        attached: Callable[[int], PeerSession | None],
+        refusals: RefusalLog,
+    ) -> None:
+        self._exports = exports
+        self._imports = imports
+        self._attached = attached
+        self._refusals = refusals
+        self._told: dict[tuple[int, Source], tuple[int, tuple[str, ...]]] = {}
+        """What each peer was last told: the route, and who listens."""
+        self._changed: dict[tuple[int, Source], None] = {}
+        self._soon: asyncio.Handle | None = None
+        self._shown: dict[tuple[int, Source], dict[str, PublisherConnection]] = {}
+        """The connections that stand for a peer's listeners, by their names here."""
+
+    def shown(self, peer: int, source: Source) -> tuple[str, ...]:
+        """The names under which a peer's listeners are connected to a local publisher."""
+        return tuple(sorted(self._shown.get((peer, source), ())))
+
+    # --- our listeners, to the peer that publishes ------------------------------------------------------------------
+
+    def changed(self, peer: int, source: Source) -> None:
+        """Somebody local has begun or ceased to listen to a peer's source, or its route is open."""
+        entry = self._imports.get(peer, source)
+        if entry is None or not is_watched(entry.type):
+            return
+        self._changed[peer, source] = None
+        if self._soon is None:
+            # Behind what is being done: the last of several changes counts, and a listener's header is answered.
+            self._soon = asyncio.get_running_loop().call_soon(self._tell)
+
+    def _tell(self) -> None:
+        self._soon = None
+        changed, self._changed = self._changed, {}
+        for peer, source in changed:
+            attached, entry = self._attached(peer), self._imports.get(peer, source)
+            if attached is None or entry is None or entry.state not in {RouteState.OPEN, RouteState.LINGERING}:
+                self._told.pop((peer, source), None)
+                continue
+            publication = attached.inbound.publication(source)
+            names = audience(publication.listeners) if publication is not None else ()
+            before, known = self._told.get((peer, source), (0, ()))
+            if names != (known if before == entry.route else ()):
+                self._told[peer, source] = (entry.route, names)
+                attached.link.send_control(encode(Audience(entry.route, names)))
+
+    # --- the peer's listeners, to our publisher ---------------------------------------------------------------------
+
+    def message(self, attached: PeerSession, message: Message) -> bool:
+        """A peer says who listens to one of its routes; one that was closed meanwhile is left alone."""
+        if not isinstance(message, Audience):
+            return False
+        source = self._exports.source(attached.peer, message.route)
+        local = self._exports.offered.get(source) if source is not None else None
+        if source is None or local is None or not is_watched(local.type):
+            return True
+        if self._exports.description(source) is None:
+            return True  # its publisher has just gone
+        names = {name for node in message.nodes if (name := self._name(attached, node))}
+        shown = self._shown.setdefault((attached.peer, source), {})
+        for name in shown.keys() - names:
+            shown.pop(name).close()
+        for name in sorted(names - shown.keys()):
+            if self._count(attached.peer) >= limits.AUDIENCES_MAX:
+                text = f"{attached.link.name}: more than {limits.AUDIENCES_MAX} of its nodes listen to actions here"
+                now = asyncio.get_running_loop().time()
+                self._refusals.refuse(now, "audience.too_many", attached.link.name, text)
+                break
+            shown[name] = self._connect(source, local.uri, name)
+        if not shown:
+            del self._shown[attached.peer, source]
+        return True
+
+    def _name(self, attached: PeerSession, node: str) -> str:
+        """What a listener is here; one that a relay names for another module is what stands for that; else empty."""
+        whose = proxied_node(node)
+        if whose is None:
+            return proxy_name(attached.inbound.prefix, node)
+        relay = attached.link.name
+        return node if any((o.name, via) == (whose[0], relay) for o, via in self._imports.ways) else ""
+
+    def _count(self, peer: int) -> int:
+        return sum(len(shown) for (owner, _), shown in self._shown.items() if owner == peer)
+
+    def _connect(self, source: Source, uri: str, name: str) -> PublisherConnection:
+        _log.debug("> %s: %s listens", source, name)
+        connection = PublisherConnection(source.topic, uri, name, on_message=_ignore, on_parts=_IgnoreParts())
+        connection.start()
+        return connection
+
+    def route_over(self, peer: int, source: Source) -> None:
+        """A source goes to a peer no longer: what stood for its listeners leaves."""
+        for connection in self._shown.pop((peer, source), {}).values():
+            connection.close()
+
+    def link_down(self, attached: PeerSession) -> None:
+        """A link is gone: nobody over there can be seen any more."""
+        for peer, source in [key for key in self._shown if key[0] == attached.peer]:
+            self.route_over(peer, source)
+        for key in [key for key in self._told if key[0] == attached.peer]:
+            del self._told[key]
+
+    async def close(self) -> None:
+        """Leave all publishers."""
+        if self._soon is not None:
+            self._soon.cancel()
+        for peer, source in list(self._shown):
+            self.route_over(peer, source)

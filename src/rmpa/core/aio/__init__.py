@@ -1,1 +1,0 @@
-"""asyncio, sockets and the system clock for the rooms above."""

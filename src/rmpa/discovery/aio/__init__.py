@@ -1,1 +1,0 @@
-"""Sockets, interfaces and timers that drive the roster."""

@@ -1,0 +1,308 @@
+"""Discovery at work: sockets, interfaces and one timer around the roster machine."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.counters import Counters, RefusalLog
+from rmpa.discovery.events import PeerConflict, SendMulticast
+from rmpa.discovery.io import sockets
+from rmpa.discovery.io.interfaces import (
+    Interface,
+    InterfaceWatcher,
+    choose,
+    further_addresses,
+    list_interfaces,
+    unknown_names,
+)
+from rmpa.discovery.io.packet_filter import PacketFilter
+from rmpa.discovery.io.seeds import SeedResolver, resolve_ipv4
+from rmpa.discovery.roster import Roster
+from rmpa.runtime.event_loop import yield_to_data
+from rmpa.runtime.system_clock import SystemClock
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Callable
+    from ipaddress import IPv4Address
+
+    from rmpa.config.settings import Settings
+    from rmpa.core.clock import Clock
+    from rmpa.core.guid import Guid
+    from rmpa.core.identity import Identity
+    from rmpa.discovery.events import Address, Event, Output, PeerView
+
+_log = logging.getLogger(__name__)
+
+_ALL_NETWORKS: Final = ""
+_ALONE: Final = "no interface that can carry multicast is up: other machines are only found by --seed"
+
+
+class Discovery:
+    """Finds the other agents and is found by them.
+
+    Args:
+        identity: Our own.
+        settings: Group, port, domain, interfaces, seeds, and whether to use multicast.
+        udp_socket: Bound to the mesh's port, non-blocking; lent, not closed here.
+        on_event: Called in the loop with each event of the roster, in order.
+        on_interfaces: Called in the loop with all interfaces, used or not, after they changed; says whether our
+            identity still fits them. If not we are about to be closed, and announce nothing more.
+        clock: Tells monotonic seconds.
+        look: How interfaces are listed.
+        resolve: How the host name of a seed is looked up; runs in a thread.
+    """
+
+    def __init__(
+        self,
+        identity: Identity,
+        settings: Settings,
+        udp_socket: socket.socket,
+        *,
+        on_event: Callable[[Event], None],
+        on_interfaces: Callable[[tuple[Interface, ...]], bool] = lambda _: True,
+        clock: Clock | None = None,
+        look: Callable[[], tuple[Interface, ...]] = list_interfaces,
+        resolve: Callable[[str], list[str]] = resolve_ipv4,
+    ) -> None:
+        self.counters = Counters()
+        self._identity = identity
+        self._settings = settings
+        self._udp = udp_socket
+        self._on_event = on_event
+        self._on_interfaces = on_interfaces
+        self._clock: Clock = clock if clock is not None else SystemClock()
+        self._roster = Roster(identity, rng=random.random, multicast=settings.multicast, counters=self.counters)
+        self._intake = PacketFilter(settings.domain, self.counters, is_linked=self._roster.is_linked)
+        self._refusals = RefusalLog(_log, self.counters)
+        self._group: Address = (settings.group, settings.discovery_port)
+        self._sender = sockets.Sender(udp_socket, self._group, self.counters)
+        self._watcher = InterfaceWatcher(self._interfaces_changed, look=look)
+        self._seeds = SeedResolver(settings.seeds, settings.discovery_port, self._seeds_changed, resolve=resolve)
+        self._interfaces: tuple[Interface, ...] = ()
+        self._receivers: list[socket.socket] = []
+        self._membership: sockets.Membership | None = None
+        self._warned: set[str] = set()
+        self._timer: asyncio.TimerHandle | None = None
+        self._started = False
+        self._flushing = False
+
+    # --- life -------------------------------------------------------------------------------------------------
+
+    async def start(self) -> None:
+        """Listen, and announce ourselves. What cannot be had is said once, and the rest works."""
+        self._started = True
+        loop = asyncio.get_running_loop()
+        loop.add_reader(self._udp.fileno(), partial(self._readable, self._udp, multicast=False))
+        self._open_door()
+        if self._settings.multicast:
+            self._open_group()
+        everything = self._watcher.start()
+        self._use(everything)
+        now = self._clock.now()
+        self._roster.interfaces_changed(now, self._further_addresses(everything))
+        self._roster.start(now)
+        self._flush()
+        self._seeds.start()
+
+    async def close(self) -> None:
+        """Say goodbye and stop."""
+        if not self._started:
+            return
+        self._started = False
+        self._watcher.close()
+        await self._seeds.close()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self._roster.goodbye(self._clock.now())
+        self._flush()
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(self._udp.fileno())
+        for sock in self._receivers:
+            loop.remove_reader(sock.fileno())
+            sock.close()
+        self._receivers.clear()
+        self._membership = None
+
+    # --- what others tell it ----------------------------------------------------------------------------------
+
+    def link_up(self, identity: Identity, endpoint: Address | None = None) -> None:
+        """A link to this peer is up; while it is, the peer is in the roster.
+
+        Args:
+            identity: As the link's handshake said.
+            endpoint: Where the peer's beacons can be sent to, if that is known: its address and its mesh port
+                (not the port of a connection that it dialled).
+        """
+        self._roster.link_up(identity, self._clock.now(), endpoint)
+        self._flush()
+
+    def link_down(self, guid: Guid, instance: bytes | None = None) -> None:
+        """The link to this peer (to this run of it, if ``instance`` is given) fell."""
+        self._roster.link_down(guid, self._clock.now(), instance)
+        self._flush()
+
+    def peers(self) -> tuple[PeerView, ...]:
+        """The roster as it is now, in GUID order."""
+        return self._roster.peers()
+
+    @property
+    def interfaces(self) -> tuple[Interface, ...]:
+        """Those in use."""
+        return self._interfaces
+
+    @property
+    def identity(self) -> Identity:
+        """Our own, with the addresses that we have now."""
+        return self._roster.identity
+
+    # --- sockets ----------------------------------------------------------------------------------------------
+
+    def _open_door(self) -> None:
+        """Unicasts to the discovery port, for seeds without a port; one agent of a machine gets them."""
+        self._receiver(_ALL_NETWORKS, multicast=False, lost="seeds of others must name our port")
+
+    def _open_group(self) -> None:
+        sock = self._receiver(self._group[0], multicast=True, lost="no multicast is heard; use --seed")
+        if sock is not None:
+            self._membership = sockets.Membership(sock, self._group[0])
+
+    def _receiver(self, host: str, *, multicast: bool, lost: str) -> socket.socket | None:
+        port = self._group[1]
+        try:
+            sock = sockets.open_receiver(host, port)
+        except OSError as error:
+            self._warn(
+                f"cannot listen at {host or '*'}:{port} ({error.strerror}): {lost}, or choose another --multicast"
+            )
+            return None
+        self._receivers.append(sock)
+        asyncio.get_running_loop().add_reader(sock.fileno(), partial(self._readable, sock, multicast=multicast))
+        return sock
+
+    def _readable(self, sock: socket.socket, *, multicast: bool) -> None:
+        """Take a bounded number of packets, with data between them: a flood must not delay it."""
+        now = self._clock.now()
+        for _ in range(limits.BEACONS_PER_WAKE):
+            yield_to_data()
+            try:
+                data, source, index = sockets.receive(sock)
+            except (BlockingIOError, InterruptedError):
+                break
+            except OSError as error:  # an ICMP error that some earlier packet of ours caused
+                _log.debug("< %s", error)
+                continue
+            beacon = self._intake.take(data, source, now, multicast=multicast, interface=index)
+            if beacon is not None:
+                _log.debug("< %s:%d (interface %d): %s", *source, index, beacon)
+                self._roster.receive(beacon, source, now, multicast=multicast)
+        self._flush()
+
+    # --- interfaces and seeds ---------------------------------------------------------------------------------
+
+    def _interfaces_changed(self, everything: tuple[Interface, ...]) -> None:
+        self._use(everything)
+        if not self._on_interfaces(everything):
+            return
+        self._roster.interfaces_changed(self._clock.now(), self._further_addresses(everything))
+        self._flush()
+
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know of the network, ready to read."""
+        silent = [
+            f"seed {host}:{port}: no answer; is `rmpa up` running there, in domain {self._settings.domain} too, "
+            "and its UDP port open?"
+            for host, port in self._roster.silent_seeds()
+        ]
+        return (*sorted(self._warned), *silent)
+
+    def _further_addresses(self, everything: tuple[Interface, ...]) -> tuple[IPv4Address, ...]:
+        wanted = self._settings.interfaces
+        mine = [i for i in everything if i.up and (not wanted or i.name in wanted)]
+        return further_addresses(mine, self._identity.guid.address)
+
+    def _use(self, everything: tuple[Interface, ...]) -> None:
+        """Join on what is there now."""
+        wanted = self._settings.interfaces
+        before = self._interfaces
+        self._interfaces = choose(everything, wanted)
+        if problem := unknown_names(everything, wanted):
+            self._warn(problem)
+        if not self._settings.multicast:
+            return
+        if self._interfaces != before:
+            _log.info("= multicast %s:%d on %s", *self._group, ", ".join(map(str, self._interfaces)) or "nothing")
+        if any(not i.loopback for i in self._interfaces) or (wanted and self._interfaces):
+            self._warned.discard(_ALONE)
+        else:
+            self._warn(_ALONE)
+        if self._membership is not None:
+            for name, error in self._membership.update(self._interfaces).items():
+                self._warn(f"{name}: the group cannot be joined ({error.strerror}); tried again when it changes")
+
+    def _seeds_changed(self, addresses: tuple[Address, ...]) -> None:
+        self._roster.set_seeds(addresses)
+        self._flush()
+
+    def _warn(self, text: str) -> None:
+        if text not in self._warned:
+            self._warned.add(text)
+            _log.warning("! %s", text)
+
+    # --- the roster's wishes ----------------------------------------------------------------------------------
+
+    def _flush(self) -> None:
+        """Send, tell, and set the timer; a handler of an event may call us again meanwhile."""
+        if self._flushing:
+            return
+        self._flushing = True
+        try:
+            while (outputs := self._roster.outputs()) or (events := self._roster.events()):
+                if outputs:
+                    self._send(outputs)
+                    continue
+                for event in events:
+                    yield_to_data()
+                    self._tell(event)
+        finally:
+            self._flushing = False
+            self._arm()
+
+    def _send(self, outputs: list[Output]) -> None:
+        for output in outputs:
+            yield_to_data()
+            data = output.beacon.serialize()
+            if isinstance(output, SendMulticast):
+                _log.debug("> group: %s", output.beacon)
+                self._sender.multicast(data, self._interfaces)
+            else:
+                _log.debug("> %s:%d: %s", *output.address, output.beacon)
+                self._sender.unicast(data, output.address)
+
+    def _tell(self, event: Event) -> None:
+        if isinstance(event, PeerConflict):
+            who = str(event.identity.guid.address)
+            self._refusals.refuse(self._clock.now(), f"conflict.{event.kind.name.lower()}", who, str(event))
+        self._on_event(event)
+
+    def _arm(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if not self._started:
+            return
+        when = self._roster.next_timer()
+        if when is not None:
+            delay = max(0.0, when - self._clock.now())
+            self._timer = asyncio.get_running_loop().call_later(delay, self._timer_due)
+
+    def _timer_due(self) -> None:
+        self._timer = None
+        self._roster.handle_timer(self._clock.now())
+        self._flush()

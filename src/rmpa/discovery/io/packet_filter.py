@@ -1,0 +1,113 @@
+"""What stands between the sockets and the parser: repeats, floods and malformed packets end here."""
+
+from __future__ import annotations
+
+import logging
+from collections import OrderedDict
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.counters import RefusalLog
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.token_bucket import TokenBucket
+from rmpa.discovery.beacon import Beacon, BeaconOtherDomain, BeaconOtherVersion, sender_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.core.counters import Counters
+    from rmpa.core.guid import Guid
+    from rmpa.discovery.events import Address
+
+_log = logging.getLogger(__name__)
+
+_INTERFACES: Final = 256
+
+
+class PacketFilter:
+    """Turns packets into beacons, or into counts.
+
+    Args:
+        domain: Ours.
+        counters: ``beacon.in``, ``beacon.repeated``, ``beacon.flood``, ``beacon.unlinked_limited``,
+            ``beacon.other_domain``, ``beacon.version``, ``beacon.malformed``.
+        is_linked: Whether there is a link with a run of a peer; its beacons, and our own echoes, are never too many.
+    """
+
+    def __init__(
+        self, domain: int, counters: Counters, *, is_linked: Callable[[Guid, bytes], bool] = lambda *_: False
+    ) -> None:
+        self._domain = domain
+        self._counters = counters
+        self._is_linked = is_linked
+        self._unlinked: dict[int, TokenBucket] = {}
+        self._refusals = RefusalLog(_log, counters)
+        self._recent: OrderedDict[bytes, None] = OrderedDict()
+        self._sources: OrderedDict[str, tuple[float, int]] = OrderedDict()
+
+    def take(self, data: bytes, source: Address, now: float, *, multicast: bool, interface: int = 0) -> Beacon | None:
+        """The beacon in a packet; ``None`` if there is none, which is counted and, where it helps, logged.
+
+        Other domains have ports of their own, and are none of our business. But one that speaks to us alone was
+        given our address, and waits for an answer.
+
+        Args:
+            data: The packet.
+            source: The address and port it came from.
+            now: Monotonic seconds.
+            multicast: Whether it came to the group.
+            interface: The index of the interface it came by: a flood on one leaves the others alone.
+        """
+        host, _ = source
+        if self._floods(host, now):
+            self._refusals.refuse(
+                now, "beacon.flood", host, f"{host} sends too many packets to the discovery port; the rest is ignored"
+            )
+            return None
+        if data in self._recent:
+            self._counters.add("beacon.repeated")
+            return None
+        if len(data) <= limits.BEACON_MAX_BYTES:
+            self._recent[data] = None
+            if len(self._recent) > limits.BEACON_REPEATS:
+                self._recent.popitem(last=False)
+        try:
+            if not self._is_linked(*sender_of(data, self._domain)) and not self._may_be_new(interface, now):
+                self._counters.add("beacon.unlinked_limited")
+                return None
+            beacon = Beacon.parse(data, self._domain)
+        except BeaconOtherDomain as error:
+            if multicast:
+                self._counters.add("beacon.other_domain")
+            else:
+                remedy = f"we are of domain {self._domain}: start both with the same --domain (ROS_DOMAIN_ID)"
+                self._refusals.refuse(now, "beacon.other_domain", host, f"the peer at {host} {error}, {remedy}")
+        except BeaconOtherVersion as error:
+            self._refusals.refuse(now, "beacon.version", host, f"the peer at {host} {error}")
+        except RemoteProtocolError as error:
+            self._refusals.refuse(now, "beacon.malformed", host, f"from {host}: {error}; is another program there?")
+        else:
+            self._counters.add("beacon.in")
+            return beacon
+        return None
+
+    def _may_be_new(self, interface: int, now: float) -> bool:
+        """Whether one more of a peer without a link is dealt with."""
+        bucket = self._unlinked.get(interface)
+        if bucket is None:
+            if len(self._unlinked) >= _INTERFACES:
+                self._unlinked.clear()  # those of containers come and go, each with an index of its own
+            bucket = self._unlinked[interface] = TokenBucket(
+                limits.BEACONS_UNLINKED_PER_SECOND, limits.BEACONS_UNLINKED_BURST
+            )
+        return bucket.take(now)
+
+    def _floods(self, host: str, now: float) -> bool:
+        since, count = self._sources.get(host, (now, 0))
+        if now - since >= 1.0:
+            since, count = now, 0
+        self._sources[host] = (since, count + 1)
+        self._sources.move_to_end(host)
+        if len(self._sources) > limits.BEACON_SOURCES_MAX:
+            self._sources.popitem(last=False)
+        return count >= limits.BEACONS_PER_SOURCE

@@ -1,1 +1,0 @@
-"""Looks at the machine: sockets, files below /proc, other programs."""

@@ -1,1 +1,0 @@
-"""Dialling, accepting and driving links with asyncio."""

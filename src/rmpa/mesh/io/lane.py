@@ -1,0 +1,138 @@
+"""The sending end of one lane: where a route's messages go, whether its connection stands or not.
+
+What is sent while there is no connection waits within the lane's bounds, and leaves first when there is one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from rmpa.core import limits
+from rmpa.core.outbox import FIRST, LAST, Outbox, QueuedMessage
+from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pack_fragment_header
+
+if TYPE_CHECKING:
+    from rmpa.runtime.stream import Buffer, Stream
+
+
+class LaneSender:
+    """Sends data frames by one lane of a link.
+
+    Args:
+        name: ``express`` or ``bulk``, for people.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.outbox = Outbox(limits.ROUTE_QUEUE_MESSAGES, limits.LINK_QUEUE_BYTES, frame=pack_fragment_header)
+        self.ended = False
+        """Whether the link is leaving: nothing is sent, nothing waits."""
+        self._stream: Stream | None = None
+        self._open: dict[int, QueuedMessage] = {}
+        self._loop = asyncio.get_running_loop()
+
+    @property
+    def connected(self) -> bool:
+        """Whether the lane has its connection."""
+        return self._stream is not None
+
+    def connect(self, stream: Stream) -> None:
+        """Use a connection from now on, first for what waits."""
+        self._stream = stream
+        stream.adopt(self.outbox, pack_fragment_header)
+
+    def disconnect(self) -> int:
+        """The connection is gone; return how many messages were torn, those on their way not counted."""
+        self._stream = None
+        for parcel in self._open.values():
+            if 0 < parcel.sent < parcel.size:
+                parcel.dropped = True  # its first bytes went down with the connection
+        self._open.clear()
+        return self.outbox.reset()
+
+    def end(self) -> None:
+        """The link leaves; what waits has its drain time to follow."""
+        self.ended = True
+        self._stream = None
+
+    def clear(self) -> None:
+        """The link is gone: let go of what its drain time was too short for."""
+        self.outbox.clear()
+        self._open.clear()
+
+    def send(self, route: int, sequence: int, stamp_ns: int, payload: Buffer) -> int:
+        """Send one message; what the socket does not take is queued, keep-last, and copied only then.
+
+        Args:
+            route: The route's id, 32 bits.
+            sequence: The message's number on its route; its low 32 bits are sent.
+            stamp_ns: When it was published, wall clock.
+            payload: Its bytes, not kept after the call.
+
+        Returns:
+            How many older messages were dropped to make room. Without effect (0) once the link is leaving.
+        """
+        size = len(payload)
+        if size > limits.FRAGMENT_BYTES:
+            return self.extend(self._parcel(route, size, sequence, stamp_ns), payload)
+        header = pack_data_header(size, route, sequence, stamp_ns)
+        if self._stream is not None:
+            return self._stream.send((header, payload), route)
+        return 0 if self.ended else self.outbox.push(b"".join((header, payload)), route, self._loop.time())
+
+    def open(self, route: int, size: int, sequence: int, stamp_ns: int) -> QueuedMessage:
+        """Begin a message of ``size`` bytes that follow by ``extend``, before the next one of its route."""
+        parcel = self._open[route] = self._parcel(route, size, sequence, stamp_ns)
+        return parcel
+
+    def _parcel(self, route: int, size: int, sequence: int, stamp_ns: int) -> QueuedMessage:
+        return QueuedMessage(route, size, sequence & 0xFFFFFFFF, stamp_ns, self._loop.time())
+
+    def extend(self, parcel: QueuedMessage, data: Buffer) -> int:
+        """Send further bytes of a message; return as for ``send``."""
+        if self._stream is not None:
+            return self._stream.extend(parcel, data)
+        if self.ended:
+            return 0
+        return self.outbox.extend(parcel, bytes(data))
+
+    def abandon(self, parcel: QueuedMessage) -> None:
+        """The rest of a message will never come."""
+        if self._stream is not None:
+            self._stream.abandon(parcel)
+        elif not self.ended:
+            self.outbox.abandon(parcel)
+
+    def fence(self, route: int, number: int) -> None:
+        """Send a fence behind the messages of a route: it is answered when all of them have arrived."""
+        frame = Frame(FrameKind.FENCE, route=route, sequence=number, flags=FIRST | LAST).serialize()
+        if self._stream is not None:
+            self._stream.send_mark(frame, route)
+        elif not self.ended:
+            self.outbox.push(frame, route, self._loop.time(), pinned=True)
+
+    def set_terms(self, route: int, depth: int, max_age: float | None, *, strict: bool) -> None:
+        """Bound what may wait of one route; see ``core.outbox``.
+
+        A route whose messages never grow too old is a reliable one: its sender's window bounds it, and nothing of it
+        is dropped for the bytes of all routes.
+        """
+        self.outbox.set_terms(route, depth, max_age, strict=strict, spared=max_age is None)
+
+    def discard(self, route: int) -> None:
+        """Let go of what waits of a route, and of its terms; it goes on."""
+        self.outbox.discard(route)
+        self._open.pop(route, None)
+        if self._stream is not None:
+            self._stream.pump()
+
+    def close_route(self, route: int) -> int:
+        """Discard what waits of a closed route; return how many messages that were. Its counts end too."""
+        count = self.outbox.discard(route)
+        self._open.pop(route, None)
+        self.outbox.dropped.pop(route, None)
+        self.outbox.expired.pop(route, None)
+        if self._stream is not None:
+            self._stream.pump()
+        return count

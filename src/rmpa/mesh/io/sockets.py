@@ -1,0 +1,111 @@
+"""What a link's socket is asked for, and what the system does not grant."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import socket
+import struct
+import sys
+import termios
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.mesh.path_mtu import TcpSample
+
+if TYPE_CHECKING:
+    from rmpa.config.settings import LaneSettings
+    from rmpa.core.counters import Counters
+
+
+_INFO_BYTES: Final = 256
+_RETRANSMITS: Final = struct.Struct("=2xB")  # tcpi_retransmits of struct tcp_info, linux/tcp.h
+_SND_MSS: Final = struct.Struct("=16xI")
+_PMTU: Final = struct.Struct("=60xI")
+_RTT: Final = struct.Struct("=68xI")  # microseconds
+_BYTES_ACKED: Final = struct.Struct("=120xQ")
+_DELIVERED: Final = struct.Struct("=192xI")  # since Linux 4.18
+_TIME_STAMPS: Final = 12
+
+
+def tune_express(sock: socket.socket, lanes: LaneSettings, counters: Counters) -> None:
+    """Set up the express lane: no Nagle, dead peers noticed, little waits in the kernel, first in every queue."""
+    _tune(sock, limits.LINK_UNSENT_BYTES, lanes.express_dscp, lanes.express_priority, counters)
+
+
+def tune_bulk(sock: socket.socket, lanes: LaneSettings, counters: Counters) -> None:
+    """Set up the bulk lane: as little as possible waits in the kernel, behind everything else."""
+    _tune(sock, limits.BULK_UNSENT_BYTES, lanes.bulk_dscp, lanes.bulk_priority, counters)
+
+
+def unacknowledged(sock: socket.socket) -> int:
+    """Bytes that were sent and that the other side's kernel has not acknowledged, those not sent yet included.
+
+    0 for a socket that is closed.
+    """
+    if sock.fileno() < 0:
+        return 0
+    try:
+        return int.from_bytes(fcntl.ioctl(sock, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
+    except OSError:
+        return 0
+
+
+def sample(sock: socket.socket) -> TcpSample | None:
+    """How the data of a connection gets on; ``None`` where the kernel does not tell, or the socket is closed."""
+    try:
+        info = sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _INFO_BYTES)
+        return TcpSample(
+            unacknowledged(sock),
+            _RETRANSMITS.unpack_from(info)[0],
+            _BYTES_ACKED.unpack_from(info)[0],
+            _DELIVERED.unpack_from(info)[0],
+            _RTT.unpack_from(info)[0] * 1e-6,
+        )
+    except (OSError, struct.error):
+        return None
+
+
+def packet_bytes(sock: socket.socket) -> int | None:
+    """Bytes of the largest packet that the kernel sends on a connection, headers included; ``None`` if unknown."""
+    try:
+        info = sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _INFO_BYTES)
+        mss: int = _SND_MSS.unpack_from(info)[0]
+        mtu: int = _PMTU.unpack_from(info)[0]
+    except (OSError, struct.error):
+        return None
+    return min(mtu, mss + limits.TCP_HEADERS)
+
+
+def limit_segments(sock: socket.socket, segment: int, counters: Counters) -> None:
+    """Before it connects: both sides send segments of at most so many bytes (TCP_MAXSEG)."""
+    try:
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, segment + _TIME_STAMPS)
+    except OSError:
+        counters.add("link.option_refused")
+
+
+def reset_at_close(sock: socket.socket) -> None:
+    """Let ``close`` throw away what waits and reset the connection: an orderly end would wait behind lost data."""
+    with contextlib.suppress(OSError):
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+
+
+def _tune(sock: socket.socket, unsent: int, dscp: int, priority: int, counters: Counters) -> None:
+    """Set the options of a lane's socket.
+
+    IP_TOS comes before SO_PRIORITY because setting it sets the priority too. An option that the system refuses
+    only costs quality of service: it is counted as ``link.option_refused`` and the link runs on.
+    """
+    options = (
+        (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),
+        (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(limits.LINK_UNACKED * 1000)),
+        (socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, unsent),
+        (socket.IPPROTO_IP, socket.IP_TOS, dscp << 2),
+        (socket.SOL_SOCKET, socket.SO_PRIORITY, priority),
+    )
+    for level, name, value in options:
+        try:
+            sock.setsockopt(level, name, value)
+        except OSError:
+            counters.add("link.option_refused")

@@ -1,0 +1,110 @@
+"""Reads the rules of nftables and iptables for signs that they keep agents apart.
+
+Signs, not proofs: what a packet meets is decided by the whole set of rules. A chain that drops what no rule lets in,
+and rules that name our ports, are what is looked for; the check of multicast sends a packet besides.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import Final
+
+from rmpa.observe.doctor.finding import Finding, FindingLevel
+
+_DROPS: Final = re.compile(r"\b(drop|reject|DROP|REJECT)\b")
+_ACCEPTS: Final = re.compile(r"\b(accept|ACCEPT)\b")
+_HOOK: Final = re.compile(r"type filter hook input .*policy (\w+)")
+_BLOCK: Final = re.compile(r"(table|chain) (.+?) \{")
+_RANGE: Final = re.compile(r"\b(\d{1,5})[-:](\d{1,5})\b")
+_NUMBER: Final = re.compile(r"\b\d{1,5}\b")
+
+
+@dataclass(slots=True)
+class FirewallRules:
+    """What is looked for in a set of rules.
+
+    Args:
+        source: The program that showed them.
+        closed: Chains for what comes in whose policy is to drop it.
+        drops: Rules that drop what is for a port of ours.
+        accepts: Rules that let such in.
+        count: Of all rules.
+    """
+
+    source: str
+    closed: list[str] = field(default_factory=list)
+    drops: list[str] = field(default_factory=list)
+    accepts: list[str] = field(default_factory=list)
+    count: int = 0
+
+    def take(self, rule: str, ports: frozenset[int]) -> None:
+        """Look at one rule."""
+        self.count += 1
+        if not names_port(rule, ports):
+            return
+        if _DROPS.search(rule):
+            self.drops.append(rule)
+        elif _ACCEPTS.search(rule):
+            self.accepts.append(rule)
+
+
+def names_port(rule: str, ports: frozenset[int]) -> bool:
+    """Whether a rule is about one of the ports, by number or within a range."""
+    _, found, behind = rule.partition("dport")
+    if not found:
+        return False
+    spans = [(int(low), int(high)) for low, high in _RANGE.findall(behind)]
+    if any(low <= port <= high for low, high in spans for port in ports):
+        return True
+    return not ports.isdisjoint(map(int, _NUMBER.findall(_RANGE.sub("", behind))))
+
+
+def read_nft(text: str, ports: frozenset[int]) -> FirewallRules:
+    """Read what ``nft list ruleset`` prints."""
+    rules = FirewallRules("nft")
+    table = chain = ""
+    for line in map(str.strip, text.splitlines()):
+        block = _BLOCK.match(line)
+        if block is not None:
+            table, chain = (block[2], "") if block[1] == "table" else (table, block[2])
+        elif (hook := _HOOK.match(line)) is not None:
+            if hook[1] == "drop":
+                rules.closed.append(f"{table} {chain}".strip())
+        elif line and line != "}" and chain and not line.startswith("type "):
+            rules.take(line, ports)
+    return rules
+
+
+def read_iptables(text: str, ports: frozenset[int]) -> FirewallRules:
+    """Read what ``iptables -S`` prints."""
+    rules = FirewallRules("iptables")
+    for line in map(str.strip, text.splitlines()):
+        if line in ("-P INPUT DROP", "-P INPUT REJECT"):
+            rules.closed.append("INPUT")
+        elif line.startswith("-A "):
+            rules.take(line, ports)
+    return rules
+
+
+def judge_rules(rules: FirewallRules, ports: str) -> Finding:
+    """Say what the rules mean for agents.
+
+    Args:
+        rules: As read.
+        ports: Those that must be open, ready to read.
+    """
+    if rules.drops:
+        remedy = f"take it out, or let {ports} in before it"
+        return Finding(
+            "firewall", rules.source, FindingLevel.FAIL, f"drops what agents send: {rules.drops[0]}", remedy
+        )
+    if rules.closed and not rules.accepts:
+        text = f"{', '.join(rules.closed)} drops what no rule lets in, and no rule names our ports"
+        remedy = f"let in {ports}; `rmpa up --port N` gives the mesh a port that rules can name"
+        return Finding("firewall", rules.source, FindingLevel.WARN, text, remedy)
+    if rules.closed:
+        return Finding("firewall", rules.source, FindingLevel.OK, f"lets ours in: {rules.accepts[0]}")
+    return Finding(
+        "firewall", rules.source, FindingLevel.OK, f"{rules.count} rules, and none against agents that we see"
+    )

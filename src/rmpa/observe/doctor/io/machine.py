@@ -1,0 +1,87 @@
+"""Looks at clock, rights and files of this machine."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import resource
+import threading
+import time
+from pathlib import Path
+from typing import Final
+
+from rmpa.core import limits
+from rmpa.observe.doctor.machine import KernelRights, WallClock
+
+_UNSYNCHRONISED: Final = 0x40
+"""STA_UNSYNC of adjtimex(2)."""
+
+
+class _Timex(ctypes.Structure):
+    """The beginning of ``struct timex``; the rest is room for the kernel to write into."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint),
+        ("offset", ctypes.c_long),
+        ("freq", ctypes.c_long),
+        ("maxerror", ctypes.c_long),
+        ("esterror", ctypes.c_long),
+        ("status", ctypes.c_int),
+        ("rest", ctypes.c_char * 512),
+    )
+
+
+def look_at_clock() -> WallClock:
+    """Watch the clock for a moment, and ask the kernel whether it follows another one."""
+    before = time.time() - time.monotonic()
+    time.sleep(limits.DOCTOR_CLOCK_LOOK)
+    after = time.time() - time.monotonic()
+    told = _Timex()
+    try:
+        answered: bool = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(told)) >= 0
+    except (OSError, AttributeError):
+        answered = False
+    return WallClock(
+        stepped=after - before,
+        synchronised=not told.status & _UNSYNCHRONISED if answered else None,
+        error=told.maxerror * 1e-6,
+        year=time.gmtime().tm_year,
+    )
+
+
+def look_at_rights(*, wanted: bool, agents: bool) -> KernelRights:
+    """Try SCHED_FIFO in a thread that ends at once, and read the limits.
+
+    Args:
+        wanted: Whether the settings ask for real time.
+        agents: Whether an agent runs, which tells its own limit of open files.
+    """
+    refusal = ["it was not tried"]
+
+    def attempt() -> None:
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+            refusal[0] = ""
+        except OSError as error:
+            refusal[0] = error.strerror or str(error)
+
+    thread = threading.Thread(target=attempt)
+    thread.start()
+    thread.join()
+    memlock = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
+    files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    free = memlock == resource.RLIM_INFINITY or _may_lock()
+    return KernelRights(
+        fifo=refusal[0],
+        memlock=None if free else memlock,
+        wanted=wanted,
+        files=None if agents else limits.OPEN_FILES if files == resource.RLIM_INFINITY else files,
+    )
+
+
+def _may_lock() -> bool:
+    """Whether we are above the limit of locked memory (CAP_IPC_LOCK)."""
+    for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
+        if line.startswith("CapEff:"):
+            return bool(int(line.split()[1], 16) >> 14 & 1)
+    return False

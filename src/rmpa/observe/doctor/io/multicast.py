@@ -1,0 +1,177 @@
+"""Multicast by hand: one socket that sends on a chosen interface, one that hears on chosen ones."""
+
+from __future__ import annotations
+
+import secrets
+import select
+import socket
+import struct
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Self
+
+from rmpa.core import limits
+from rmpa.core.errors import ConfigError, StartError
+from rmpa.discovery.beacon import MAGIC, VERSION, BeaconKind
+from rmpa.discovery.io.sockets import Membership, open_receiver, receive
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from rmpa.discovery.io.interfaces import Interface
+
+_PKTINFO: Final = struct.Struct("@i4s4s")
+_IP_PKTINFO: Final = 8  # Linux's (linux/in.h); not in the socket module of every supported Python
+_NO_DOMAIN: Final = 0xFFFF
+"""Beyond every domain: agents pass such a beacon over without a word."""
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """One packet of the group.
+
+    Args:
+        data: Its payload.
+        source: ``address:port`` of its sender.
+        interface: The name of the interface that it came by.
+    """
+
+    data: bytes
+    source: str
+    interface: str
+
+
+class GroupSender:
+    """Sends to one group, interface by interface; a context manager.
+
+    Args:
+        group: Its address.
+        port: Its port.
+
+    Raises:
+        ConfigError: It is no multicast group.
+    """
+
+    def __init__(self, group: str, port: int) -> None:
+        _check_group(group)
+        self._to = (group, port)
+        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+        self._sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, limits.MULTICAST_TTL)
+        self._sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._sock.close()
+
+    def send(self, interface: Interface, data: bytes) -> str:
+        """Send one packet; return why it could not be, or an empty string."""
+        source = interface.addresses[0].packed if interface.addresses else bytes(4)
+        ancillary = [(socket.IPPROTO_IP, _IP_PKTINFO, _PKTINFO.pack(interface.index, source, bytes(4)))]
+        try:
+            self._sock.sendmsg([data], ancillary, 0, self._to)
+        except OSError as error:
+            return error.strerror or str(error)
+        return ""
+
+
+class GroupReceiver:
+    """Hears what comes for one group on the interfaces that it joined; a context manager.
+
+    Args:
+        group: Its address.
+        port: Its port; agents and others may have it too.
+
+    Raises:
+        ConfigError: It is no multicast group.
+        StartError: Somebody holds the port and does not share it.
+    """
+
+    def __init__(self, group: str, port: int) -> None:
+        _check_group(group)
+        try:
+            self._sock = open_receiver(group, port)
+        except OSError as error:
+            problem = f"cannot be opened ({error.strerror})"
+            raise StartError(f"UDP port {port}", problem, "`ss -ulnp` shows who has it") from None
+        self._members = Membership(self._sock, group)
+        self._names: dict[int, str] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._sock.close()
+
+    def join(self, interfaces: Iterable[Interface]) -> dict[str, str]:
+        """Join the group on these; return the names of those that refused, and why."""
+        wanted = tuple(interfaces)
+        self._names = {interface.index: interface.name for interface in wanted}
+        refused = self._members.update(wanted)
+        return {name: error.strerror or str(error) for name, error in refused.items()}
+
+    def wait(self, timeout: float | None = None) -> Packet | None:
+        """The next packet, or ``None`` if none came in time (seconds; ``None``: for ever)."""
+        if not select.select([self._sock], [], [], None if timeout is None else max(0.0, timeout))[0]:
+            return None
+        try:
+            data, (host, port), index = receive(self._sock)
+        except BlockingIOError:
+            return None  # its checksum was wrong
+        return Packet(data, f"{host}:{port}", self._names.get(index, f"interface {index}"))
+
+
+@dataclass(frozen=True, slots=True)
+class FlowOutcome:
+    """What became of a packet that was sent to ourselves on one interface.
+
+    Args:
+        interface: Which.
+        problem: Why it could not be sent or joined; empty if it could.
+        after: Seconds until it came back; ``None`` if it did not.
+    """
+
+    interface: Interface
+    problem: str = ""
+    after: float | None = None
+
+
+def hear_ourselves(interfaces: Iterable[Interface], group: str, port: int) -> tuple[FlowOutcome, ...]:
+    """Send one packet on each interface, and listen for it there as an agent does.
+
+    The packets are beacons of a domain that there cannot be, so agents that hear them pass them over.
+
+    Raises:
+        StartError: Somebody holds the port and does not share it.
+    """
+    wanted = tuple(interfaces)
+    found: dict[str, FlowOutcome] = {}
+    with GroupReceiver(group, port) as receiver, GroupSender(group, port) as sender:
+        refused = receiver.join(wanted)
+        sent: dict[bytes, tuple[Interface, float]] = {}
+        for interface in wanted:
+            token = struct.pack(">4sBBH", MAGIC, VERSION, BeaconKind.HEARTBEAT, _NO_DOMAIN) + secrets.token_bytes(16)
+            problem = refused.get(interface.name) or sender.send(interface, token)
+            found[interface.name] = FlowOutcome(interface, problem)
+            if not problem:
+                sent[token] = (interface, time.monotonic())
+        until = time.monotonic() + limits.DOCTOR_HEAR
+        while sent and (rest := until - time.monotonic()) > 0:
+            packet = receiver.wait(rest)
+            # The same packet may come in on another interface too, where two share a network.
+            if packet is not None and packet.data in sent and sent[packet.data][0].name == packet.interface:
+                interface, when = sent.pop(packet.data)
+                found[interface.name] = FlowOutcome(interface, after=time.monotonic() - when)
+    return tuple(found.values())
+
+
+def _check_group(group: str) -> None:
+    try:
+        first = socket.inet_aton(group)[0]
+    except OSError:
+        first = 0
+    if not 224 <= first <= 239 or group.count(".") != 3:  # RFC 5771
+        raise ConfigError(
+            "--group", f"{group!r} is not an IPv4 multicast group", "they are 224.0.0.0 to 239.255.255.255"
+        )

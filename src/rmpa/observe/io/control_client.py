@@ -1,0 +1,178 @@
+"""Finds this machine's agents and asks them; blocking, for the command line.
+
+Only the standard library's sockets: a command that asks one question needs no event loop.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self, TypeVar
+from urllib.parse import urlsplit
+
+import msgspec
+
+from rmpa.core import limits
+from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.observe.control import ControlReply, ControlRequest
+from rmpa.observe.io.runtime_dir import runtime_dir, runtime_dirs
+from rmpa.observe.snapshot import Snapshot
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+    from types import TracebackType
+
+_T = TypeVar("_T")
+_START_ONE = "start one with `rmpa up`"
+
+
+class ControlClient:
+    """One connection to an agent; a context manager.
+
+    Args:
+        path: Its socket.
+        timeout: Seconds for each call.
+
+    Raises:
+        UnreachableError: Nobody answers there.
+    """
+
+    def __init__(self, path: Path, timeout: float = limits.CONTROL_CALL_TIMEOUT) -> None:
+        self.path = path
+        self._sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._sock.settimeout(timeout)
+        try:
+            self._sock.connect(str(path))
+        except OSError:
+            self._sock.close()
+            raise UnreachableError("agent", str(path), _START_ONE) from None
+        self._rest = b""
+
+    @property
+    def name(self) -> str:
+        """The agent's name."""
+        return self.path.stem
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Hang up."""
+        self._sock.close()
+
+    def call(self, op: str, type: type[_T], **args: object) -> _T:  # noqa: A002 - as msgspec calls it
+        """Ask, and wait for the answer.
+
+        Args:
+            op: The handler's name.
+            type: What its value is.
+            args: What it wants.
+
+        Raises:
+            PeerRefused: The agent said no, and why.
+            UnreachableError: It hung up, or did not answer in time.
+            RemoteProtocolError: It answered something else.
+        """
+        try:
+            self._sock.sendall(ControlRequest(op, args).serialize())
+            line = self._line()
+        except TimeoutError:
+            raise UnreachableError("agent", f"{self.path} in time", "is it stopped? its log may tell") from None
+        except OSError as error:
+            raise UnreachableError("agent", f"{self.path} ({error.strerror})", _START_ONE) from None
+        reply = ControlReply.parse(line)
+        if not reply.ok:
+            raise PeerRefused(f"agent {self.name}", reply.error, reply.remedy)
+        try:
+            return msgspec.convert(reply.value, type)
+        except msgspec.ValidationError as error:
+            raise RemoteProtocolError(
+                f"agent {self.name} answers {op} in another way: {error}; is it older?"
+            ) from None
+
+    def snapshot(self) -> Snapshot:
+        """Everything that the agent shows."""
+        return self.call("snapshot", Snapshot)
+
+    def _line(self) -> bytes:
+        parts = [self._rest]
+        size = len(self._rest)
+        while b"\n" not in parts[-1]:
+            part = self._sock.recv(256 * limits.KIB)
+            if not part:
+                raise UnreachableError("agent", f"{self.path}: it hung up", "its log says why")
+            parts.append(part)
+            size += len(part)
+            if size > limits.CONTROL_REPLY_MAX:
+                raise RemoteProtocolError(f"agent {self.name} sends more than {limits.CONTROL_REPLY_MAX} bytes")
+        line, _, self._rest = b"".join(parts).partition(b"\n")
+        return line
+
+
+@dataclass(frozen=True, slots=True)
+class FoundAgent:
+    """An agent that runs on this machine."""
+
+    name: str
+    path: Path
+
+
+def find_agents(environ: Mapping[str, str]) -> list[FoundAgent]:
+    """The agents of this machine that answer a connection, by name; sockets of killed ones are skipped."""
+    found = []
+    for place in runtime_dirs(environ):
+        for path in sorted(place.glob("*.sock")):
+            with contextlib.suppress(UnreachableError), ControlClient(path, timeout=limits.CONTROL_LOOK_TIMEOUT):
+                found.append(FoundAgent(path.stem, path))
+    return sorted(found, key=lambda agent: agent.name)
+
+
+def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAgent:
+    """The agent that is meant: the one named, the one in RMPA_AGENT, the only one, or ROS_MASTER_URI's.
+
+    Raises:
+        UnreachableError: There is none, or none of that name.
+        RmpaError: There are several, and nothing tells which; they are listed.
+    """
+    agents = find_agents(environ)
+    wanted = name or environ.get("RMPA_AGENT")
+    listed = ", ".join(agent.name for agent in agents)
+    if wanted:
+        for agent in agents:
+            if agent.name == wanted:
+                return agent
+        path = runtime_dir(environ) / f"{wanted}.sock"
+        remedy = f"running here: {listed}" if agents else f"start it with `rmpa up --name {wanted}`"
+        raise UnreachableError(f"agent {wanted!r}", str(path), remedy)
+    if not agents:
+        places = ", ".join(map(str, runtime_dirs(environ) or [runtime_dir(environ)]))
+        raise UnreachableError("agent", places, _START_ONE)
+    if len(agents) == 1:
+        return agents[0]
+    uri = environ.get("ROS_MASTER_URI", "")
+    for agent in agents if uri else ():
+        with contextlib.suppress(RmpaError), ControlClient(agent.path) as client:
+            if same_core(client.snapshot().agent.core_uri, uri):
+                return agent
+    raise RmpaError(f"several agents run on this machine: {listed}; name one with --agent NAME or RMPA_AGENT")
+
+
+def same_core(one: str, other: str) -> bool:
+    """Whether two URIs of ROS cores on this machine are one: the port decides, all names of this machine are one."""
+    try:
+        first, second = urlsplit(one), urlsplit(other)
+        hosts = {_local(u.hostname or "") for u in (first, second)}
+        return first.port is not None and first.port == second.port and len(hosts) == 1
+    except ValueError:
+        return False
+
+
+def _local(host: str) -> str:
+    return "localhost" if host.startswith("127.") or host == socket.gethostname().lower() else host

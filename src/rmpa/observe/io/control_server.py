@@ -1,0 +1,193 @@
+"""Serves the control socket: the CLI asks, the agent's handlers answer (``observe.control`` has the words)."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import inspect
+import logging
+import os
+import socket
+from collections.abc import Awaitable, Callable, Mapping
+from typing import TYPE_CHECKING, Final
+
+from rmpa.config.values import did_you_mean
+from rmpa.core import limits
+from rmpa.core.counters import Counters, RefusalLog
+from rmpa.core.errors import RemoteProtocolError, RmpaError, StartError
+from rmpa.observe.control import ControlReply, ControlRequest
+from rmpa.observe.io.runtime_dir import NameLock
+from rmpa.runtime.acceptor import Acceptor
+from rmpa.runtime.descriptors import Use
+from rmpa.runtime.event_loop import yielding_to_data
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_log = logging.getLogger(__name__)
+_breathing: Final = functools.partial(yielding_to_data, every=1)
+
+Handler = Callable[[dict[str, object]], Awaitable[object] | object]
+
+
+class ControlServer:
+    """A UNIX stream socket ``<name>.sock``, for this user alone, and the lock on its name.
+
+    Args:
+        place: The runtime directory; made if needed.
+        name: The agent's name.
+        handlers: By op; each gets the request's ``args`` and returns what JSON can say (``msgspec`` structs too),
+            at once or as an awaitable. An ``RmpaError`` becomes the error that the client shows.
+        counters: Where refusals are counted: ``control.refused``, ``control.busy``, ``control.failed``.
+
+    Raises:
+        StartError: By ``lock()`` and ``start()``, if an agent of this name runs already, or the socket cannot be.
+    """
+
+    def __init__(
+        self, place: Path, name: str, handlers: Mapping[str, Handler], *, counters: Counters | None = None
+    ) -> None:
+        self._place = place
+        self._name = name
+        self._handlers = handlers
+        self.counters = counters if counters is not None else Counters()
+        self._refusals = RefusalLog(_log, self.counters)
+        self._lock: NameLock | None = None
+        self._acceptor: Acceptor | None = None
+        self._clients: set[asyncio.Task[None]] = set()
+        self.path = place / f"{name}.sock"
+
+    def lock(self) -> None:
+        """Take the name, before anything else starts; ``start()`` does it otherwise."""
+        if self._lock is None:
+            self._lock = NameLock(self._place, self._name)
+
+    async def start(self) -> None:
+        """Bind and serve. A socket left by an agent that was killed is replaced: we hold its name's lock."""
+        if len(os.fsencode(self.path)) > limits.CONTROL_PATH_MAX:
+            problem = f"longer than the {limits.CONTROL_PATH_MAX} bytes that a socket's path may have"
+            raise StartError(str(self.path), problem, "set RMPA_RUNTIME_DIR to a shorter directory")
+        sock = await asyncio.to_thread(self._bind)
+        self._acceptor = Acceptor(sock, self._connected, name="control socket", use=Use.LINK)
+        self._acceptor.start()
+        _log.info("= control socket %s", self.path)
+
+    def _bind(self) -> socket.socket:
+        self.lock()
+        with contextlib.suppress(FileNotFoundError):
+            self.path.unlink()
+        sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            # The directory is ours alone already (0700), so nobody can connect between bind and chmod.
+            sock.bind(str(self.path))
+            self.path.chmod(0o600)
+            sock.listen(limits.CONTROL_BACKLOG)
+        except OSError as error:
+            sock.close()
+            raise StartError(str(self.path), f"cannot be bound: {error.strerror}") from None
+        return sock
+
+    async def close(self) -> None:
+        """End all clients, remove socket and lock; twice does no harm."""
+        served = self._acceptor is not None
+        if self._acceptor is not None:
+            self._acceptor.close()
+            self._acceptor = None
+        await asyncio.sleep(0)  # a client that was accepted just now closes its socket only if its task has begun
+        clients = list(self._clients)
+        for task in clients:
+            task.cancel()
+        await asyncio.gather(*clients, return_exceptions=True)
+        await asyncio.to_thread(self._remove, served=served)
+
+    def _remove(self, *, served: bool) -> None:
+        if served:
+            with contextlib.suppress(FileNotFoundError):
+                self.path.unlink()
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    def _connected(self, sock: socket.socket, _address: str) -> None:
+        task = asyncio.get_running_loop().create_task(self._open(sock))
+        self._clients.add(task)
+        task.add_done_callback(self._clients.discard)
+
+    async def _open(self, sock: socket.socket) -> None:
+        try:
+            reader, writer = await asyncio.open_unix_connection(sock=sock, limit=limits.CONTROL_REQUEST_MAX)
+        except BaseException:
+            sock.close()
+            raise
+        await self._serve(reader, writer)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            if len(self._clients) > limits.CONTROL_CLIENTS_MAX:
+                self._refuse("control.busy", f"more than {limits.CONTROL_CLIENTS_MAX} clients of the control socket")
+                busy = ControlReply(
+                    ok=False, error="the agent has too many clients", remedy="close some, or try again"
+                )
+                await self._send(writer, busy)
+                return
+            while await self._one(reader, writer):
+                pass
+        except (OSError, TimeoutError, asyncio.IncompleteReadError):
+            pass  # gone, idle, or hung up half-way: all are a client's right
+        except Exception:  # noqa: BLE001 - a task's top
+            _log.exception("! control client failed")
+        finally:
+            writer.close()
+            with contextlib.suppress(OSError):
+                await writer.wait_closed()
+
+    async def _one(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
+        """Serve one request; whether to go on."""
+        try:
+            async with asyncio.timeout(limits.CONTROL_IDLE_TIMEOUT):
+                line = await reader.readuntil(b"\n")
+            request = ControlRequest.parse(line)
+        except asyncio.LimitOverrunError:
+            self._refuse("control.refused", f"a control request of more than {limits.CONTROL_REQUEST_MAX} bytes")
+            await self._send(writer, ControlReply(ok=False, error=f"more than {limits.CONTROL_REQUEST_MAX} bytes"))
+            return False
+        except RemoteProtocolError as error:
+            self._refuse("control.refused", str(error))
+            await self._send(writer, ControlReply(ok=False, error=str(error)))
+            return False
+        _log.debug("< control %s", request)
+        return await self._send(writer, await self._answer(request))
+
+    async def _answer(self, request: ControlRequest) -> ControlReply:
+        handler = self._handlers.get(request.op)
+        if handler is None:
+            near = did_you_mean(request.op, self._handlers)
+            remedy = f"did you mean {near}?" if near else f"there are {', '.join(sorted(self._handlers))}"
+            return ControlReply(ok=False, error=f"no op {request.op!r}", remedy=remedy)
+        try:
+            async with asyncio.timeout(limits.CONTROL_HANDLER_TIMEOUT):
+                value = handler(request.args)
+                return ControlReply(ok=True, value=await value if inspect.isawaitable(value) else value)
+        except RmpaError as error:
+            return ControlReply(ok=False, error=str(error))
+        except TimeoutError:
+            return ControlReply(ok=False, error=f"{request.op} took more than {limits.CONTROL_HANDLER_TIMEOUT:.0f} s")
+        except Exception:  # noqa: BLE001 - one handler's bug must not end the client's connection
+            self.counters.add("control.failed")
+            _log.exception("! control handler %s failed", request)
+            return ControlReply(ok=False, error=f"the agent failed at {request.op}", remedy="its log says why")
+
+    async def _send(self, writer: asyncio.StreamWriter, reply: ControlReply) -> bool:
+        try:
+            line = reply.serialize(_breathing)
+        except RmpaError as error:
+            _log.exception("! control reply")
+            line = ControlReply(ok=False, error=str(error)).serialize()
+        async with asyncio.timeout(limits.CONTROL_IDLE_TIMEOUT):
+            writer.write(line)
+            await writer.drain()
+        return True
+
+    def _refuse(self, name: str, text: str) -> None:
+        self._refusals.refuse(asyncio.get_running_loop().time(), name, "local", text)

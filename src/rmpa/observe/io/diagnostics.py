@@ -1,0 +1,91 @@
+"""Tells the local graph how the agent, its links and what comes over them are: ``/diagnostics``, once a second.
+
+The agent's own node publishes it, so it stays in this graph. Nothing is made while nobody listens.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.observe.health import Health
+from rmpa.ros.node.publication import Publication
+from rmpa.ros.types.diagnostic_array import ARRAY_DEFINITION, ARRAY_MD5, ARRAY_TYPE, frame_array
+from rmpa.ros.wire.tcpros import TopicDescription
+from rmpa.runtime.event_loop import yield_to_data
+from rmpa.runtime.system_clock import SystemClock
+
+if TYPE_CHECKING:
+    from rmpa.bridge.io.bridge import Bridge
+    from rmpa.observe.io.peer_clocks import PeerClocks
+    from rmpa.observe.io.snapshot_builder import SnapshotBuilder
+    from rmpa.ros.core.api import Core
+
+_log = logging.getLogger(__name__)
+
+TOPIC: Final = "/diagnostics"
+"""The topic of REP 107."""
+
+
+class Diagnostics:
+    """Publishes what the view shows; has the clocks followed, whether somebody listens or not.
+
+    Args:
+        core: The local core.
+        bridge: Its node publishes; started before.
+        view: What there is to tell.
+        clocks: Those of the peers.
+    """
+
+    def __init__(self, core: Core, bridge: Bridge, view: SnapshotBuilder, clocks: PeerClocks) -> None:
+        self._core = core
+        self._bridge = bridge
+        self._view = view
+        self._clocks = clocks
+        self._clock = SystemClock()
+        self._health = Health()
+        self._sequence = 0
+        self._publication = Publication(
+            TOPIC,
+            bridge.node.name,
+            TopicDescription(ARRAY_TYPE, ARRAY_MD5, ARRAY_DEFINITION),
+            queue_messages=limits.DIAGNOSTICS_QUEUE,
+        )
+        self._timer: asyncio.TimerHandle | None = None
+
+    def start(self) -> None:
+        """Advertise, and look once a second."""
+        node = self._bridge.node
+        node.add_publication(self._publication)
+        code, text, _ = self._core.call("registerPublisher", node.name, TOPIC, ARRAY_TYPE, node.uri)
+        if code != 1:
+            _log.error("! the local core does not take %s: %s", TOPIC, text)
+        self._loop = asyncio.get_running_loop()
+        self._again()
+
+    def close(self) -> None:
+        """Advertise no more."""
+        if self._timer is not None:
+            self._timer.cancel()
+        node = self._bridge.node
+        self._core.call("unregisterPublisher", node.name, TOPIC, node.uri)
+        node.remove_publication(TOPIC)
+
+    def _again(self) -> None:
+        self._timer = self._loop.call_later(limits.DIAGNOSTICS_INTERVAL, self._look)
+
+    def _look(self) -> None:
+        self._again()
+        self._clocks.follow(self._clock.now())
+        if self._publication.subscribers:
+            self._publish()
+
+    def _publish(self) -> None:
+        self._sequence += 1
+        parts = []
+        for status in self._health.judge(self._view.snapshot(), self._clock.now()):
+            parts.append(status.serialize())
+            yield_to_data()
+        self._publication.publish_framed(frame_array(self._sequence, self._clock.wall_ns(), parts))

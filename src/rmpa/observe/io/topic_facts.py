@@ -1,0 +1,221 @@
+"""What this agent knows of one topic on its way: for its own user, and for the agent at the other end."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+from rmpa.bridge.messages import Source
+from rmpa.bridge.policy import Policy, is_own
+from rmpa.bridge.proxy_names import proxy_name
+from rmpa.config.values import did_you_mean
+from rmpa.core import limits
+from rmpa.core.contract import Reliability
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.names import is_global_name
+from rmpa.observe.why.diagnosis import FarSource, FarTopic, NearTopic, Reader
+from rmpa.ros.wire.tcpros import printable
+from rmpa.runtime.event_loop import yielding_to_data
+
+if TYPE_CHECKING:
+    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.config.settings import Settings
+    from rmpa.observe.io.snapshot_builder import SnapshotBuilder
+    from rmpa.observe.snapshot import PeerInfo
+    from rmpa.ros.core.api import Core
+
+
+class TopicFacts:
+    """Reads the rooms; changes nothing.
+
+    Args:
+        settings: The agent's.
+        core: Its ROS core.
+        bridge: Its bridge.
+        view: Its snapshots.
+    """
+
+    def __init__(self, settings: Settings, core: Core, bridge: Bridge, view: SnapshotBuilder) -> None:
+        self._core = core
+        self._bridge = bridge
+        self._view = view
+        self.reload(settings)
+
+    def reload(self, settings: Settings) -> None:
+        """Other settings hold from now on."""
+        self._policy = Policy(settings.policy, settings.peers, settings.time)
+
+    def own(self, topic: str) -> dict[str, str]:
+        """The module's own publishers of a topic, and their addresses."""
+        return {node: uri for node, uri in self._core.publishers(topic).items() if not is_own(node)}
+
+    def awaited(self, topic: str) -> list[str]:
+        """Nodes that published a topic before this agent was restarted, each with its address."""
+        return [f"{node} at {uri}" for node, uri in self._core.awaited(topic).items()]
+
+    def there(self, peer: str, topic: str) -> tuple[str, str]:
+        """A topic of a peer, as a user names it: its name here, and over there.
+
+        Where the rules for that peer leave nothing that has this name here, it is taken for the peer's own name.
+        """
+        names = self._bridge.names.of(peer)
+        wires = names.wires_of(topic)
+        return (topic, wires[0]) if wires else (names.local_name(topic), topic)
+
+    def near(self, attached: PeerSession | None, peer: PeerInfo | None, topic: str) -> NearTopic:
+        """What is known here of a topic that a peer publishes.
+
+        Args:
+            attached: Whose link brings it, if one does.
+            peer: Whose it is.
+            topic: Its name here.
+        """
+        snapshot = self._view.snapshot(frozenset({topic}))
+        if attached is None or peer is None:
+            return NearTopic(snapshot, topic)
+        only, registered, conflict = set(), set(), set()
+        readers, mismatches, proxies = {}, {}, {}
+        publishers, standing = self._core.publishers(topic), dict(attached.inbound)
+        for number, source in list(self._bridge.imports.at(topic)):
+            entry = self._bridge.imports.get(number, source)
+            if number != attached.peer or entry is None:
+                continue
+            if (entry.origin.instance if entry.origin else attached.link.identity.instance.hex()) != peer.instance:
+                continue
+            node = source.node
+            only.add(node)
+            if entry.conflict:
+                conflict.add(node)
+            name = attached.inbound.names.get(node) or proxy_name(attached.inbound.prefix, node)
+            proxies[node] = name
+            if node in standing and publishers.get(name) == standing[node].node.uri:
+                registered.add(node)
+            readers[node] = self._readers(attached, source)
+            mismatches[node] = self._bridge.mismatches(source)
+        return NearTopic(
+            snapshot,
+            topic,
+            attached.link.name,
+            frozenset(only),
+            proxies,
+            frozenset(registered),
+            frozenset(conflict),
+            readers,
+            mismatches,
+        )
+
+    @staticmethod
+    def _readers(attached: PeerSession, source: Source) -> tuple[Reader, ...]:
+        publication = attached.inbound.publication(source)
+        return tuple(
+            Reader(
+                number=link.number,
+                node=printable(link.other),
+                held=not link.connected,
+                messages=link.messages,
+                waiting=link.waiting,
+                dropped=link.dropped,
+            )
+            for link in (publication.connections() if publication is not None else ())
+        )
+
+    async def tell(self, attached: PeerSession, args: dict[str, Any]) -> FarTopic:
+        """Answer the agent that should receive a topic.
+
+        Args:
+            attached: Who asks.
+            args: ``topic``: its name on the way; ``instance``: the module whose it is, if we only relay it.
+        """
+        wire = name_in(args, "topic")
+        instance = args.get("instance") or ""
+        asker = attached.link.name
+        names = self._bridge.names.of(asker)
+        state = self._core.state()
+        sources: list[FarSource] = []
+        subscribers: list[str] = []
+        awaited: list[str] = []
+        for topic in names.locals_of(wire):
+            kind = self._core.type_of(topic)
+            nodes = self._relayed(topic, instance) if instance else list(self.own(topic))
+            if names.wire_name(topic, kind) == wire:
+                sources += [self._far(attached, Source(topic, node), wire) for node in nodes]
+                subscribers += [node for node in state.subscribers.get(topic, {}) if not is_own(node)]
+                awaited += self.awaited(topic)
+        station = self._view.station
+        problem = station.mesh.paths.problem(attached.link) if station is not None else None
+        return FarTopic(
+            path_problem=problem.text if problem is not None else "",
+            path_remedy=problem.remedy if problem is not None else "",
+            sources=tuple(sources[: limits.WHY_SOURCES_MAX]),
+            subscribers=tuple(subscribers[: limits.WHY_SOURCES_MAX]),
+            near="" if sources else await self._nearest(attached.link.name, wire),
+            awaited=tuple(awaited[: limits.WHY_SOURCES_MAX]),
+        )
+
+    async def _nearest(self, asker: str, wire: str) -> str:
+        """The topic of ours whose name over there is most like this one; empty if none is."""
+        names, state = self._bridge.names.of(asker), self._core.state()
+        known = {
+            names.wire_name(topic, state.types.get(topic, ""))
+            for topic, nodes in yielding_to_data(list(state.publishers.items()))
+            if not all(map(is_own, nodes))
+        }
+        # To compare with thousands of names takes longer than a message may wait.
+        near = await asyncio.to_thread(did_you_mean, wire, known)
+        return near or ""
+
+    def _relayed(self, topic: str, instance: object) -> list[str]:
+        """What stands here for the nodes of a module whose topic we pass on."""
+        offered = self._bridge.exports.offered
+        return [
+            node
+            for node in self._core.publishers(topic)
+            if (local := offered.get(Source(topic, node))) is not None
+            and local.origin is not None
+            and local.origin.instance == instance
+        ]
+
+    def _far(self, attached: PeerSession, source: Source, wire: str) -> FarSource:
+        exports = self._bridge.exports
+        local = exports.offered.get(source)
+        kind = local.type if local is not None else self._core.type_of(source.topic)
+        node = source.node if local is None or local.origin is None else local.origin.node
+        decision = self._policy.judge(source.topic, kind, node)
+        if decision.allowed:
+            special = self._policy.judge_for(attached.link.name, source.topic, kind, wire)
+            decision = special if special.rule else decision
+        flow = self._bridge.outbound.flows.get(source)
+        contract = exports.contract(source, attached.peer)
+        reliable = contract is not None and contract.reliability is Reliability.RELIABLE
+        return FarSource(
+            node=source.node,
+            topic=source.topic,
+            type=kind,
+            crosses=decision.allowed,
+            rule=decision.rule,
+            offered=exports.offer(attached.peer, source) is not None,
+            route="open" if attached.peer in exports.flowing(source) else "opening" if contract is not None else "",
+            messages=flow.messages if flow is not None else 0,
+            dropped=flow.dropped if flow is not None and not reliable else 0,
+            lost=self._bridge.outbound.lost(source, attached.peer),
+            oversized=flow.oversized if flow is not None else 0,
+            oversized_bytes=flow.oversized_bytes if flow is not None else 0,
+            beyond=exports.beyond.limit if exports.is_beyond(source) else 0,
+            unreachable="" if flow is not None and flow.messages else self._unreachable(source.node),
+        )
+
+    def _unreachable(self, node: str) -> str:
+        found = self._core.unreachable().get(node)
+        return f"{found.api}: {found.problem}" if found is not None else ""
+
+
+def name_in(args: dict[str, Any], key: str) -> str:
+    """A name in a question of another agent.
+
+    Raises:
+        RemoteProtocolError: It is none.
+    """
+    name = args.get(key)
+    if not isinstance(name, str) or len(name) > limits.CROSSING_NAME_MAX or not is_global_name(name):
+        raise RemoteProtocolError(f"the question names no {key}")
+    return name

@@ -1,1 +1,0 @@
-"""Brings resources to life: nodes, tasks, topics."""

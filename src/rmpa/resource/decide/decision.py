@@ -1,0 +1,327 @@
+"""The most similar profile: which System Profile serves best what all clients ask (paper, section 3.1).
+
+For each attribute that is asked for, a profile's *shortfall* is how far its value lies on the wrong side of the
+bound, as a part of the attribute's tolerance, or else of its range over all profiles (0 or 1 where that is 0); better
+than asked is no shortfall. Its *distance* is the weighted root mean square of the shortfalls, plus a little for its
+cost::
+
+    delta = max(0, shortfall) / s        D = sqrt(sum(w * delta^2) / sum(w)) + EPSILON * cost
+
+Of the profiles that meet every hard requirement the nearest serves. If none does: the declared best-effort profile,
+or the one with the smallest (largest weighted hard shortfall, D, cost). Ties go to the one declared first.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from rmpa.config.values import did_you_mean
+from rmpa.core.errors import ConfigError
+from rmpa.resource.declare.profiles import check_profiles
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from rmpa.resource.declare.attributes import Attribute, Value
+    from rmpa.resource.declare.profiles import Profile
+    from rmpa.resource.declare.requirements import Bound
+
+EPSILON: Final = 1e-3
+"""What one unit of cost adds to the distance: it decides among profiles that serve nearly alike."""
+_FEW: Final = 3
+"""Of more than one in so many profiles the distances are worked out at once, of fewer one by one."""
+_MISSING: Final = 1.0
+"""The shortfall of an attribute that a profile does not offer: as far as the whole range."""
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One attribute's part in a profile's distance.
+
+    Args:
+        attribute: Its name.
+        offered: The profile's value, ``None`` if it has none.
+        wanted: What is asked, ready to read.
+        delta: The shortfall, 0 where the request is met.
+        weight: Of the attribute.
+        hard: Whether a shortfall excludes.
+    """
+
+    attribute: str
+    offered: Value | None
+    wanted: str
+    delta: float
+    weight: float
+    hard: bool
+
+    @property
+    def met(self) -> bool:
+        """Whether the profile satisfies the request."""
+        return self.delta == 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class ProfileScore:
+    """How one profile does.
+
+    Args:
+        profile: Its name.
+        distance: ``D``.
+        hard_shortfall: The largest weighted shortfall of a hard requirement; 0: it is feasible.
+        excluded: Why it is left out (a precondition, a failure within the cool-down), or empty.
+        terms: The parts of the distance, in the order of the attributes asked for.
+    """
+
+    profile: str
+    distance: float
+    hard_shortfall: float
+    excluded: str = ""
+    terms: tuple[Term, ...] = ()
+
+    @property
+    def feasible(self) -> bool:
+        """Whether it meets every hard requirement and may be taken."""
+        return self.hard_shortfall == 0.0 and not self.excluded
+
+
+@dataclass(frozen=True, slots=True)
+class ProfileDecision:
+    """Which profile serves best.
+
+    Args:
+        profile: Its name; empty if all are left out.
+        distance: Its ``D``.
+        feasible: Whether it meets every hard requirement; if not, this is a non-adaptable event.
+        best_effort: Whether it was taken because it is the declared best-effort profile.
+    """
+
+    profile: str
+    distance: float
+    feasible: bool
+    best_effort: bool = False
+
+
+class _Column:
+    """One attribute under one bound, a value for each profile.
+
+    Args:
+        bound: What is asked.
+        deltas: The shortfalls.
+    """
+
+    __slots__ = ("_squares", "bound", "deltas")
+
+    def __init__(self, bound: Bound, deltas: list[float]) -> None:
+        self.bound = bound
+        self.deltas = deltas
+        self._squares: list[float] | None = None
+
+    @property
+    def weighted(self) -> list[float]:
+        """Times the weight."""
+        weight = self.bound.weight
+        return self.deltas if weight == 1 else [weight * delta for delta in self.deltas]
+
+    @property
+    def squares(self) -> list[float]:
+        """Their squares, times the weight; most decisions need few of them."""
+        if self._squares is None:
+            weight = self.bound.weight
+            if weight == 1:
+                self._squares = [delta * delta for delta in self.deltas]
+            else:
+                self._squares = [weight * delta * delta for delta in self.deltas]
+        return self._squares
+
+
+class Decider:
+    """Decides for one resource; what does not change between decisions is worked out once.
+
+    Args:
+        resource: Its name, for errors.
+        attributes: Declared ones, by name.
+        profiles: In order of declaration.
+
+    Raises:
+        ConfigError: See ``check_profiles``.
+    """
+
+    def __init__(self, resource: str, attributes: Mapping[str, Attribute], profiles: Sequence[Profile]) -> None:
+        check_profiles(profiles, attributes, resource)
+        self._resource = resource
+        self._attributes = attributes
+        self._profiles = {profile.name: profile for profile in profiles}
+        self._costs = [EPSILON * profile.cost for profile in profiles]
+        self._places: dict[str, list[float | None]] = {}
+        self._spans: dict[str, float] = {}
+        self._known: dict[str, list[float]] = {}
+        """The places of the attributes that every profile offers."""
+        self._columns: dict[str, _Column] = {}
+        for name, attribute in attributes.items():
+            places = [attribute.place(p.offers[name]) if name in p.offers else None for p in profiles]
+            known = [place for place in places if place is not None]
+            self._places[name] = places
+            if len(known) == len(places):
+                self._known[name] = known
+            span = attribute.tolerated
+            self._spans[name] = span if span is not None else (max(known) - min(known) if known else 0.0)
+        self._offered = {name for profile in profiles for name in profile.offers}
+        self._best_effort = next((profile.name for profile in profiles if profile.best_effort), "")
+
+    @property
+    def profiles(self) -> Sequence[str]:
+        """The names, in order of declaration."""
+        return tuple(self._profiles)
+
+    def profile(self, name: str) -> Profile:
+        """One of them.
+
+        Raises:
+            ConfigError: There is none of that name.
+        """
+        found = self._profiles.get(name)
+        if found is None:
+            near = did_you_mean(name, self._profiles)
+            remedy = f"did you mean {near}?" if near else f"it has {', '.join(self._profiles)}"
+            raise ConfigError(f"profile {name}", f"{self._resource} has no such profile", remedy)
+        return found
+
+    def decide(self, bounds: Mapping[str, Bound], excluded: Mapping[str, str] | None = None) -> ProfileDecision:
+        """The profile that serves best what is asked.
+
+        Args:
+            bounds: By attribute; those of attributes that are not declared raise ``KeyError``.
+            excluded: Profiles that are left out, by name, and why.
+        """
+        columns = [self._column(name, bound) for name, bound in bounds.items()]
+        left_out = excluded or {}
+        allowed = [index for index, name in enumerate(self._profiles) if name not in left_out]
+        names = self.profiles
+        hard_deltas = [column.deltas for column in columns if column.bound.hard]
+        fails = [*map(any, zip(*hard_deltas, strict=True))]  # a shortfall is above 0
+        feasible = [index for index in allowed if not fails[index]] if fails else allowed
+        if len(feasible) == 1 or (feasible and len(feasible) * _FEW < len(names)):
+            near = {index: self._distance(index, columns) for index in feasible}
+            best = min(feasible, key=near.__getitem__)
+            return ProfileDecision(names[best], near[best], feasible=True)
+        if feasible:
+            distances = self._distances(columns)
+            best = min(feasible, key=distances.__getitem__)
+            return ProfileDecision(names[best], distances[best], feasible=True)
+        if self._best_effort and self._best_effort not in left_out:
+            best = names.index(self._best_effort)
+            return ProfileDecision(names[best], self._distance(best, columns), feasible=False, best_effort=True)
+        if not allowed:
+            return ProfileDecision("", math.inf, feasible=False)
+        distances, hard = self._judge(bounds)
+        best = min(allowed, key=lambda index: (hard[index], distances[index], self._costs[index]))
+        return ProfileDecision(names[best], distances[best], feasible=False)
+
+    def explain(
+        self, bounds: Mapping[str, Bound], excluded: Mapping[str, str] | None = None
+    ) -> tuple[ProfileScore, ...]:
+        """Every profile's score with all its terms, in order of declaration."""
+        distances, hard = self._judge(bounds)
+        left_out = excluded or {}
+        said = {name: wanted(self._attributes[name], bound) for name, bound in bounds.items()}
+        return tuple(
+            ProfileScore(
+                name, distances[index], hard[index], left_out.get(name, ""), self._terms(index, profile, said, bounds)
+            )
+            for index, (name, profile) in enumerate(self._profiles.items())
+        )
+
+    def distance(self, name: str, bounds: Mapping[str, Bound]) -> float:
+        """One profile's distance."""
+        columns = [self._column(asked, bound) for asked, bound in bounds.items()]
+        return self._distance(self.profiles.index(name), columns)
+
+    def _judge(self, bounds: Mapping[str, Bound]) -> tuple[list[float], list[float]]:
+        """Distances, and largest weighted hard shortfalls, by profile."""
+        columns = [self._column(name, bound) for name, bound in bounds.items()]
+        distances = self._distances(columns)
+        hard = [column.weighted for column in columns if column.bound.hard]
+        if not hard:
+            return distances, [0.0] * len(self._profiles)
+        return distances, [*map(max, zip(*hard, strict=True))] if len(hard) > 1 else hard[0]
+
+    def _distances(self, columns: Sequence[_Column]) -> list[float]:
+        """``D`` of every profile."""
+        if not columns:
+            return list(self._costs)
+        scale = sum(column.bound.weight for column in columns)
+        sums = map(sum, zip(*(column.squares for column in columns), strict=True))
+        return [math.sqrt(total / scale) + cost for total, cost in zip(sums, self._costs, strict=True)]
+
+    def _distance(self, index: int, columns: Sequence[_Column]) -> float:
+        """``D`` of one profile, to the bit as ``_distances`` has it."""
+        if not columns:
+            return self._costs[index]
+        scale = sum(column.bound.weight for column in columns)
+        total = sum(column.bound.weight * column.deltas[index] * column.deltas[index] for column in columns)
+        return math.sqrt(total / scale) + self._costs[index]
+
+    def _column(self, name: str, bound: Bound) -> _Column:
+        """One attribute's part in every profile's distance; most bounds are as they were at the last decision."""
+        known = self._columns.get(name)
+        if known is not None and known.bound == bound:
+            return known
+        made = self._columns[name] = _Column(bound, self._deltas(name, bound))
+        return made
+
+    def _deltas(self, name: str, bound: Bound) -> list[float]:
+        places, span = self._places[name], self._spans[name]
+        if name not in self._offered:
+            return [0.0] * len(places)  # no profile says anything of it: what is measured will tell
+        if bound.words:
+            words = self._attributes[name].words
+            wanted = {float(words.index(word)) for word in bound.words}
+            return [0.0 if place in wanted else _MISSING for place in places]
+        low, high = bound.low, bound.high
+        if span > 0:
+            if (known := self._known.get(name)) is not None:  # the usual ones, in half of the time
+                if high == math.inf:
+                    return [(low - place) / span if place < low else 0.0 for place in known]
+                if low == -math.inf:
+                    return [(place - high) / span if place > high else 0.0 for place in known]
+            return [
+                _MISSING
+                if place is None
+                else (low - place) / span
+                if place < low
+                else (place - high) / span
+                if place > high
+                else 0.0
+                for place in places
+            ]
+        return [_MISSING if place is None or not low <= place <= high else 0.0 for place in places]
+
+    def _terms(
+        self, index: int, profile: Profile, said: Mapping[str, str], bounds: Mapping[str, Bound]
+    ) -> tuple[Term, ...]:
+        return tuple(
+            Term(
+                name,
+                profile.offers.get(name),
+                said[name],
+                self._column(name, bound).deltas[index],
+                bound.weight,
+                bound.hard,
+            )
+            for name, bound in bounds.items()
+        )
+
+
+def wanted(attribute: Attribute, bound: Bound) -> str:
+    """What is asked of an attribute, for people: ``at least 20 Hz``."""
+    if bound.words:
+        return " or ".join(word for word in attribute.words if word in bound.words)
+    low = attribute.show(attribute.value(bound.low)) if bound.low > -math.inf else ""
+    high = attribute.show(attribute.value(bound.high)) if bound.high < math.inf else ""
+    if low == high:
+        return f"exactly {low}"
+    if low and high:
+        return f"{low} to {high}"
+    return f"at least {low}" if low else f"at most {high}"

@@ -1,0 +1,254 @@
+"""A resource's configuration as dynamic_reconfigure has it (wiki.ros.org/dynamic_reconfigure), for its tools to work.
+
+Pure: parameters in, plain values of ``dynamic_reconfigure/Config`` and ``ConfigDescription`` out, and back. As its
+servers do, a number out of range is clipped; everything else that cannot be is refused, and nothing is changed then.
+
+Two parameters are not declared by the user: ``profile`` (empty: the resource decides) and, where there are contexts,
+``context`` (empty: the rules decide).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from rmpa.config.values import did_you_mean
+from rmpa.core.errors import ConfigError
+from rmpa.resource.declare.resource import INT_MAX, INT_MIN, Parameter
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from rmpa.resource.declare.resource import ParameterValue, Resource
+    from rmpa.ros.types.messages import Plain
+
+CONFIG_TYPE: Final = "dynamic_reconfigure/Config"
+DESCRIPTION_TYPE: Final = "dynamic_reconfigure/ConfigDescription"
+SERVICE_TYPE: Final = "dynamic_reconfigure/Reconfigure"
+PROFILE: Final = "profile"
+CONTEXT: Final = "context"
+AUTOMATIC: Final = "automatic"
+"""How an empty ``profile`` or ``context`` is called in lists to choose from."""
+_LISTS: Final = {"bool": "bools", "int": "ints", "str": "strs", "double": "doubles"}
+_GROUP: Final[dict[str, Plain]] = {"name": "Default", "id": 0, "parent": 0}
+"""All parameters are in the one group that every server has."""
+
+
+@dataclass(frozen=True, slots=True)
+class EnumChoice:
+    """One value that a parameter may have, with its name in lists."""
+
+    name: str
+    value: ParameterValue
+    description: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ReconfigureEntry:
+    """One parameter as tools see it.
+
+    Args:
+        name: A ROS base name.
+        kind: ``bool``, ``int``, ``double`` or ``str``.
+        default: Its default value.
+        low: The least value of a number; infinite or the least of 32 bits for none.
+        high: The greatest.
+        description: For people, with the unit.
+        choices: The only values, if there are only some.
+    """
+
+    name: str
+    kind: str
+    default: ParameterValue
+    low: float = -math.inf
+    high: float = math.inf
+    description: str = ""
+    choices: tuple[EnumChoice, ...] = ()
+
+
+def entries(resource: Resource) -> dict[str, ReconfigureEntry]:
+    """All parameters of a resource, the declared ones in order, then ``profile`` and ``context``."""
+    found = {name: _entry(parameter) for name, parameter in resource.parameters.items()}
+    profiles = [EnumChoice(p.profile.name, p.profile.name, p.profile.description) for p in resource.profiles.values()]
+    found[PROFILE] = _pseudo(PROFILE, "the profile to run; empty: the resource decides", profiles)
+    if resource.contexts:
+        contexts = [EnumChoice(c.name, c.name, c.when) for c in resource.contexts.values()]
+        found[CONTEXT] = _pseudo(CONTEXT, "the context to be in; empty: its rules decide", contexts)
+    return found
+
+
+def _entry(parameter: Parameter) -> ReconfigureEntry:
+    text = parameter.description
+    if parameter.unit:
+        text = f"{text} [{parameter.unit}]".lstrip()
+    choices = tuple(EnumChoice(str(value), value) for value in parameter.choices)
+    low, high = parameter.bounds
+    return ReconfigureEntry(parameter.name, parameter.type, parameter.default, low, high, text, choices)
+
+
+def _pseudo(name: str, text: str, choices: Sequence[EnumChoice]) -> ReconfigureEntry:
+    free = AUTOMATIC
+    while any(choice.name.lower() == free for choice in choices):
+        free = f"({free})"
+    return ReconfigureEntry(
+        name, "str", "", description=text, choices=(EnumChoice(free, "", "not chosen by hand"), *choices)
+    )
+
+
+def config(values: Mapping[str, ParameterValue], known: Mapping[str, ReconfigureEntry]) -> dict[str, Plain]:
+    """Plain values of a ``Config``.
+
+    Args:
+        values: By parameter.
+        known: What they are.
+    """
+    made: dict[str, Any] = {key: [] for key in _LISTS.values()}
+    for name, value in values.items():
+        made[_LISTS[known[name].kind]].append({"name": name, "value": value})
+    made["groups"] = [{**_GROUP, "state": True}]
+    return made
+
+
+def description(known: Mapping[str, ReconfigureEntry]) -> dict[str, Plain]:
+    """Plain values of a ``ConfigDescription``."""
+    parameters: list[Plain] = [
+        {
+            "name": entry.name,
+            "type": entry.kind,
+            "level": 0,
+            "description": entry.description,
+            "edit_method": _edit_method(entry),
+        }
+        for entry in known.values()
+    ]
+    return {
+        "groups": [{**_GROUP, "type": "", "parameters": parameters}],
+        "min": config({name: _bound(entry, low=True) for name, entry in known.items()}, known),
+        "max": config({name: _bound(entry, low=False) for name, entry in known.items()}, known),
+        "dflt": config({name: entry.default for name, entry in known.items()}, known),
+    }
+
+
+def _bound(entry: ReconfigureEntry, *, low: bool) -> ParameterValue:
+    if entry.kind == "bool":
+        return not low
+    if entry.kind == "str":
+        return ""
+    value = entry.low if low else entry.high
+    if entry.kind == "double":
+        return float(value)
+    # Within the bound, whatever stands behind its point.
+    return max(INT_MIN, min(INT_MAX, math.ceil(value) if low else math.floor(value)))
+
+
+def _edit_method(entry: ReconfigureEntry) -> str:
+    """What to choose from: the clients evaluate it as a Python expression, so it is made of ``repr`` alone."""
+    if not entry.choices:
+        return ""
+    enum = [
+        {
+            "name": choice.name,
+            "type": entry.kind,
+            "value": choice.value,
+            "description": choice.description,
+            "srcline": 0,
+            "srcfile": "",
+            "ctype": {"str": "std::string"}.get(entry.kind, entry.kind),
+            "cconsttype": "const char * const" if entry.kind == "str" else f"const {entry.kind}",
+        }
+        for choice in entry.choices
+    ]
+    return repr({"enum": enum, "enum_description": entry.description})
+
+
+def read_config(message: Any) -> dict[str, ParameterValue]:
+    """What a ``Config`` says, by parameter; groups are not looked at, there is but one.
+
+    Raises:
+        ConfigError: A parameter is in it twice.
+    """
+    found: dict[str, ParameterValue] = {}
+    kinds = {"bools": bool, "ints": int, "strs": str, "doubles": float}
+    for key, kind in kinds.items():
+        for pair in getattr(message, key):
+            name = str(pair.name)
+            if name in found:
+                raise ConfigError(f"parameter {name[:80]}", "it is given twice", "say it once")
+            found[name] = kind(pair.value)
+    return found
+
+
+def checked(
+    values: Mapping[str, ParameterValue], known: Mapping[str, ReconfigureEntry], parameters: Mapping[str, Parameter]
+) -> dict[str, ParameterValue]:
+    """What parameters become when a client asks for values.
+
+    Raises:
+        ConfigError: The first thing that cannot be; nothing is changed then.
+    """
+    return {name: _checked(name, value, known, parameters) for name, value in values.items()}
+
+
+def _checked(
+    name: str, value: ParameterValue, known: Mapping[str, ReconfigureEntry], parameters: Mapping[str, Parameter]
+) -> ParameterValue:
+    if name not in known:
+        near = did_you_mean(name, known)
+        remedy = f"did you mean {near}?" if near else f"there are {', '.join(known)}"
+        raise ConfigError(f"parameter {name[:80]}", "there is none of this name", remedy)
+    entry = known[name]
+    if name in parameters:
+        return parameters[name].check(_clipped(value, entry))
+    if not isinstance(value, str):
+        raise ConfigError(name, f"{value!r} is no text", f"it is one of {_named(entry)}")
+    return choose(value, entry)
+
+
+def choose(value: str, entry: ReconfigureEntry) -> str:
+    """The value of ``profile`` or ``context`` by its value or name.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    for choice in entry.choices:
+        if value == choice.value or value.lower() == choice.name.lower():
+            return str(choice.value)
+    near = did_you_mean(value, (choice.name for choice in entry.choices))
+    remedy = f"did you mean {near}?" if near else f"it is one of {_named(entry)}"
+    raise ConfigError(entry.name, f"there is no {entry.name} {value[:80]!r}", remedy)
+
+
+def _named(entry: ReconfigureEntry) -> str:
+    return ", ".join(choice.name for choice in entry.choices)
+
+
+def _clipped(value: ParameterValue, entry: ReconfigureEntry) -> ParameterValue:
+    if isinstance(value, bool | str) or entry.kind not in ("int", "double") or entry.choices:
+        return value
+    # With the bounds' own type: a float bound of a whole number is not one of its values.
+    low, high = _bound(entry, low=True), _bound(entry, low=False)
+    if value < float(low):
+        return low
+    return high if value > float(high) else value
+
+
+def from_server(
+    found: Mapping[str, Any], known: Mapping[str, ReconfigureEntry], parameters: Mapping[str, Parameter]
+) -> tuple[dict[str, ParameterValue], list[str]]:
+    """What the parameter server holds for a resource that starts, and what of it cannot be.
+
+    Args:
+        found: The members of the resource's namespace; others than parameters are none of its business.
+        known: What the parameters are.
+        parameters: The declared ones.
+    """
+    taken: dict[str, ParameterValue] = {}
+    problems: list[str] = []
+    for name in known:
+        if name in found:
+            try:
+                taken[name] = _checked(name, found[name], known, parameters)
+            except ConfigError as error:
+                problems.append(str(error))
+    return taken, problems

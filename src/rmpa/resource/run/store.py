@@ -1,0 +1,312 @@
+"""A resource's file: what it remembers over a restart, and a bounded history. SQLite in a thread of its own.
+
+Nothing here blocks the loop, and no disk can stop a resource: one that is full, read-only or gone is said once
+(``ResourceStore.problem``) and tried again; a file that is damaged is set aside under ``.damaged`` and begun anew,
+with everything that is known at that moment. Tables, for ``sqlite3 FILE``::
+
+    state(kind, name, value, at_ns)                      value: JSON; see resource.remembered
+    windows(at_ns, profile, level, message, quality)     quality: JSON, attribute -> value in the attribute's unit
+    events(at_ns, event, level, message, details)        event: apply, alarm, over, reacted, late; details: JSON
+    descriptors(node, text, first_ns, last_ns)
+"""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import contextlib
+import fcntl
+import logging
+import os
+import sqlite3
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.runtime.state_dir import module_dir, state_dir
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from rmpa.resource.decide.saved_state import Key
+
+__all__ = ["DamagedStore", "ResourceStore", "module_dir", "read_state", "state_dir"]
+
+_log = logging.getLogger(__name__)
+_VERSION: Final = 1
+_PAGE: Final = 4096
+_SCHEMA: Final = f"""
+CREATE TABLE IF NOT EXISTS state (
+    kind TEXT NOT NULL, name TEXT NOT NULL, value TEXT NOT NULL, at_ns INTEGER NOT NULL, PRIMARY KEY (kind, name));
+CREATE TABLE IF NOT EXISTS windows (
+    id INTEGER PRIMARY KEY, at_ns INTEGER, profile TEXT, level INTEGER, message TEXT, quality TEXT);
+CREATE TABLE IF NOT EXISTS events (
+    id INTEGER PRIMARY KEY, at_ns INTEGER, event TEXT, level INTEGER, message TEXT, details TEXT);
+CREATE TABLE IF NOT EXISTS descriptors (
+    id INTEGER PRIMARY KEY, node TEXT NOT NULL, text TEXT NOT NULL, first_ns INTEGER, last_ns INTEGER,
+    UNIQUE (node, text));
+PRAGMA user_version = {_VERSION};
+"""
+_INSERT: Final = {
+    "windows": "INSERT INTO windows (at_ns, profile, level, message, quality) VALUES (?, ?, ?, ?, ?)",
+    "events": "INSERT INTO events (at_ns, event, level, message, details) VALUES (?, ?, ?, ?, ?)",
+    "descriptors": "INSERT INTO descriptors (node, text, first_ns, last_ns) VALUES (?, ?, ?, ?)"
+    " ON CONFLICT (node, text) DO UPDATE SET last_ns = excluded.last_ns",
+}
+_KEPT: Final = {
+    "windows": limits.STORE_WINDOWS_MAX,
+    "events": limits.STORE_EVENTS_MAX,
+    "descriptors": limits.STORE_DESCRIPTORS_MAX,
+}
+_DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+_LOCK_LOOK: Final = 0.02
+
+
+def read_state(path: Path) -> dict[Key, str]:
+    """What a store's ``state`` holds; nobody need run, and who does is not disturbed.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    try:
+        with contextlib.closing(
+            sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=1.0)
+        ) as found:
+            rows = found.execute("SELECT kind, name, value FROM state ORDER BY kind, name")
+            return {(str(kind), str(name)): str(value) for kind, name, value in rows}
+    except sqlite3.Error as error:
+        raise OSError(f"{path}: {error}") from error
+
+
+class DamagedStore(Exception):  # noqa: N818 - reads as what happened; never leaves this file
+    """The file is no store of ours."""
+
+
+@dataclass
+class _Pending:
+    """What is to be written."""
+
+    state: dict[Key, str | None] = field(default_factory=dict)
+    rows: deque[tuple[str, tuple[object, ...]]] = field(
+        default_factory=lambda: deque(maxlen=limits.STORE_PENDING_MAX)
+    )
+
+    def __bool__(self) -> bool:
+        return bool(self.state or self.rows)
+
+
+class ResourceStore:
+    """One file. Its methods may be called from the loop: none waits for the disk.
+
+    Args:
+        path: Made if it is not there, with its folders.
+        interval: Seconds between writes of the history.
+        bytes_max: Of the file.
+    """
+
+    def __init__(
+        self, path: Path, *, interval: float = limits.STORE_INTERVAL, bytes_max: int = limits.STORE_BYTES_MAX
+    ) -> None:
+        self.path = path
+        self.problem = ""
+        """Why nothing is kept at present, or empty."""
+        self._interval = interval
+        self._pages = bytes_max // _PAGE
+        self._change = threading.Condition()
+        self._pending = _Pending()
+        self._urgent = False
+        self._closing = False
+        self._known: dict[Key, str] = {}
+        """Everything in ``state``, so that a new file can take the place of a damaged one."""
+        self._connection: sqlite3.Connection | None = None
+        self._inode = 0
+        self._lock: int | None = None
+        self._opened: concurrent.futures.Future[dict[Key, str]] = concurrent.futures.Future()
+        self._thread = threading.Thread(target=self._run, name=f"store {path.stem}", daemon=True)
+
+    async def open(self) -> dict[Key, str]:
+        """Begin, and return what is there; nothing if it cannot be read, which is said."""
+        self._thread.start()
+        try:
+            async with asyncio.timeout(limits.STORE_OPEN_TIMEOUT):
+                return await asyncio.wrap_future(self._opened)
+        except TimeoutError:
+            _log.warning("! %s does not answer; nothing is remembered", self.path)
+            return {}
+
+    def put(self, key: Key, value: str | None) -> None:
+        """Remember a JSON text, or nothing any more; written at once."""
+        with self._change:
+            self._pending.state[key] = value
+            self._urgent = True
+            self._change.notify()
+
+    def window(self, at_ns: int, profile: str, level: int, message: str, quality: str) -> None:
+        """Add a window of quality to the history."""
+        self._add("windows", (at_ns, profile, level, message, quality))
+
+    def event(self, at_ns: int, event: str, level: int, message: str, details: str) -> None:
+        """Add an alarm or a change to it."""
+        self._add("events", (at_ns, event, level, message, details))
+
+    def descriptor(self, node: str, text: str, at_ns: int) -> None:
+        """Add a descriptor as it was seen; the same one again only moves its ``last_ns``."""
+        self._add("descriptors", (node, text, at_ns, at_ns))
+
+    async def close(self) -> None:
+        """Write everything and end; a disk that hangs is left behind."""
+        with self._change:
+            self._closing = True
+            self._change.notify()
+        if self._thread.ident is not None:
+            await asyncio.to_thread(self._thread.join, limits.STORE_CLOSE_TIMEOUT)
+            if self._thread.is_alive():
+                _log.warning("! %s does not answer; what was last is not kept", self.path)
+
+    # --- inside: the thread -------------------------------------------------------------------------------------
+
+    def _add(self, table: str, row: tuple[object, ...]) -> None:
+        with self._change:
+            self._pending.rows.append((table, row))
+
+    def _run(self) -> None:
+        try:
+            self._attempt(_Pending())
+        finally:
+            self._opened.set_result(dict(self._known))
+        while True:
+            with self._change:
+                self._change.wait_for(lambda: self._urgent or self._closing, self._interval)
+                work, self._pending = self._pending, _Pending()
+                self._urgent, closing = False, self._closing
+            if (work or self.problem) and not self._attempt(work) and not closing:
+                self._put_back(work)
+            if closing:
+                break
+        self._disconnect()
+        if self._lock is not None:
+            os.close(self._lock)
+
+    def _put_back(self, work: _Pending) -> None:
+        with self._change:
+            self._pending.state = work.state | self._pending.state
+            rows = [*work.rows, *self._pending.rows]
+            self._pending.rows = deque(rows, maxlen=limits.STORE_PENDING_MAX)
+
+    def _attempt(self, work: _Pending) -> bool:
+        """Write; a damaged file is replaced and written again."""
+        try:
+            try:
+                self._write(work)
+            except DamagedStore as error:
+                self._set_aside(str(error))
+                self._write(work)
+        except (OSError, sqlite3.Error, DamagedStore) as error:
+            self._disconnect()
+            self._say(f"{type(error).__name__}: {error}" if not str(error) else str(error))
+            return False
+        self._say("")
+        return True
+
+    def _write(self, work: _Pending) -> None:
+        try:
+            connection = self._connected()
+            with connection:
+                self._insert(connection, work)
+        except sqlite3.DatabaseError as error:
+            if getattr(error, "sqlite_errorcode", 0) & 0xFF in _DAMAGED:
+                raise DamagedStore(str(error)) from error
+            raise
+        for key, value in work.state.items():
+            if value is None:
+                self._known.pop(key, None)
+            else:
+                self._known[key] = value
+
+    def _insert(self, connection: sqlite3.Connection, work: _Pending) -> None:
+        now = time.time_ns()
+        for (kind, name), value in work.state.items():
+            if value is None:
+                connection.execute("DELETE FROM state WHERE kind = ? AND name = ?", (kind, name))
+            else:
+                connection.execute("INSERT OR REPLACE INTO state VALUES (?, ?, ?, ?)", (kind, name, value, now))
+        for table, row in work.rows:
+            connection.execute(_INSERT[table], row)
+        for table in {table for table, _ in work.rows}:
+            # The name is one of _KEPT's.
+            oldest = f"(SELECT max(id) FROM {table}) - {_KEPT[table]}"  # noqa: S608
+            connection.execute(f"DELETE FROM {table} WHERE id <= {oldest}")  # noqa: S608
+
+    def _connected(self) -> sqlite3.Connection:
+        if self._connection is not None:
+            with contextlib.suppress(OSError):
+                if self.path.stat().st_ino == self._inode:
+                    return self._connection
+            _log.warning("! %s was taken away; it is begun anew", self.path)
+            self._disconnect()
+        self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._take_lock()
+        connection = sqlite3.connect(self.path, timeout=1.0, check_same_thread=False)
+        self._connection = connection
+        connection.execute(f"PRAGMA max_page_count = {self._pages}")
+        if (version := connection.execute("PRAGMA user_version").fetchone()[0]) > _VERSION:
+            raise DamagedStore(f"it is of version {version}; this release reads {_VERSION}")
+        if (found := connection.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
+            raise DamagedStore(found)
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA synchronous = FULL")
+        connection.executescript(_SCHEMA)
+        self._inode = self.path.stat().st_ino
+        if not self._known:
+            rows = connection.execute("SELECT kind, name, value FROM state ORDER BY kind, name")
+            self._known = {(str(kind), str(name)): str(value) for kind, name, value in rows}
+        else:
+            with connection:
+                self._insert(connection, _Pending(dict(self._known)))
+        return connection
+
+    def _take_lock(self) -> None:
+        """Two resources of one name in two modules of one name on one machine must not mix."""
+        if self._lock is not None:
+            return
+        number = os.open(self.path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        deadline = time.monotonic() + limits.STORE_LOCK_TIMEOUT
+        while True:
+            try:
+                fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    os.close(number)
+                    raise OSError("another process uses it; name this module otherwise, or set --state") from None
+                time.sleep(_LOCK_LOOK)
+            except OSError:
+                os.close(number)
+                raise
+            else:
+                self._lock = number
+                return
+
+    def _set_aside(self, why: str) -> None:
+        self._disconnect()
+        aside = self.path.with_name(f"{self.path.name}.damaged")
+        _log.warning("! %s is damaged (%s); it is set aside as %s and begun anew", self.path, why, aside.name)
+        self.path.replace(aside)
+        for suffix in ("-wal", "-shm"):
+            self.path.with_name(f"{self.path.name}{suffix}").unlink(missing_ok=True)
+
+    def _disconnect(self) -> None:
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            with contextlib.suppress(sqlite3.Error):
+                connection.close()
+
+    def _say(self, problem: str) -> None:
+        """Log it when it begins and when it is over."""
+        if problem and not self.problem:
+            _log.warning("! %s: nothing is kept: %s", self.path, problem)
+        elif self.problem and not problem:
+            _log.info("= %s: everything is kept again", self.path)
+        self.problem = problem

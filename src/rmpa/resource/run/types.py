@@ -1,0 +1,49 @@
+"""Waits for the types of outputs that are not known on this machine: a publisher, here or at a peer, tells them."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING
+
+from rmpa.core import limits
+from rmpa.core.errors import UnreachableError
+from rmpa.ros.node.learn_type import learn_type
+from rmpa.ros.wire.tcpros import printable
+
+if TYPE_CHECKING:
+    from rmpa.resource.declare.resource import Output, Resource
+
+_log = logging.getLogger(__name__)
+
+
+async def learn_outputs(resource: Resource, master_uri: str, caller_id: str) -> None:
+    """Return when the type of each output is known; says for which it waits, and where it was looked for.
+
+    Args:
+        resource: Declared completely; its outputs get their types.
+        master_uri: The core whose publishers are asked.
+        caller_id: The resource's node, which need not be registered yet.
+    """
+    said: set[str] = set()
+    while missing := [output for output in resource.outputs.values() if output.kind.known is None]:
+        for output in missing:
+            if await _learn(output, master_uri, caller_id) or output.kind.name in said:
+                continue
+            said.add(output.kind.name)
+            _log.warning("! %s waits for the type of output %s: %s", caller_id, output.name, output.kind.problem)
+        if any(output.kind.known is None for output in missing):
+            await asyncio.sleep(limits.TYPE_LOOK)
+
+
+async def _learn(output: Output, master_uri: str, caller_id: str) -> bool:
+    try:
+        learnt = await learn_type(master_uri, caller_id, output.kind.name)
+    except UnreachableError as error:
+        _log.debug("! %s: %s", caller_id, error)  # whatever starts next says so
+        return False
+    if learnt is not None:
+        output.kind.known = learnt.kind
+        whence = printable(learnt.node), printable(learnt.topic)
+        _log.info("= %s: %s is learnt from %s, which publishes %s", caller_id, output.kind.name, *whence)
+    return learnt is not None

@@ -1,1 +1,0 @@
-"""The ROS core, nodes and TCPROS connections on asyncio."""

@@ -1,0 +1,266 @@
+"""Keeps a core's registrations and parameters in its file: what has changed, a moment after it has."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.ros.core.store import is_locked
+from rmpa.ros.master import kept
+from rmpa.ros.wire.xmlrpc import brief
+from rmpa.runtime.event_loop import yielding_to_data
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from rmpa.core.counters import Counters
+    from rmpa.ros.core.store import CoreStore
+    from rmpa.ros.master.api import MasterApi
+    from rmpa.ros.master.kept import Key, Row, StoredRegistrations
+    from rmpa.ros.master.parameters import Tree
+
+_log = logging.getLogger(__name__)
+_NONE: Final = (0, 0)
+_ROW: Final = 64
+_OPENS: Final = 3
+"""Times that a locked file is tried at the start, ``limits.CORE_STATE_LOCKED`` each."""
+_RECORDS: Final = 8
+"""Nodes that are looked at between two breaths: to write one down takes some 25 microseconds."""
+
+
+class Keeper:
+    """Looks what has changed, and writes that; where nothing has, it writes nothing.
+
+    Args:
+        store: The file.
+        api: The core's.
+        temporary: Whether a node of this name is not to be kept: the agent's own are made anew.
+        counters: ``kept.written``, ``kept.failed``, ``kept.unfit``.
+    """
+
+    def __init__(
+        self, store: CoreStore, api: MasterApi, temporary: Callable[[str], bool], counters: Counters
+    ) -> None:
+        self._store = store
+        self._api = api
+        self._temporary = temporary
+        self._counters = counters
+        self.problem = ""
+        """Why nothing is kept at present, or empty."""
+        self._marks: dict[str, int] = {}
+        self._tree: Tree = {}
+        self._known: dict[Key, tuple[int, int]] = {}
+        """Size and hash of each row that is in the file."""
+        self._size = 0
+        self._unfit: dict[Key, str] = {}
+        self._anew = False
+        self._unread = False
+        """Whether the file may hold what was not read at the start: it is copied before it is written."""
+        self._timer: asyncio.TimerHandle | None = None
+        self._writing: asyncio.Task[None] | None = None
+        self._again = False
+        self._closed = False
+
+    @property
+    def path(self) -> Path:
+        """Of the file."""
+        return self._store.path
+
+    # --- the start --------------------------------------------------------------------------------------------
+
+    async def open(self, *, fresh: bool) -> StoredRegistrations:
+        """Open the file and read what was kept; nothing if it cannot be read, which ``problem`` says.
+
+        Args:
+            fresh: Take nothing from it, and begin it anew.
+        """
+        try:
+            rows = await self._opened()
+        except OSError as error:
+            self._anew = self._unread = True
+            self._say(str(error))
+            self._after(limits.CORE_STATE_RETRY)
+            return kept.StoredRegistrations()
+        if fresh:
+            self._anew = bool(rows)
+            return kept.StoredRegistrations()
+        found = kept.read(rows)
+        for lost in found.lost[: limits.LOG_LINES_MAX]:
+            _log.warning("! %s: left out: %s", self.path, lost)
+        self._known = {(kind, name): _known(name, value) for kind, name, value in rows}
+        self._size = sum(size for size, _ in self._known.values())
+        return found
+
+    async def _opened(self) -> list[Row]:
+        """The rows; a process that is just ending may hold the file's lock for a moment more."""
+        for _ in range(_OPENS - 1):
+            try:
+                return await self._store.open()
+            except OSError as error:
+                if not is_locked(error):
+                    raise
+        return await self._store.open()
+
+    def taken(self, tree: Tree) -> None:
+        """Everything that was read is in the master now; ``tree`` are the parameters that were in the file."""
+        self._marks = dict(self._api.registrations.marks)
+        self._tree = tree
+
+    def look_soon(self) -> None:
+        """Something may have changed."""
+        if self._closed:
+            return
+        if self._writing is not None:
+            self._again = True
+        elif self._timer is None:
+            self._after(limits.CORE_STATE_GATHER)
+
+    async def close(self) -> None:
+        """Write what has changed, and let go of the file."""
+        self._closed = True
+        if self._timer is not None:
+            self._timer.cancel()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(limits.CORE_STATE_CLOSE):
+                if self._writing is not None:
+                    await self._writing
+                await self._write()
+        if self._writing is not None and not self._writing.done():
+            self._writing.cancel()
+            await asyncio.gather(self._writing, return_exceptions=True)
+        await self._store.close()
+
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know."""
+        notes = []
+        if self.problem:
+            notes.append(f"nothing of the core is kept over a restart: {self.problem}")
+        if self._unfit:
+            texts = list(self._unfit.values())
+            more = len(texts) - limits.CORE_STATE_UNFIT_SHOWN
+            text = ", ".join(texts[: limits.CORE_STATE_UNFIT_SHOWN]) + (f" and {more} more" if more > 0 else "")
+            notes.append(f"not kept over a restart of the core: {text}")
+        return tuple(notes)
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _after(self, seconds: float) -> None:
+        self._timer = asyncio.get_running_loop().call_later(seconds, self._begin)
+
+    def _begin(self) -> None:
+        self._timer = None
+        self._again = False
+        self._writing = asyncio.get_running_loop().create_task(self._work(), name="keep the core's state")
+
+    async def _work(self) -> None:
+        good = False
+        try:
+            good = await self._write()
+        except Exception:  # noqa: BLE001 - a task's top
+            _log.exception("! keeping the core's state failed")
+        finally:
+            self._writing = None
+            if not self._closed and (self._again or not good):
+                self._after(limits.CORE_STATE_GATHER if good else limits.CORE_STATE_RETRY)
+
+    async def _write(self) -> bool:
+        """Write what has changed; whether that went well."""
+        registrations, tree = self._api.registrations, self._api.parameters.tree
+        marks = dict(registrations.marks)
+        if marks == self._marks and tree is self._tree and not self._anew and not self.problem:
+            return True
+        try:
+            if self._unread:
+                if (aside := await self._store.copy_aside()) is not None:
+                    _log.warning("! %s was not read at the start; what it holds is kept as %s", self.path, aside)
+                self._unread = False
+            if await self._store.taken_away() and not self._anew:
+                self._forget()
+            rows = dict(self._changed_nodes(marks))
+            rows |= self._changed_params(tree)
+            known = self._fitting(rows)
+            if rows or self._anew:
+                await self._store.write(rows, anew=self._anew)
+                self._counters.add("kept.written")
+        except OSError as error:
+            self._counters.add("kept.failed")
+            self._say(str(error))
+            return False
+        self._anew = False
+        self._marks, self._tree = marks, tree
+        for key, (size, digest) in known.items():
+            self._size += size - self._known.pop(key, _NONE)[0]
+            if size:
+                self._known[key] = size, digest
+        self._say("")
+        return True
+
+    def _forget(self) -> None:
+        """The file is another one than it was: everything is to be written."""
+        self._marks, self._tree, self._known, self._size = {}, {}, {}, 0
+        self._anew = True
+
+    def _changed_nodes(self, marks: dict[str, int]) -> dict[Key, bytes | None]:
+        rows: dict[Key, bytes | None] = {
+            (kept.NODE, name): None for name in yielding_to_data(list(self._marks)) if name not in marks
+        }
+        for name, mark in yielding_to_data(marks.items(), every=_RECORDS):
+            if self._marks.get(name) != mark and not self._temporary(name):
+                record = self._api.registrations.record(name)
+                rows[kept.NODE, name] = record.serialize() if record is not None else None
+        return rows
+
+    def _changed_params(self, tree: Tree) -> dict[Key, bytes | None]:
+        rows: dict[Key, bytes | None] = {}
+        for path, value in yielding_to_data(kept.changed_params(self._tree, tree)):
+            key = kept.param_key(path)
+            rows[key] = None
+            if value is not None:
+                try:
+                    rows[key] = kept.packed(value, yielding_to_data)
+                except kept.UnkeepableError as error:
+                    self._refuse(key, "/" + "/".join(path), str(error))
+                    continue
+            self._unfit.pop(key, None)
+        return rows
+
+    def _fitting(self, rows: dict[Key, bytes | None]) -> dict[Key, tuple[int, int]]:
+        """Leave out what is in the file already and what does not fit; size and hash of each row that is left."""
+        known: dict[Key, tuple[int, int]] = {}
+        size = self._size
+        for key, value in sorted(rows.items(), key=lambda row: row[1] is not None):
+            name = key[1]
+            wanted = _known(name, value) if value is not None else _NONE
+            before = self._known.get(key, _NONE)
+            if wanted[0] and size - before[0] + wanted[0] > limits.CORE_STATE_BYTES:
+                self._refuse(key, brief(name), f"{wanted[0]:,} bytes beside the {size:,} that are kept")
+                rows[key], wanted = None, _NONE
+            if wanted == before:
+                del rows[key]
+                continue
+            size += wanted[0] - before[0]
+            known[key] = wanted
+        return known
+
+    def _refuse(self, key: Key, name: str, why: str) -> None:
+        self._counters.add("kept.unfit")
+        if not self._unfit:
+            _log.warning("! %s is not kept over a restart of the core: %s", name, why)
+        self._unfit[key] = f"{key[0]} {name} ({why})"
+
+    def _say(self, problem: str) -> None:
+        """Log it when it begins and when it is over."""
+        if problem and not self.problem:
+            _log.warning("! nothing of the core is kept over a restart: %s", problem)
+        elif self.problem and not problem:
+            _log.info("= %s: everything is kept again", self.path)
+        self.problem = problem
+
+
+def _known(name: str, value: bytes) -> tuple[int, int]:
+    """Size and hash of a row. Its name stands in an index too, and each takes a few bytes more."""
+    return 2 * len(name) + len(value) + _ROW, hash(value)

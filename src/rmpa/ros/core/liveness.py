@@ -1,0 +1,227 @@
+"""Notices nodes that died without a word, so that their registrations can go.
+
+A killed node leaves its registrations behind, and roscpp does so even on SIGTERM. Whether a node still listens is
+read from the kernel's own table where the node is on this machine, because rospy starts a thread for everybody who
+only knocks; others are connected to. Only a refused connect, twice, is death: a network that is down is none. What
+cannot be connected to for another reason is unreachable (``ros.master.reachability``).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.errors import OutOfDescriptors, UnreachableError
+from rmpa.ros.core.sock_diag import ask_listening_ports
+from rmpa.ros.http.client import connect, is_own_name, split_uri
+from rmpa.ros.master.reachability import Reachability
+from rmpa.runtime.descriptors import Use, is_shortage
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Container, Mapping
+
+    from rmpa.ros.master.reachability import Unreachable
+
+_log = logging.getLogger(__name__)
+
+_TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
+_PIECE: Final = 4 * limits.KIB
+_LISTENING: Final = re.compile(rb"^ *\d+: [0-9A-F]+:([0-9A-F]{4}) [0-9A-F]+:[0-9A-F]{4} 0A ", re.MULTILINE)
+
+
+def listening_ports() -> set[int] | None:
+    """TCP ports that somebody listens at in this network namespace, or ``None`` where the kernel does not tell.
+
+    For a thread: the kernel may take milliseconds.
+    """
+    ports = ask_listening_ports()
+    return ports if ports is not None else read_tables()
+
+
+def read_tables() -> set[int] | None:
+    """The same from ``/proc``, where it cannot be asked for.
+
+    The kernel takes milliseconds where there are thousands of sockets. Between two short pieces the interpreter is
+    left to others.
+    """
+    ports: set[int] = set()
+    try:
+        for table in _TABLES:
+            if table == _TABLES[0] or table.exists():
+                with table.open("rb", buffering=0) as file:
+                    rest = b""
+                    while piece := file.read(_PIECE):
+                        lines, end, rest = (rest + piece).rpartition(b"\n")
+                        ports.update(int(port, 16) for port in _LISTENING.findall(lines + end))
+    except OSError:
+        return None
+    return ports
+
+
+class Liveness:
+    """Looks after the nodes of one master.
+
+    Args:
+        nodes: All nodes with their slave APIs.
+        on_dead: ``(node, api)`` of a node that refused two connects.
+        interval: Seconds in which every node is looked at once; ``limits.NODE_CHECK_INTERVAL`` by default.
+    """
+
+    def __init__(
+        self,
+        *,
+        nodes: Callable[[], dict[str, str]],
+        on_dead: Callable[[str, str], None],
+        interval: float | None = None,
+    ) -> None:
+        self._nodes = nodes
+        self._on_dead = on_dead
+        self._interval = limits.NODE_CHECK_INTERVAL if interval is None else interval
+        self._rounds: asyncio.Task[None] | None = None
+        self._checks: dict[str, asyncio.Task[None]] = {}
+        self._look: asyncio.Future[set[int] | None] | None = None
+        """The look in a thread that was begun last."""
+        self._closed = False
+        self._reachability = Reachability()
+        self._slow = asyncio.Semaphore(limits.NODE_UNREACHABLE_CHECKS)
+
+    @property
+    def unreachable(self) -> Mapping[str, Unreachable]:
+        """The nodes that could not be connected to, by name; not to be changed."""
+        return self._reachability.unreachable
+
+    def start(self) -> None:
+        """Look from now on."""
+        self._rounds = asyncio.get_running_loop().create_task(self._go_round(), name="node liveness")
+
+    async def close(self) -> None:
+        """Look no longer; later suspicions are not heard.
+
+        A look that is under way in its thread cannot be stopped; it is waited for, because it holds a socket.
+        """
+        self._closed = True
+        tasks = [*self._checks.values()]
+        if self._rounds is not None:
+            tasks.append(self._rounds)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        if self._look is not None:
+            await asyncio.wait([self._look], timeout=limits.DRAIN_TIMEOUT)
+
+    def suspect(self, node: str) -> None:
+        """Check one node now."""
+        api = self._nodes().get(node)
+        if api is None or node in self._checks or self._closed:
+            return
+        task = asyncio.get_running_loop().create_task(self._check(node, api), name=f"check {node}")
+        self._checks[node] = task
+        task.add_done_callback(lambda _: self._checks.pop(node, None))
+
+    async def _go_round(self) -> None:
+        while True:
+            self._look = asyncio.get_running_loop().run_in_executor(None, listening_ports)
+            ports = await asyncio.shield(self._look)
+            nodes = self._nodes()
+            self._reachability.keep(nodes)
+            pause = self._interval / max(1, len(nodes))
+            for node, api in nodes.items():
+                await asyncio.sleep(pause)
+                if _listens(api, ports):
+                    self._reached(node)
+                else:
+                    self.suspect(node)
+            if not nodes:
+                await asyncio.sleep(pause)
+
+    async def _check(self, node: str, api: str) -> None:
+        try:
+            if node in self._reachability.unreachable:
+                async with self._slow:
+                    problem = await try_connect(api)
+            else:
+                problem = await try_connect(api)
+        except ConnectionRefusedError:
+            await asyncio.sleep(limits.NODE_RECHECK_DELAY)
+            if await refuses(api) and self._nodes().get(node) == api:
+                _log.warning("= node %s at %s is dead: nobody listens there", node, api)
+                self._on_dead(node, api)
+            return
+        except OutOfDescriptors:
+            return  # our own want: nothing is known of the node
+        if self._nodes().get(node) != api:
+            return
+        if not problem:
+            self._reached(node)
+        elif self._reachability.failed(node, api, problem, asyncio.get_running_loop().time()):
+            text = "! node %s at %s cannot be reached (%s): peers are not offered it until it can"
+            _log.warning(text, node, api, problem)
+
+    def _reached(self, node: str) -> None:
+        if self._reachability.reached(node):
+            _log.warning("= node %s can be reached again", node)
+
+
+def _listens(api: str, ports: set[int] | None) -> bool:
+    try:
+        host, port, _ = split_uri(api)
+    except UnreachableError:
+        return False  # the attempt to connect says why
+    return ports is not None and (is_own_name(host) or host.startswith("127.")) and port in ports
+
+
+def is_gone(api: str, ports: set[int] | None, addresses: Container[str]) -> bool:
+    """Whether a slave API is at an address of this machine and nobody listens there; ``False`` where nothing tells.
+
+    Args:
+        api: Its URI.
+        ports: That somebody listens at (``listening_ports``).
+        addresses: This machine's.
+    """
+    try:
+        host, port, _ = split_uri(api)
+    except UnreachableError:
+        return False
+    here = is_own_name(host) or host.startswith("127.") or host in addresses
+    return here and ports is not None and port not in ports
+
+
+async def refuses(api: str) -> bool:
+    """Whether nobody listens at a slave API's address; ``False`` where that cannot be found out."""
+    try:
+        await try_connect(api)
+    except ConnectionRefusedError:
+        return True
+    except OutOfDescriptors:
+        return False
+    return False
+
+
+async def try_connect(api: str) -> str:
+    """Connect to a slave API, and hang up; why it cannot be reached, or empty.
+
+    Raises:
+        ConnectionRefusedError: Its machine answers that nobody listens there.
+        OutOfDescriptors: It could not be tried.
+    """
+    try:
+        host, port, _ = split_uri(api)
+        async with asyncio.timeout(limits.TCPROS_CONNECT_TIMEOUT):
+            sock = await connect(host, port, Use.CORE)
+    except ConnectionRefusedError:
+        raise
+    except TimeoutError:
+        return f"no answer in {limits.TCPROS_CONNECT_TIMEOUT:g} s"
+    except UnreachableError as error:
+        return error.remedy or str(error)
+    except OSError as error:
+        if is_shortage(error):
+            raise OutOfDescriptors("node", api) from error
+        return os.strerror(error.errno) if error.errno else str(error)
+    sock.close()
+    return ""

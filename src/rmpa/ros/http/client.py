@@ -1,0 +1,260 @@
+"""XML-RPC calls to nodes and masters, each on a connection of its own.
+
+A kept-alive connection costs a Python node a thread and blocks nothing for roscpp, so none is kept; a connection on
+loopback is made in 50 microseconds.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import functools
+import ipaddress
+import logging
+import os
+import socket
+from typing import Final
+from urllib.parse import urlsplit
+
+import h11
+
+from rmpa.core import limits
+from rmpa.core.errors import LimitExceeded, OutOfDescriptors, RemoteProtocolError, UnreachableError
+from rmpa.ros.wire.xmlrpc import ResponseReader, RosFault, RosReply, XmlRpcValue, brief, call_pieces
+from rmpa.runtime.descriptors import DESCRIPTORS, OUT_OF_DESCRIPTORS, Use
+from rmpa.runtime.event_loop import yield_to_data, yielding_to_data
+
+__all__ = ["RosFault", "call", "call_api", "connect", "exchange", "is_own_name", "read_response", "split_uri"]
+
+_log = logging.getLogger(__name__)
+
+_CHUNK: Final = 64 * limits.KIB
+_LOOPBACK: Final = "127.0.0.1"
+
+
+@functools.lru_cache(maxsize=1024)
+def split_uri(uri: str) -> tuple[str, int, str]:
+    """``http://host:port/path`` to ``(host, port, path)``; the path is at least ``/``.
+
+    Raises:
+        UnreachableError: The text is not such a URI: ROS wants the port said.
+    """
+    try:
+        parts = urlsplit(uri)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host, port, parts = None, None, None
+    if parts is None or parts.scheme != "http" or not host or not port:
+        raise UnreachableError("XML-RPC server", repr(uri), "a ROS URI looks like http://host:11311/")
+    return host, port, parts.path or "/"
+
+
+def is_own_name(host: str) -> bool:
+    """Whether a host's name is this machine's, so that loopback will do."""
+    return host in {"localhost", socket.gethostname()}
+
+
+async def _addresses(host: str, port: int) -> list[tuple[str, int]]:
+    """Where to connect, best first: names of this machine and numbers without asking the resolver."""
+    if is_own_name(host):
+        return [(_LOOPBACK, port)]
+    try:
+        return [(str(ipaddress.IPv4Address(host)), port)]
+    except ValueError:
+        return await _resolve(host, port)
+
+
+async def _resolve(host: str, port: int) -> list[tuple[str, int]]:
+    loop = asyncio.get_running_loop()
+    try:
+        found = await loop.getaddrinfo(host, port, family=socket.AF_INET, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError) as error:
+        raise UnreachableError(
+            "machine", host, f"the name does not resolve here ({error}); set ROS_IP where that node runs"
+        ) from error
+    return [(address[0], port) for *_, address in found if isinstance(address[0], str)]
+
+
+async def _connect_one(address: tuple[str, int], use: Use) -> socket.socket:
+    sock = DESCRIPTORS.open_socket(use, what=f"a connection to {address[0]}:{address[1]}")
+    try:
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        await asyncio.get_running_loop().sock_connect(sock, address)
+        # This raises too, where the other side hung up at once.
+        if sock.getsockname() == sock.getpeername():
+            # A port of the ephemeral range that nobody listens at can connect to itself.
+            raise ConnectionRefusedError(errno.ECONNREFUSED, "connected to itself")  # noqa: TRY301 - see below
+    except BaseException:
+        sock.close()
+        raise
+    return sock
+
+
+async def connect(host: str, port: int, use: Use = Use.DATA) -> socket.socket:
+    """Connect by TCP, non-blocking and with TCP_NODELAY.
+
+    Args:
+        host: A number, a name of this machine (connected on loopback, without the resolver) or any other name.
+        port: The port.
+        use: What for: whether it may take one of the last file descriptors.
+
+    Raises:
+        UnreachableError: The name does not resolve.
+        OSError: Nobody listens there (``ConnectionRefusedError``), the network says no, or no file descriptor is
+            left (``EMFILE``).
+    """
+    error: OSError = ConnectionRefusedError(errno.ECONNREFUSED, f"no address for {host}")
+    addresses = await _addresses(host, port)
+    for address in addresses:
+        try:
+            return await _connect_one(address, use)
+        except OSError as refused:
+            error = refused
+    if is_own_name(host) and host != "localhost":
+        # A node may listen at this machine's outer address only.
+        for address in await _resolve(host, port):
+            if address not in addresses:
+                try:
+                    return await _connect_one(address, use)
+                except OSError as refused:
+                    error = refused
+    raise error
+
+
+def _request(host: str, port: int, path: str, body: bytes) -> tuple[h11.Connection, bytes]:
+    http = h11.Connection(h11.CLIENT, max_incomplete_event_size=limits.HTTP_HEADERS_MAX)
+    headers = [
+        (b"Host", f"{host}:{port}".encode("idna" if not host.isascii() else "ascii")),
+        (b"User-Agent", b"rmpa"),
+        (b"Content-Type", b"text/xml"),
+        (b"Content-length", str(len(body)).encode("ascii")),
+        (b"Connection", b"close"),
+    ]
+    parts = [
+        http.send(h11.Request(method=b"POST", target=path.encode("ascii", "replace"), headers=headers)),
+        http.send(h11.Data(data=body)),
+        http.send(h11.EndOfMessage()),
+    ]
+    return http, b"".join(part or b"" for part in parts)
+
+
+async def _response_body(sock: socket.socket, http: h11.Connection) -> bytes:
+    loop = asyncio.get_running_loop()
+    body = bytearray()
+    while True:
+        event = http.next_event()
+        match event:
+            case h11.Data(data=data):
+                if len(body) + len(data) > limits.HTTP_BODY_MAX:
+                    raise LimitExceeded("XML-RPC response", len(body) + len(data), limits.HTTP_BODY_MAX)
+                body += data
+            case h11.EndOfMessage():
+                return bytes(body)
+            case h11.ConnectionClosed():
+                raise RemoteProtocolError("the connection was closed before the response")
+            case h11.InformationalResponse() | h11.Response():
+                # XmlRpc++ and its copies put anything into the status; the body says what happened.
+                pass
+            case _:
+                http.receive_data(await loop.sock_recv(sock, _CHUNK))
+
+
+async def call(
+    uri: str,
+    method: str,
+    *params: XmlRpcValue,
+    timeout: float = limits.SLAVE_CALL_TIMEOUT,  # noqa: ASYNC109 - the message names it
+    use: Use = Use.DATA,
+) -> XmlRpcValue:
+    """Call a method of the server at ``uri``.
+
+    Args:
+        uri: ``http://host:port/``.
+        method: Its name.
+        params: What it is called with.
+        timeout: Seconds for everything: connecting, the call and its response.
+        use: What for: whether it may take one of the last file descriptors.
+
+    Raises:
+        UnreachableError: Nobody answers there, or not in time.
+        OutOfDescriptors: No file descriptor is left here to ask.
+        RosFault: The answer is a fault.
+        RemoteProtocolError: The answer is not XML-RPC, or too large.
+        LocalProtocolError: A parameter cannot be said in XML-RPC.
+    """
+    if _log.isEnabledFor(logging.DEBUG):
+        _log.debug("> %s %s%s", uri, method, brief(params))
+    document = b"".join(yielding_to_data(call_pieces(method, params), every=1))
+    return await read_response(await exchange(uri, method, document, timeout=timeout, use=use))
+
+
+async def exchange(
+    uri: str,
+    method: str,
+    document: bytes,
+    *,
+    timeout: float,  # noqa: ASYNC109 - the message names it
+    use: Use = Use.DATA,
+) -> bytes:
+    """Send a ``methodCall`` document and return the response's, which nobody has looked at.
+
+    For who asks the same again and again, and need not read the same answer twice. Arguments and errors as of
+    ``call``; ``read_response`` reads it.
+    """
+    host, port, path = split_uri(uri)
+    http, request = _request(host, port, path, document)
+    try:
+        async with asyncio.timeout(timeout):
+            sock = await connect(host, port, use)
+            try:
+                await asyncio.get_running_loop().sock_sendall(sock, request)
+                return await _response_body(sock, http)
+            finally:
+                sock.close()
+    except TimeoutError as error:
+        raise UnreachableError(
+            "XML-RPC server", uri, f"no answer to {method} in {timeout:g} s; is that program stopped?"
+        ) from error
+    except OSError as error:
+        if error.errno in OUT_OF_DESCRIPTORS:
+            raise OutOfDescriptors("XML-RPC server", uri, "`rmpa doctor` says what to do") from error
+        problem = os.strerror(error.errno) if error.errno else str(error)
+        raise UnreachableError("XML-RPC server", uri, f"{problem}; is that program running?") from error
+    except h11.RemoteProtocolError as error:
+        raise RemoteProtocolError(f"{uri} does not speak HTTP: {error}") from error
+
+
+async def read_response(body: bytes) -> XmlRpcValue:
+    """Read a response, a little at a time.
+
+    Raises:
+        RosFault, RemoteProtocolError: As for ``call``.
+    """
+    reader = ResponseReader()
+    try:
+        for begin in range(0, len(body), limits.XMLRPC_SLICE):
+            reader.feed(body[begin : begin + limits.XMLRPC_SLICE])
+            if begin >= limits.HTTP_BODY_INLINE:
+                await asyncio.sleep(0)
+            else:
+                yield_to_data()
+    except asyncio.CancelledError:
+        reader.abandon()
+        raise
+    return reader.close()
+
+
+async def call_api(
+    uri: str,
+    method: str,
+    *params: XmlRpcValue,
+    timeout: float = limits.SLAVE_CALL_TIMEOUT,  # noqa: ASYNC109 - handed to ``call``
+    use: Use = Use.DATA,
+) -> RosReply:
+    """Call a method of a ROS API, all of which answer ``[code, status, value]``.
+
+    Raises:
+        RemoteProtocolError: The answer is not such a triple (roscpp's ``getBusStats`` is none).
+        UnreachableError, RosFault, LocalProtocolError: As for ``call``.
+    """
+    return RosReply.of(await call(uri, method, *params, timeout=timeout, use=use))

@@ -1,0 +1,72 @@
+"""Opens the listening socket of an XML-RPC server, and says in plain words why that cannot be."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import ipaddress
+import socket
+from typing import TYPE_CHECKING
+
+from rmpa.core import limits
+from rmpa.core.errors import StartError
+from rmpa.core.open_files import remedy
+from rmpa.runtime.descriptors import DESCRIPTORS
+
+if TYPE_CHECKING:
+    from rmpa.runtime.descriptors import Use
+
+
+async def listen(name: str, host: str, port: int, use: Use) -> socket.socket:
+    """A socket that listens.
+
+    Args:
+        name: What listens, for the text of errors.
+        host: Numeric address or name; empty: all addresses.
+        port: 0 lets the system choose.
+        use: What its connections are for.
+
+    Raises:
+        StartError: The address is in use, not ours, or not allowed.
+    """
+    try:
+        address = await _resolve(host, port)
+        sock = DESCRIPTORS.open_socket(use, what=name)
+        try:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            sock.bind(address)
+            sock.listen(limits.HTTP_BACKLOG)
+        except BaseException:
+            sock.close()
+            raise
+    except OSError as error:
+        raise _start_error(error, f"{name} at {host}:{port}", port) from error
+    return sock
+
+
+async def _resolve(host: str, port: int) -> tuple[str, int]:
+    with contextlib.suppress(ValueError):
+        return str(ipaddress.IPv4Address(host)), port
+    if not host:
+        return "", port
+    loop = asyncio.get_running_loop()
+    found = await loop.getaddrinfo(host, port, family=socket.AF_INET, type=socket.SOCK_STREAM)
+    return str(found[0][4][0]), port
+
+
+def _start_error(error: OSError, where: str, port: int) -> StartError:
+    match error.errno:
+        case errno.EADDRINUSE:
+            return StartError(
+                where,
+                f"port {port} is already in use",
+                "end the program that listens there (another core?) or choose another port",
+            )
+        case errno.EACCES | errno.EPERM:
+            return StartError(where, "this user may not use that port", "choose a port above 1023")
+        case errno.EADDRNOTAVAIL:
+            return StartError(where, "this machine does not have that address", "choose one that `ip addr` shows")
+        case errno.EMFILE:
+            return StartError(where, "no file descriptors left", remedy())
+    return StartError(where, error.strerror or str(error))

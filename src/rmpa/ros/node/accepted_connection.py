@@ -1,0 +1,152 @@
+"""One accepted TCPROS connection: its header comes in, then messages go out."""
+
+from __future__ import annotations
+
+import logging
+import socket
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.outbox import URGENT, Outbox
+from rmpa.ros.wire.tcpros import encode_header, error_header, parse_header
+from rmpa.runtime.stream import Stream
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from rmpa.core.outbox import QueuedMessage
+    from rmpa.ros.wire.tcpros import Buffer, Header
+    from rmpa.runtime.stream import OnBytes
+
+_log = logging.getLogger(__name__)
+_MESSAGES: Final = 0
+
+
+def keep_alive(sock: socket.socket) -> None:
+    """Let the kernel notice a machine that was switched off, after the same time as roscpp does."""
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, limits.TCP_KEEPALIVE_IDLE)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, limits.TCP_KEEPALIVE_INTERVAL)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, limits.TCP_KEEPALIVE_COUNT)
+
+
+class AcceptedConnection:
+    """A connection that another node opened to us.
+
+    Args:
+        sock: Accepted, non-blocking; owned from here on.
+        number: The node's own number for this connection.
+        on_header: Called once, with the fields.
+        on_end: Called once when the other side is gone or broke the protocol (then with the error); not after
+            ``close()`` or ``refuse()``. Its owner may replace it.
+
+    Attributes:
+        on_bytes: Takes what comes behind the header, as ``runtime.stream`` has it; without one, as for subscribers,
+            it is thrown away.
+    """
+
+    def __init__(
+        self,
+        sock: socket.socket,
+        number: int,
+        *,
+        on_header: Callable[[AcceptedConnection, Header], None],
+        on_end: Callable[[AcceptedConnection, Exception | None], None],
+    ) -> None:
+        self.number = number
+        self.fields: Header = {}
+        """The other side's header, once it is there."""
+        self.peer: tuple[str, int] = sock.getpeername()[:2]
+        self.messages = 0
+        """Messages given to the connection, later dropped ones included."""
+        self.on_end = on_end
+        self.on_bytes: OnBytes | None = None
+        self._on_header = on_header
+        self._sock = sock
+        self._local_port: int = sock.getsockname()[1]
+        self._heard = False
+        keep_alive(sock)
+        self._outbox = Outbox(limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SUBSCRIBER_QUEUE_BYTES)
+        self.stream = Stream(sock, on_bytes=self._take, on_close=self._ended, outbox=self._outbox)
+
+    @property
+    def caller_id(self) -> str:
+        """The other node's name, as it says."""
+        return self.fields.get("callerid", "")
+
+    @property
+    def dropped(self) -> int:
+        """Messages that this connection was too slow for."""
+        return self._outbox.dropped[_MESSAGES]
+
+    @property
+    def info(self) -> str:
+        """The addresses, in the form that rosnode shows."""
+        return f"TCPROS connection on port {self._local_port} to [{self.peer[0]}:{self.peer[1]}]"
+
+    def accept(
+        self, header: Mapping[str, str], queue_messages: int, queue_bytes: int, *, nodelay: bool = False
+    ) -> None:
+        """Answer with our header; messages may follow.
+
+        Args:
+            header: Our reply.
+            queue_messages: How many messages may wait for this connection.
+            queue_bytes: The same in bytes.
+            nodelay: Whether each message leaves at once, even if the other side did not ask for it.
+        """
+        if nodelay or self.fields.get("tcp_nodelay") == "1":
+            self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._outbox.set_bounds(queue_messages, queue_bytes)
+        self.stream.send([encode_header(header)], URGENT)
+
+    def bound(self, queue_messages: int, queue_bytes: int) -> None:
+        """Change how much may wait for this connection."""
+        self._outbox.set_bounds(queue_messages, queue_bytes)
+
+    def refuse(self, text: str) -> None:
+        """Answer with an error header and close. For good only: the other side does not ask again by itself."""
+        self.stream.send([encode_header(error_header(text))], URGENT)
+        self.close()
+
+    def send(self, framed: Buffer) -> int:
+        """Send one message, its length in front; return how many older ones were dropped for it."""
+        self.messages += 1
+        return self.stream.send([framed], _MESSAGES)
+
+    def begin(self, size: int) -> QueuedMessage:
+        """Begin a message of ``size`` bytes, its length in front, that come in parts."""
+        self.messages += 1
+        return self.stream.open(_MESSAGES, size)
+
+    def extend(self, parcel: QueuedMessage, part: Buffer) -> int:
+        """Send a part of it; return how many older ones were dropped for it."""
+        return self.stream.extend(parcel, part)
+
+    def abandon(self, parcel: QueuedMessage) -> bool:
+        """The rest of it will not come; whether the other side has the beginning, and must be hung up on."""
+        return self.stream.abandon(parcel)
+
+    def close(self) -> None:
+        """Close at once, without a call of ``on_end``."""
+        self.stream.close()
+
+    def _take(self, data: memoryview) -> tuple[int, int]:
+        if self._heard:
+            if self.on_bytes is not None:
+                return self.on_bytes(data)
+            # Nothing may come from a subscriber. Reading it away keeps its end of stream visible.
+            return len(data), 0
+        fields, consumed, wanted = parse_header(data)
+        if fields is None:
+            return 0, wanted
+        self._heard = True
+        self.fields = fields
+        self._on_header(self, fields)
+        if self.on_bytes is not None and consumed < len(data):
+            taken, wanted = self.on_bytes(data[consumed:])
+            return consumed + taken, wanted
+        return consumed, 0
+
+    def _ended(self, error: Exception | None) -> None:
+        self.on_end(self, error)

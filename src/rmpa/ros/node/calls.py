@@ -1,0 +1,79 @@
+"""Calls to one node's slave API: is it there, and please end."""
+
+from __future__ import annotations
+
+import asyncio
+
+from rmpa.core import limits
+from rmpa.core.errors import PeerRefused, RemoteProtocolError, UnreachableError
+from rmpa.ros.core.liveness import refuses
+from rmpa.ros.http.client import call_api
+from rmpa.ros.node_info import NodePing
+from rmpa.ros.wire.xmlrpc import RosFault, RosReply
+
+
+async def ping_node(node: str, uri: str, caller_id: str) -> NodePing:
+    """Ask a node for its process, and measure how long it takes.
+
+    Args:
+        node: Its name, for errors.
+        uri: Its slave API.
+        caller_id: The asking node's name.
+
+    Raises:
+        UnreachableError: It does not answer.
+        PeerRefused: It answers with an error.
+        RemoteProtocolError: Its answer is none.
+    """
+    loop = asyncio.get_running_loop()
+    begin = loop.time()
+    reply = await _call(node, uri, "getPid", caller_id)
+    if reply.code != 1 or not isinstance(reply.value, int):
+        raise PeerRefused(node, reply.status or "it does not tell its process")
+    return NodePing(uri=uri, time=loop.time() - begin, pid=reply.value)
+
+
+async def end_node(node: str, uri: str, caller_id: str, reason: str) -> bool:
+    """Ask a node to end, and wait up to ``limits.NODE_KILL_WAIT`` until it has.
+
+    Args:
+        node: Its name, for errors.
+        uri: Its slave API.
+        caller_id: The asking node's name.
+        reason: For its log.
+
+    Returns:
+        Whether nothing listens at its slave API any more.
+
+    Raises:
+        UnreachableError: It cannot be asked.
+        PeerRefused: It says no.
+        RemoteProtocolError: Its answer is none.
+    """
+    try:
+        reply = await _call(node, uri, "shutdown", caller_id, reason)
+    except (UnreachableError, RemoteProtocolError):
+        # A node may end before it has answered; one that was not there has not ended.
+        if not await refuses(uri):
+            raise
+        return True
+    if reply.code != 1:
+        raise PeerRefused(node, reply.status or "it does not end")
+    return await _ended(uri)
+
+
+async def _ended(uri: str) -> bool:
+    loop = asyncio.get_running_loop()
+    give_up = loop.time() + limits.NODE_KILL_WAIT
+    while not await refuses(uri):
+        if loop.time() >= give_up:
+            return False
+        await asyncio.sleep(limits.NODE_KILL_LOOK)
+    return True
+
+
+async def _call(node: str, uri: str, method: str, *params: str) -> RosReply:
+    try:
+        return await call_api(uri, method, *params)
+    except RosFault as error:
+        raise PeerRefused(node, error.text) from error

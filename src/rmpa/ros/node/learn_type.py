@@ -1,0 +1,166 @@
+"""Learns the definition of a message type from a node that publishes it: each publisher sends it in its header.
+
+The connection ends with the header, and is not registered at the master. A publisher that works only while there is a
+subscriber (a lazy one) sees one for a moment. To a peer's publisher it goes by its proxy, which opens the route.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.errors import RmpaError
+from rmpa.ros.http.client import call_api
+from rmpa.ros.node.subscription import PublisherConnection
+from rmpa.ros.types.definitions import UnknownTypeError
+from rmpa.ros.types.find import find_message_type
+from rmpa.ros.types.header_types import type_of_header
+from rmpa.ros.wire.tcpros import printable
+
+if TYPE_CHECKING:
+    from rmpa.ros.types.messages import MessageType
+    from rmpa.ros.wire.tcpros import Header
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+
+_log = logging.getLogger(__name__)
+_PROXIES: Final = "/rmpa/"
+"""Begins the names of nodes that stand for a peer's: asked last, for that opens a route."""
+
+
+@dataclass(frozen=True, slots=True)
+class Learnt:
+    """A type that a publisher has told.
+
+    Args:
+        kind: The type.
+        topic: What it publishes.
+        node: Its name.
+    """
+
+    kind: MessageType
+    topic: str
+    node: str
+
+
+async def learn_type(
+    master_uri: str, caller_id: str, name: str, *, topic: str = "", elsewhere: bool = True
+) -> Learnt | None:
+    """Ask the publishers of a type for its definition, one behind the other, at most ``limits.ASKED_FOR_TYPE_MAX``.
+
+    Args:
+        master_uri: The master that knows them.
+        caller_id: The name of the node that asks; it need not be registered.
+        name: The type, ``package/Name``.
+        topic: Its publishers are asked first.
+        elsewhere: Whether publishers of other topics are asked, too.
+
+    Returns:
+        ``None`` where no publisher of that type could tell.
+
+    Raises:
+        UnreachableError: The master does not answer.
+    """
+    candidates = await _publishers(master_uri, caller_id, name)
+    if not elsewhere:
+        candidates = [each for each in candidates if each[0] == topic]
+    candidates.sort(key=lambda each: (each[0] != topic, each[1].startswith(_PROXIES), each))
+    for where, node in candidates[: limits.ASKED_FOR_TYPE_MAX]:
+        if node == caller_id:
+            continue
+        try:
+            reply = await call_api(master_uri, "lookupNode", caller_id, node)
+            header = await _header(str(reply.value), where, f"{caller_id}_learns") if reply.code == 1 else {}
+            kind = await asyncio.to_thread(type_of_header, header) if header.get("type") == name else None
+        except RmpaError as error:
+            _log.debug("! %s from %s: %s", name, node, error)
+            continue
+        if kind is not None:
+            return Learnt(kind, where, node)
+    return None
+
+
+async def find_or_learn(master_uri: str, caller_id: str, name: str, topic: str = "") -> MessageType:
+    """Find a message type on this machine (``ros.types.find``), else learn it from a publisher.
+
+    Args:
+        master_uri: The master whose publishers are asked.
+        caller_id: The node that asks.
+        name: The type, ``package/Name``.
+        topic: Its publishers are asked first.
+
+    Raises:
+        UnknownTypeError: Neither this machine nor a publisher knows it.
+        DefinitionError: What is here is malformed.
+        UnreachableError: The master does not answer.
+    """
+    try:
+        return await asyncio.to_thread(find_message_type, name)
+    except UnknownTypeError as error:
+        if not error.learnable:
+            raise
+        unknown = error
+    learnt = await learn_type(master_uri, caller_id, name, topic=topic)
+    if learnt is None:
+        unknown.problem += f"; no publisher at {master_uri} tells it"
+        raise unknown
+    _log.info("= %s is learnt from %s, which publishes %s", name, printable(learnt.node), printable(learnt.topic))
+    return learnt.kind
+
+
+async def _publishers(master_uri: str, caller_id: str, name: str) -> list[tuple[str, str]]:
+    """(topic, node) pairs of all that publish a type."""
+    state = (await call_api(master_uri, "getSystemState", caller_id)).value
+    types = (await call_api(master_uri, "getTopicTypes", caller_id)).value
+    topics = {str(pair[0]) for pair in _pairs(types) if pair[1] == name}
+    publishers = _pairs(state[0]) if isinstance(state, list) and state else []
+    return [
+        (str(topic), str(node))
+        for topic, nodes in publishers
+        if topic in topics and isinstance(nodes, list)
+        for node in nodes
+    ]
+
+
+def _pairs(value: XmlRpcValue) -> list[list[XmlRpcValue]]:
+    return [pair for pair in value if isinstance(pair, list) and len(pair) == 2] if isinstance(value, list) else []
+
+
+async def _header(uri: str, topic: str, caller_id: str) -> Header:
+    """A publisher's reply header; empty where it sends none.
+
+    Args:
+        uri: Its slave API.
+        topic: The topic.
+        caller_id: Not that of a node that listens to it: a rospy publisher has one connection for each caller.
+    """
+    told: asyncio.Future[Header] = asyncio.get_running_loop().create_future()
+
+    def tell(header: Header) -> None:
+        if not told.done():
+            told.set_result(header)
+
+    def fail(why: str) -> None:
+        _log.debug("! %s from %s: %s", topic, uri, printable(why))
+        tell({})
+
+    link = PublisherConnection(
+        topic,
+        uri,
+        caller_id,
+        on_message=lambda _: None,
+        on_header=lambda fields: tell(dict(fields)),
+        on_refused=fail,
+        on_lost=fail,
+    )
+    link.start()
+    try:
+        async with asyncio.timeout(limits.ASKED_FOR_TYPE_TIMEOUT):
+            return await told
+    except TimeoutError:
+        return {}
+    finally:
+        link.close()
+        await link.closed()

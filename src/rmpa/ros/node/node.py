@@ -1,0 +1,550 @@
+"""A small ROS node for our own tools, demos and tests.
+
+::
+
+    async with Node("talker") as node:
+        publisher = await node.advertise("/chatter", "std_msgs/String")
+        publisher.publish(publisher.make("hello"))
+
+    async with Node("echo", anonymous=True) as node:
+        async for received in await node.subscribe("/chatter"):
+            print(received.message.data)
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import time
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from rmpa.core import limits
+from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.ros.environment import RosEnvironment, host_of, is_loopback
+from rmpa.ros.http.client import call_api
+from rmpa.ros.node.learn_type import find_or_learn
+from rmpa.ros.node.local_addresses import local_addresses
+from rmpa.ros.node.service_client import ServiceConnection
+from rmpa.ros.node.services import Handler, Service, ServiceClient, probe
+from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.ros.node.topics import Publisher, Received, Subscriber
+from rmpa.ros.types.definitions import UnknownTypeError
+from rmpa.ros.types.find import find_message_type, find_service_type
+from rmpa.ros.types.messages import MessageType
+from rmpa.ros.wire.tcpros import ANY, TopicDescription
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import TracebackType
+
+    from rmpa.ros.types.service_types import ServiceType
+    from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
+
+__all__ = ["Node", "Publisher", "Received", "Service", "ServiceClient", "Subscriber"]
+
+_log = logging.getLogger(__name__)
+_REMEDY: Final = "start one (rmpa up, or roscore), or set ROS_MASTER_URI to one that runs"
+_NO_DEFAULT: Final = object()
+
+
+class Node:
+    """One node, registered at a master as long as the ``async with`` lasts.
+
+    A master that is killed and started again is noticed within ``limits.NODE_MASTER_CHECK`` and gets all
+    registrations anew; connections that stand are kept meanwhile. When the master wants the node to end, it closes
+    itself: ``async for`` loops end and ``stopped`` is set.
+
+    Args:
+        name: As the user writes it; resolved in the namespace. ``__name:=`` replaces it.
+        master_uri: Instead of the environment's.
+        anonymous: Whether the name is made unique.
+        environment: Instead of this process's variables (its arguments are only read through here).
+        on_shutdown: ``(reason)``: the master wants the node to end.
+        on_param_update: ``(key, value)``: a parameter followed by ``follow_param`` has changed.
+
+    Raises:
+        ConfigError: A ROS variable cannot be used.
+        ValueError: The name is not a legal one.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        master_uri: str = "",
+        anonymous: bool = False,
+        environment: RosEnvironment | None = None,
+        on_shutdown: Callable[[str], None] | None = None,
+        on_param_update: Callable[[str, XmlRpcValue], None] | None = None,
+    ) -> None:
+        if environment is None:
+            environment = RosEnvironment.read(os.environ, (), local_addresses())
+        if anonymous:
+            name = f"{name}_{os.getpid()}_{time.time_ns() // 1_000_000}"
+        self.environment = environment
+        self.name = environment.node_name(name)
+        self.master_uri = master_uri or environment.master_uri
+        self.stopped = asyncio.Event()
+        """Set when the node is closed, by whomever."""
+        self._on_shutdown = on_shutdown
+        self._on_param_update = on_param_update
+        self._publishers: dict[str, Publisher] = {}
+        self._subscribers: dict[str, Subscriber] = {}
+        self._services: dict[str, Service] = {}
+        self._followed: set[str] = set()
+        self._watch: asyncio.Task[None] | None = None
+        self._ending: asyncio.Task[None] | None = None
+        self._closing: asyncio.Task[None] | None = None
+        host, self._bind = self._hosts()
+        self._slave = SlaveNode(
+            self.name,
+            self._bind,
+            self.master_uri,
+            advertised_host=host,
+            on_shutdown=self._told_to_stop,
+            on_param_update=self._param_update,
+        )
+
+    @property
+    def uri(self) -> str:
+        """The slave API, ``http://host:port/``."""
+        return self._slave.uri
+
+    @property
+    def slave(self) -> SlaveNode:
+        """The serving side, for its connections and counters."""
+        return self._slave
+
+    async def __aenter__(self) -> Self:
+        """Listen, and see whether the master answers.
+
+        Raises:
+            UnreachableError: It does not.
+        """
+        await self._slave.start()
+        try:
+            await self.call_master("getPid")
+        except BaseException:
+            await self._slave.close()
+            raise
+        self._watch = asyncio.get_running_loop().create_task(self._watch_master(), name=f"watch master {self.name}")
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Unregister everything and close; may be called twice."""
+        if self._closing is None:
+            self._closing = asyncio.get_running_loop().create_task(self._close(), name=f"close {self.name}")
+        await asyncio.shield(self._closing)
+
+    # --- topics -----------------------------------------------------------------------------------------------
+
+    async def advertise(
+        self,
+        topic: str,
+        kind: str | MessageType | TopicDescription,
+        *,
+        latch: bool = False,
+        queue_messages: int = limits.SUBSCRIBER_QUEUE_MESSAGES,
+    ) -> Publisher:
+        """Publish a topic.
+
+        Args:
+            topic: Resolved in the namespace; ``~name`` is the node's own.
+            kind: The type: its name, which ``rmpa.ros.types.find`` finds here or a publisher tells; one that was
+                found before; or, for raw bytes only, just a description.
+            latch: Whether each new subscriber gets the last message.
+            queue_messages: Messages that wait for one slow subscriber; the oldest is dropped beyond it.
+
+        Raises:
+            DefinitionError: The type is not known.
+            UnreachableError: The master does not answer.
+            PeerRefused: The master refuses the registration.
+        """
+        resolved = self._resolve(topic)
+        if isinstance(kind, str):
+            kind = await find_or_learn(self.master_uri, self.name, kind, resolved)
+        description = kind if isinstance(kind, TopicDescription) else kind.describe(latching=latch)
+        publisher = Publisher(
+            resolved,
+            self.name,
+            description,
+            kind if isinstance(kind, MessageType) else None,
+            queue_messages,
+            self._unadvertise,
+        )
+        self._slave.add_publication(publisher.publication)
+        self._publishers[resolved] = publisher
+        try:
+            await self._register_publisher(publisher)
+        except BaseException:
+            self._publishers.pop(resolved, None)
+            self._slave.remove_publication(resolved)
+            raise
+        return publisher
+
+    async def subscribe(
+        self,
+        topic: str,
+        kind: str | MessageType | None = None,
+        callback: Callable[[Received], None] | None = None,
+        *,
+        nodelay: bool = True,
+        queue_messages: int = limits.RECEIVED_QUEUE,
+    ) -> Subscriber:
+        """Subscribe to a topic.
+
+        Args:
+            topic: Resolved in the namespace.
+            kind: The type; ``None`` takes any. The definition is the publisher's where none is found here.
+            callback: Called in the loop with each message; what it raises is logged. Without one, use
+                ``async for`` on the result.
+            nodelay: Whether to ask publishers for TCP_NODELAY.
+            queue_messages: Messages that wait for the ``async for``; the oldest is dropped beyond it.
+
+        Raises:
+            DefinitionError: The type is not known.
+            UnreachableError: The master does not answer.
+            PeerRefused: The master refuses the registration.
+            ValueError: The node subscribes to that topic already.
+        """
+        resolved = self._resolve(topic)
+        type_name = kind if isinstance(kind, str) else ANY
+        if isinstance(kind, str):
+            kind = await self._known_here(kind) if kind != ANY else None
+        if resolved in self._subscribers:
+            raise ValueError(f"{self.name} subscribes to {resolved} already")
+        subscriber = Subscriber(
+            resolved,
+            self.name,
+            kind,
+            callback,
+            type_name=type_name,
+            own_uri=self.uri,
+            nodelay=nodelay,
+            queue_messages=queue_messages,
+            number=self._slave.next_number,
+            on_close=self._unsubscribe,
+        )
+        self._slave.add_subscription(subscriber.subscription)
+        self._subscribers[resolved] = subscriber
+        try:
+            await self._register_subscriber(subscriber)
+        except BaseException:
+            self._subscribers.pop(resolved, None)
+            await self._slave.remove_subscription(resolved)
+            raise
+        return subscriber
+
+    # --- services ---------------------------------------------------------------------------------------------
+
+    async def advertise_service(
+        self,
+        name: str,
+        kind: str | ServiceType,
+        handler: Handler,
+        *,
+        timeout: float = limits.SERVICE_TIMEOUT,  # noqa: ASYNC109 - of each call, which the client hears of
+    ) -> Service:
+        """Serve a service.
+
+        Args:
+            name: Resolved in the namespace; ``~name`` is the node's own.
+            kind: The type.
+            handler: Called in the loop with each request's object; gives the response, as an object or plain values,
+                at once or as an awaitable. What it raises becomes the client's error.
+            timeout: Seconds for a call before the client gets an error.
+
+        Raises:
+            DefinitionError: The type is not known.
+            UnreachableError: The master does not answer.
+            PeerRefused: The master refuses the registration.
+            ValueError: The node serves that service already.
+        """
+        resolved = self._resolve(name)
+        kind = await asyncio.to_thread(find_service_type, kind) if isinstance(kind, str) else kind
+        service = Service(resolved, self.name, kind, handler, timeout, self._unadvertise_service)
+        self._slave.add_service(service.endpoint)
+        self._services[resolved] = service
+        try:
+            await self._register_service(service)
+        except BaseException:
+            self._services.pop(resolved, None)
+            self._slave.remove_service(resolved)
+            raise
+        return service
+
+    async def lookup_service(self, name: str) -> str:
+        """Where a service is served, ``rosrpc://host:port``.
+
+        Raises:
+            UnreachableError: No node serves it, or the master does not answer.
+        """
+        resolved = self._resolve(name)
+        reply = await self._call("lookupService", resolved)
+        if reply.code != 1:
+            where = f"the ROS master {self.master_uri}"
+            raise UnreachableError(f"server of service {resolved}", where, "does its node run?")
+        return str(reply.value)
+
+    async def connect_service(self, name: str, kind: str | ServiceType, *, persistent: bool = True) -> ServiceClient:
+        """Connect to a service, for many calls or for one; close the result.
+
+        Raises:
+            DefinitionError: The type is not known.
+            UnreachableError: No node serves it, or its server does not answer.
+            PeerRefused: The server has another version of the type, or another service.
+        """
+        found = await asyncio.to_thread(find_service_type, kind) if isinstance(kind, str) else kind
+        uri, resolved = await self.lookup_service(name), self._resolve(name)
+
+        async def connect(to: ServiceType) -> ServiceClient:
+            opened = await ServiceConnection.open(uri, resolved, self.name, md5sum=to.md5sum, persistent=persistent)
+            return ServiceClient(opened, to)
+
+        try:
+            return await connect(found)
+        except PeerRefused:
+            # Another version of it may be here, too: that of a workspace, and the one that comes with us.
+            other = await self._version_of(uri, resolved, found) if isinstance(kind, str) else None
+            if other is None:
+                raise
+        return await connect(other)
+
+    async def call_service(
+        self,
+        name: str,
+        kind: str | ServiceType,
+        request: object = None,
+        timeout: float | None = limits.SERVICE_TIMEOUT,  # noqa: ASYNC109 - the message names it
+    ) -> Any:
+        """Call a service once; arguments and errors are those of ``connect_service`` and ``ServiceClient.call``.
+
+        Returns:
+            The response as an object.
+        """
+        client = await self.connect_service(name, kind, persistent=False)
+        try:
+            return await client.call(request, timeout)
+        finally:
+            client.close()
+
+    # --- the master -------------------------------------------------------------------------------------------
+
+    async def call_master(self, method: str, *params: XmlRpcValue) -> XmlRpcValue:
+        """Call the Master or Parameter API; the caller id is put in front.
+
+        Raises:
+            UnreachableError: The master does not answer.
+            PeerRefused: It answers with a code other than 1.
+        """
+        reply = await self._call(method, *params)
+        if reply.code != 1:
+            raise PeerRefused(f"the ROS master at {self.master_uri}", f"{method}: {reply.status}")
+        return reply.value
+
+    async def _call(self, method: str, *params: XmlRpcValue) -> RosReply:
+        try:
+            return await call_api(self.master_uri, method, self.name, *params)
+        except UnreachableError as error:
+            raise UnreachableError("ROS master", f"{self.master_uri} (ROS_MASTER_URI)", _REMEDY) from error
+
+    async def get_published_topics(self, subgraph: str = "") -> list[tuple[str, str]]:
+        """Topics that have a publisher, with their types."""
+        value = await self.call_master("getPublishedTopics", subgraph)
+        return [(str(p[0]), str(p[1])) for p in value if isinstance(p, list)] if isinstance(value, list) else []
+
+    async def get_param(self, key: str, default: XmlRpcValue | object = _NO_DEFAULT) -> XmlRpcValue:
+        """A parameter's value, or ``default`` where one is given and the parameter does not exist.
+
+        Raises:
+            PeerRefused: It does not exist.
+        """
+        reply = await self._call("getParam", self._resolve(key))
+        if reply.code == 1:
+            return reply.value
+        if default is _NO_DEFAULT:
+            raise PeerRefused(f"the ROS master at {self.master_uri}", reply.status)
+        return default  # type: ignore[return-value]
+
+    async def set_param(self, key: str, value: XmlRpcValue) -> None:
+        """Set a parameter."""
+        await self.call_master("setParam", self._resolve(key), value)
+
+    async def has_param(self, key: str) -> bool:
+        """Whether a parameter exists."""
+        return bool(await self.call_master("hasParam", self._resolve(key)))
+
+    async def delete_param(self, key: str) -> None:
+        """Delete a parameter.
+
+        Raises:
+            PeerRefused: It does not exist.
+        """
+        await self.call_master("deleteParam", self._resolve(key))
+
+    async def search_param(self, key: str) -> str | None:
+        """The full name of the nearest parameter of this name, up through the namespaces."""
+        reply = await self._call("searchParam", key)
+        return str(reply.value) if reply.code == 1 else None
+
+    async def follow_param(self, key: str) -> XmlRpcValue:
+        """Have ``on_param_update`` called when a parameter changes; return its value now, ``{}`` for none."""
+        resolved = self._resolve(key)
+        self._followed.add(resolved)
+        return await self.call_master("subscribeParam", self.uri, resolved)
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _hosts(self) -> tuple[str, str]:
+        """The host to tell others, and the address to listen at.
+
+        Where nobody asked for an address and the master is on this machine, loopback it is: no other machine can
+        reach that master, and the node goes on when its network is lost.
+        """
+        host = self.environment.host
+        if not self.environment.host_given and is_loopback(host_of(self.master_uri)):
+            host = "127.0.0.1"
+        return host, "127.0.0.1" if is_loopback(host) else "0.0.0.0"  # noqa: S104 - as every ROS node does
+
+    async def _known_here(self, name: str) -> MessageType | None:
+        """A message type as it is found here; ``None`` where its publishers may tell it.
+
+        Raises:
+            DefinitionError: It is malformed, or of a package that comes with us, and not in it.
+        """
+        try:
+            return await asyncio.to_thread(find_message_type, name)
+        except UnknownTypeError as error:
+            if not error.learnable:
+                raise
+            return None
+
+    async def _version_of(self, uri: str, service: str, found: ServiceType) -> ServiceType | None:
+        """The version of a service type that its server has, if it is another one and found here."""
+        try:
+            said = (await probe(uri, service, self.name, limits.SERVICE_OPEN_TIMEOUT)).description
+            other = await asyncio.to_thread(find_service_type, found.name, said.md5sum)
+        except RmpaError:
+            return None
+        return other if said.type == found.name and other.md5sum != found.md5sum else None
+
+    def _resolve(self, name: str) -> str:
+        return self.environment.resolve(name, self.name)
+
+    async def _register_publisher(self, publisher: Publisher) -> None:
+        await self.call_master("registerPublisher", publisher.topic, publisher.description.type, self.uri)
+
+    async def _register_subscriber(self, subscriber: Subscriber, *, keep: bool = False) -> None:
+        uris = await self.call_master("registerSubscriber", subscriber.topic, subscriber.type_name, self.uri)
+        if isinstance(uris, list):
+            subscriber.subscription.update([str(uri) for uri in uris], keep=keep)
+
+    async def _register_service(self, service: Service) -> None:
+        await self.call_master("registerService", service.name, self._slave.service_uri, self.uri)
+
+    async def _unadvertise_service(self, name: str) -> None:
+        if self._services.pop(name, None) is not None:
+            with contextlib.suppress(RmpaError):
+                await self.call_master("unregisterService", name, self._slave.service_uri)
+            self._slave.remove_service(name)
+
+    async def _unadvertise(self, topic: str) -> None:
+        if self._publishers.pop(topic, None) is not None:
+            with contextlib.suppress(RmpaError):
+                await self.call_master("unregisterPublisher", topic, self.uri)
+            self._slave.remove_publication(topic)
+
+    async def _unsubscribe(self, topic: str) -> None:
+        if self._subscribers.pop(topic, None) is not None:
+            with contextlib.suppress(RmpaError):
+                await self.call_master("unregisterSubscriber", topic, self.uri)
+            await self._slave.remove_subscription(topic)
+
+    async def _watch_master(self) -> None:
+        while True:
+            await asyncio.sleep(limits.NODE_MASTER_CHECK)
+            if not (self._publishers or self._subscribers or self._services or self._followed):
+                continue
+            try:
+                if await self._is_forgotten():
+                    _log.info(
+                        "= %s: the master at %s was started anew; registering again", self.name, self.master_uri
+                    )
+                    await self._register_all()
+            except RmpaError as error:
+                _log.debug("! %s: %s", self.name, error)
+
+    async def _is_forgotten(self) -> bool:
+        """Whether the master does not know us any more, which only a new one does."""
+        reply = await self._call("lookupNode", self.name)
+        return reply.code != 1
+
+    async def _register_all(self) -> None:
+        for publisher in tuple(self._publishers.values()):
+            await self._register_publisher(publisher)
+        for subscriber in tuple(self._subscribers.values()):
+            await self._register_subscriber(subscriber, keep=True)
+        for service in tuple(self._services.values()):
+            await self._register_service(service)
+        for key in tuple(self._followed):
+            await self.call_master("subscribeParam", self.uri, key)
+
+    def _param_update(self, key: str, value: XmlRpcValue) -> bool:
+        # The update of a namespace or of one member concerns those who follow the other.
+        if not any(
+            key == f or key.startswith(f + "/") or f.startswith(key.rstrip("/") + "/") for f in self._followed
+        ):
+            return False
+        if self._on_param_update is not None:
+            self._on_param_update(key, value)
+        return True
+
+    def _told_to_stop(self, reason: str) -> None:
+        if self._ending is None and self._closing is None:
+            if self._on_shutdown is not None:
+                self._on_shutdown(reason)
+            # Behind the answer to this very call.
+            self._ending = asyncio.get_running_loop().create_task(self.close(), name=f"shut down {self.name}")
+
+    async def _close(self) -> None:
+        if self._watch is not None:
+            self._watch.cancel()
+            await asyncio.wait([self._watch])
+        self.stopped.set()
+        await self._unregister_all()
+        for publisher in self._publishers.values():
+            await publisher.drained()
+        for subscriber in self._subscribers.values():
+            subscriber.ended()
+        await self._slave.close()
+
+    async def _unregister_all(self) -> None:
+        """Take all registrations back, side by side: what a slow master does not take by one deadline stays there."""
+        at_once = asyncio.Semaphore(limits.NODE_UNREGISTER_AT_ONCE)
+
+        async def take_back(method: str, *params: XmlRpcValue) -> None:
+            try:
+                async with at_once:
+                    await self.call_master(method, *params)
+            except RmpaError as error:
+                _log.debug("! %s: %s %s: %s", self.name, method, params, error)
+
+        everything = [
+            *(take_back("unregisterPublisher", topic, self.uri) for topic in self._publishers),
+            *(take_back("unregisterSubscriber", topic, self.uri) for topic in self._subscribers),
+            *(take_back("unregisterService", service, self._slave.service_uri) for service in self._services),
+            *(take_back("unsubscribeParam", self.uri, key) for key in self._followed),
+        ]
+        try:
+            async with asyncio.timeout(limits.NODE_UNREGISTER_TIMEOUT), asyncio.TaskGroup() as group:
+                for one in everything:
+                    group.create_task(one, name=f"unregister {self.name}")
+        except TimeoutError:
+            _log.debug("! %s: the master at %s is slow; not everything is unregistered", self.name, self.master_uri)

@@ -1,0 +1,307 @@
+"""The publishing end of one topic, for the subscribers that connect to us.
+
+It carries raw bytes. A publication of our own node knows its type from the start; that of a proxy for a remote
+publisher learns it when the route to that publisher opens, and holds its subscribers until then.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from typing import TYPE_CHECKING
+
+from rmpa.core import limits
+from rmpa.ros.wire.slave_api import OUTBOUND, BusConnection
+from rmpa.ros.wire.tcpros import TopicDescription, check_subscriber, printable, publisher_header
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from rmpa.core.outbox import QueuedMessage
+    from rmpa.ros.node.accepted_connection import AcceptedConnection
+    from rmpa.ros.wire.tcpros import Buffer
+
+_log = logging.getLogger(__name__)
+
+
+def _ignore(*_: object) -> None:
+    pass
+
+
+class Publication:
+    """One topic of one (real or proxy) node, with its subscribers.
+
+    Demand is the number of connections, held ones included: ``on_first_subscriber`` is called when it leaves 0,
+    ``on_last_subscriber`` when it is 0 again. All callbacks are called in the loop; they may call back.
+
+    Args:
+        topic: Its global name; compared literally with what subscribers ask for.
+        caller_id: The publishing node's name.
+        description: Type, md5 sum, definition and latching, or ``None`` until ``describe()`` tells.
+        on_first_subscriber: Somebody listens: open the route.
+        on_last_subscriber: Nobody listens any more.
+        on_mismatch: ``(fields, text)``: a subscriber was refused; its header and what it was told.
+        on_listeners: Who is served has changed; see ``listeners``.
+        queue_messages: Messages that wait for one slow subscriber; the oldest is dropped beyond it.
+        queue_bytes: The same in bytes; one message always fits.
+    """
+
+    def __init__(
+        self,
+        topic: str,
+        caller_id: str,
+        description: TopicDescription | None = None,
+        *,
+        on_first_subscriber: Callable[[], None] = _ignore,
+        on_last_subscriber: Callable[[], None] = _ignore,
+        on_mismatch: Callable[[Mapping[str, str], str], None] = _ignore,
+        on_listeners: Callable[[], None] = _ignore,
+        queue_messages: int = limits.SUBSCRIBER_QUEUE_MESSAGES,
+        queue_bytes: int = limits.SUBSCRIBER_QUEUE_BYTES,
+    ) -> None:
+        self.topic = topic
+        self.caller_id = caller_id
+        self.messages = 0
+        """Messages published."""
+        self.bytes = 0
+        """Their bytes, lengths included, counted once however many subscribers there are."""
+        self._description: TopicDescription | None = None
+        self._reply: dict[str, str] = {}
+        self._on_first = on_first_subscriber
+        self._on_last = on_last_subscriber
+        self._on_mismatch = on_mismatch
+        self._on_listeners = on_listeners
+        self._queue_messages = queue_messages
+        self._queue_bytes = queue_bytes
+        self._held: tuple[AcceptedConnection, ...] = ()
+        self._open: tuple[AcceptedConnection, ...] = ()
+        self._latched: deque[bytes] = deque(maxlen=1)
+        self._parcels: list[tuple[AcceptedConnection, QueuedMessage]] = []
+        self._whole: bytearray | None = None
+        self._size = self._left = 0
+        self._dropped_before = 0
+        self._withdrawn = False
+        if description is not None:
+            self.describe(description)
+
+    @property
+    def description(self) -> TopicDescription | None:
+        """What is published, once it is known."""
+        return self._description
+
+    @property
+    def latched(self) -> tuple[bytes, ...]:
+        """The messages that are kept for later subscribers, oldest first, with their lengths in front."""
+        return tuple(self._latched)
+
+    @property
+    def subscribers(self) -> int:
+        """Connections, held ones included."""
+        return len(self._held) + len(self._open)
+
+    @property
+    def listeners(self) -> tuple[str, ...]:
+        """The caller ids of those that are served, as they gave them."""
+        return tuple(link.caller_id for link in self._open)
+
+    @property
+    def dropped(self) -> int:
+        """Messages that slow subscribers missed, those that have left included."""
+        return self._dropped_before + sum(link.dropped for link in self._open)
+
+    def connections(self) -> list[BusConnection]:
+        """All connections, for ``getBusInfo`` and ``getBusStats``."""
+        return [
+            BusConnection(
+                link.number,
+                link.caller_id,
+                OUTBOUND,
+                self.topic,
+                link in self._open,
+                link.info,
+                link.stream.bytes_out,
+                link.messages,
+                link.dropped,
+                link.stream.pending_bytes,
+            )
+            for link in (*self._open, *self._held)
+        ]
+
+    def attach(self, link: AcceptedConnection) -> None:
+        """Take over a connection whose header names this topic: serve it, hold it, or refuse it."""
+        problem = check_subscriber(link.fields, self.topic, self.caller_id, self._description)
+        if problem is not None:
+            self._refuse(link, problem)
+            return
+        first = self.subscribers == 0
+        link.on_end = self._gone
+        if self._description is None:
+            _log.debug("= %s: holds subscriber %s until the type is known", self.topic, printable(link.caller_id))
+            self._held += (link,)
+        else:
+            self._serve(link)
+        if first and self.subscribers:
+            self._on_first()
+
+    def describe(self, description: TopicDescription) -> int:
+        """Say what is published from now on: held subscribers are served, those that do not fit are refused.
+
+        A publisher may have come back with another definition. Then everybody who was promised the old one is
+        closed, for there is no other way to tell them; rospy subscribers come again on the next ``publisherUpdate``.
+
+        Returns:
+            How many subscribers were closed: if any, the owner should register the topic again.
+
+        Raises:
+            ValueError: Type or md5 sum is ``*``; see ``tcpros.publisher_header``.
+        """
+        before = self.subscribers
+        reply = publisher_header(self.topic, self.caller_id, description)
+        old: tuple[AcceptedConnection, ...] = ()
+        if self._reply and self._reply != reply:
+            self._latched.clear()
+            old, self._open = self._open, ()
+            self._on_listeners()
+            for link in old:
+                self._count_out(link)
+                link.close()
+        self._description = description
+        self._reply = reply
+        held, self._held = self._held, ()
+        for link in held:
+            problem = check_subscriber(link.fields, self.topic, self.caller_id, description)
+            if problem is None:
+                self._serve(link)
+            else:
+                self._refuse(link, problem)
+        if before and not self.subscribers:
+            self._on_last()
+        return len(old)
+
+    def publish_framed(self, framed: Buffer) -> int:
+        """Send one message to all subscribers; none waits for another.
+
+        Args:
+            framed: The message with its 4-byte length in front. It is not kept, but copied where it must wait.
+
+        Returns:
+            How many older messages were dropped for it, over all subscribers.
+        """
+        self.messages += 1
+        self.bytes += len(framed)
+        if self._description is not None and self._description.latching:
+            self._latched.append(bytes(framed))
+        dropped = 0
+        for link in self._open:
+            dropped += link.send(framed)
+        return dropped
+
+    def begin(self, size: int) -> None:
+        """Begin a message of ``size`` bytes, its length in front, whose parts follow.
+
+        Those that come before its end subscribe too late for it, unless it is kept for such.
+        """
+        self._size = self._left = size
+        self._parcels = [(link, link.begin(size)) for link in self._open]
+        latching = self._description is not None and self._description.latching
+        self._whole = bytearray() if latching else None
+
+    def extend(self, part: Buffer) -> None:
+        """Send a part of it to all that have its beginning; none waits for another."""
+        for link, parcel in self._parcels:
+            link.extend(parcel, part)
+        self._left -= len(part)
+        if self._whole is not None:
+            self._whole += part
+        if self._left:
+            return
+        self.messages += 1
+        self.bytes += self._size
+        began, self._parcels = self._parcels, []
+        if self._whole is not None:
+            framed, self._whole = bytes(self._whole), None
+            self._latched.append(framed)
+            served = {link for link, _ in began}
+            for link in self._open:
+                if link not in served:
+                    link.send(framed)
+
+    def abort(self) -> int:
+        """The rest of it will not come.
+
+        Subscribers that have its beginning are closed: TCPROS has no other way to take back half a message.
+
+        Returns:
+            How many that were: if any, the owner should register the topic again.
+        """
+        torn = [link for link, parcel in self._parcels if link.abandon(parcel)]
+        self._parcels = []
+        self._whole = None
+        before = self.subscribers
+        for link in torn:
+            self._count_out(link)
+            link.close()
+        self._open = tuple(link for link in self._open if link not in torn)
+        self._on_listeners()
+        if before and not self.subscribers:
+            self._on_last()
+        return len(torn)
+
+    def bound(self, messages: int) -> None:
+        """Let at most so many messages wait for one slow subscriber from now on."""
+        self._queue_messages = min(messages, limits.SUBSCRIBER_QUEUE_MESSAGES)
+        for link in self._open:
+            link.bound(self._queue_messages, self._queue_bytes)
+
+    def keep(self, depth: int) -> None:
+        """Where messages are latched, keep the last ``depth`` of them for later subscribers."""
+        self._latched = deque(self._latched, maxlen=min(depth, limits.LATCHED_MAX))
+
+    def forget_latched(self) -> None:
+        """Keep no message for later subscribers: its source is gone, or will send it again."""
+        self._latched.clear()
+
+    async def drained(self, timeout: float = limits.DRAIN_TIMEOUT) -> None:  # noqa: ASYNC109 - for all together
+        """Wait until all that was published has left, or ``timeout`` seconds are over."""
+        if self._open:
+            await asyncio.gather(*(link.stream.drained(timeout) for link in self._open))
+
+    def withdraw(self) -> None:
+        """Publish no more: close all connections, without a callback."""
+        self._withdrawn = True
+        links, self._held, self._open = (*self._held, *self._open), (), ()
+        for link in links:
+            self._count_out(link)
+            link.close()
+        self._latched.clear()
+        self._parcels = []
+        self._whole = None
+
+    def _serve(self, link: AcceptedConnection) -> None:
+        _log.debug("> %s: serves subscriber %s at %s", self.topic, printable(link.caller_id), link.peer[0])
+        link.accept(self._reply, self._queue_messages, self._queue_bytes)
+        for framed in self._latched:
+            link.send(framed)
+        if not link.stream.closed:
+            self._open += (link,)
+            self._on_listeners()
+
+    def _refuse(self, link: AcceptedConnection, text: str) -> None:
+        _log.debug("! %s: refuses subscriber %s: %s", self.topic, printable(link.caller_id), text)
+        link.refuse(text)
+        self._on_mismatch(link.fields, text)
+
+    def _count_out(self, link: AcceptedConnection) -> None:
+        self._dropped_before += link.dropped
+
+    def _gone(self, link: AcceptedConnection, error: Exception | None) -> None:
+        _log.debug("< %s: subscriber %s is gone (%s)", self.topic, printable(link.caller_id), error or "closed")
+        before = self.subscribers
+        self._count_out(link)
+        self._parcels = [(other, parcel) for other, parcel in self._parcels if other is not link]
+        self._held = tuple(other for other in self._held if other is not link)
+        self._open = tuple(other for other in self._open if other is not link)
+        self._on_listeners()
+        if before and not self.subscribers and not self._withdrawn:
+            self._on_last()

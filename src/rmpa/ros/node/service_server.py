@@ -1,0 +1,520 @@
+"""The serving side of a service: ``SlaveNode.add_service`` puts an endpoint behind the node's TCPROS port."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.errors import LimitExceeded, RmpaError
+from rmpa.ros.node.service_stream import BODIES, INLINE, send_large
+from rmpa.ros.wire.services import (
+    BodyBuffer,
+    ServiceDescription,
+    check_client,
+    frame_reply,
+    is_persistent,
+    is_probe,
+    parse_request_length,
+    server_header,
+)
+from rmpa.ros.wire.tcpros import LENGTH, printable
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rmpa.ros.node.accepted_connection import AcceptedConnection
+    from rmpa.ros.wire.tcpros import Buffer
+
+_log = logging.getLogger(__name__)
+
+_WHOLE: Final = 64 * limits.KIB
+"""Requests up to here are taken in one piece, without a copy in between."""
+
+Describe = Callable[[], Awaitable[ServiceDescription | str]]
+Serve = Callable[["ServiceCall"], None]
+Respond = Callable[["ServiceCall"], Awaitable[tuple[bool, "Buffer"]]]
+
+
+class ServiceCall:
+    """One request, until it is answered.
+
+    Attributes:
+        service: The service's name here.
+        caller_id: The calling node.
+        request: The request's bytes, without a length; belongs to the call and never changes.
+        deadline: ``loop.time()`` at which the client gets an error by itself.
+        on_gone: Set it to hear that no answer is wanted any more: the client has left, the deadline is over, or the
+            service is withdrawn. Called once at the most, and never behind ``reply``.
+    """
+
+    __slots__ = ("_session", "caller_id", "deadline", "on_gone", "request", "service")
+
+    def __init__(
+        self, session: _ClientConnection, service: str, caller_id: str, request: bytes | bytearray, deadline: float
+    ) -> None:
+        self._session: _ClientConnection | None = session
+        self.service = service
+        self.caller_id = caller_id
+        self.request = request
+        self.deadline = deadline
+        self.on_gone: Callable[[], None] | None = None
+
+    @property
+    def answered(self) -> bool:
+        """Whether an answer has been given, or is not wanted any more."""
+        return self._session is None
+
+    def reply(self, ok: bool, body: Buffer) -> None:
+        """Answer; ``body`` is the response, or for ``ok=False`` the error's text. The first answer counts."""
+        session, self._session = self._session, None
+        if session is not None:
+            self.on_gone = None
+            session.reply(ok, body)
+
+    def fail(self, text: str) -> None:
+        """Answer with an error."""
+        self.reply(False, text.encode(errors="replace"))
+
+    def abandon(self) -> None:
+        """No answer is wanted any more; for the endpoint."""
+        self._session = None
+        on_gone, self.on_gone = self.on_gone, None
+        if on_gone is not None:
+            try:
+                on_gone()
+            except Exception:  # noqa: BLE001 - a stranger's code within a connection's end
+                _log.exception("! %s: the end of a call failed", self.service)
+
+
+class ServiceEndpoint:
+    """One service of a node: takes its connections, and hands each request over as a ``ServiceCall``.
+
+    Args:
+        service: The global name, compared literally.
+        caller_id: The serving node's name.
+        serve: Called in the loop with each request; answers at once or later by ``call.reply``. What it raises
+            becomes the client's error. ``responding(async_function)`` makes one of a coroutine function.
+        describe: Asked when the first header comes and nothing is known (``description`` is ``None``); returns the
+            description, which is kept, or the text of a refusal, which is not. Connections that come meanwhile wait
+            for the same answer.
+        description: What is known from the start.
+        timeout: Seconds for a call before the client gets an error.
+        on_mismatch: ``(fields, text)``: a client with another md5 sum was refused.
+    """
+
+    def __init__(
+        self,
+        service: str,
+        caller_id: str,
+        serve: Serve,
+        describe: Describe | None = None,
+        *,
+        description: ServiceDescription | None = None,
+        timeout: float = limits.SERVICE_TIMEOUT,
+        on_mismatch: Callable[[Mapping[str, str], str], None] | None = None,
+    ) -> None:
+        self.service = service
+        self.caller_id = caller_id
+        self.serve = serve
+        self.timeout = timeout
+        self.description = description
+        """What clients are told; ``None`` to have ``describe`` asked at the next header."""
+        self.calls = 0
+        """Requests taken so far."""
+        self.failed = 0
+        """Of these, answered with an error."""
+        self._describe = describe
+        self._on_mismatch = on_mismatch
+        self._sessions: set[_ClientConnection] = set()
+        self._waiting: list[_ClientConnection] = []
+        self._asking: asyncio.Task[None] | None = None
+        self._empty: asyncio.Future[None] | None = None
+
+    @property
+    def connections(self) -> int:
+        """Open connections."""
+        return len(self._sessions)
+
+    def attach(self, link: AcceptedConnection) -> None:
+        """Take a connection whose header names this service and has the fields that it needs."""
+        session = _ClientConnection(self, link)
+        self._sessions.add(session)
+        if self.description is not None:
+            session.open(self.description, resume=False)
+            return
+        self._waiting.append(session)
+        if self._asking is None:
+            self._asking = asyncio.get_running_loop().create_task(self._ask(), name=f"describe {self.service}")
+
+    def withdraw(self, text: str = "") -> None:
+        """Close all connections; calls under way get an error with ``text``."""
+        text = text or f"service [{self.service}] is no longer offered by [{self.caller_id}]"
+        if self._asking is not None:
+            self._asking.cancel()
+        self._refuse_waiting(text)
+        for session in tuple(self._sessions):
+            session.withdraw(text)
+
+    async def closed(self) -> None:
+        """Behind ``withdraw``: wait, a moment at the most, until the last replies have left."""
+        if self._sessions:
+            self._empty = asyncio.get_running_loop().create_future()
+            await asyncio.wait([self._empty], timeout=limits.DRAIN_TIMEOUT)
+        for session in tuple(self._sessions):
+            session.close()
+
+    def mismatch(self, fields: Mapping[str, str], text: str) -> None:
+        """A client's md5 sum does not fit; for the sessions."""
+        if self._on_mismatch is not None:
+            self._on_mismatch(fields, text)
+        else:
+            _log.warning("! %s", text)
+
+    def left(self, session: _ClientConnection) -> None:
+        """A connection has ended; for the sessions."""
+        self._sessions.discard(session)
+        if session in self._waiting:
+            self._waiting.remove(session)
+        if not self._sessions and self._empty is not None and not self._empty.done():
+            self._empty.set_result(None)
+
+    async def _ask(self) -> None:
+        try:
+            answer = await self._answer()
+        finally:
+            self._asking = None
+        if isinstance(answer, str):
+            self._refuse_waiting(answer)
+            return
+        self.description = answer
+        waiting, self._waiting = self._waiting, []
+        for session in waiting:
+            session.open(answer)
+
+    async def _answer(self) -> ServiceDescription | str:
+        if self._describe is None:
+            return f"service [{self.service}] has no description yet"
+        try:
+            async with asyncio.timeout(self.timeout):
+                return await self._describe()
+        except TimeoutError:
+            return f"service [{self.service}]: its server did not describe it within {self.timeout:g} s"
+        except RmpaError as error:
+            return str(error)
+        except Exception:  # noqa: BLE001 - a task's top
+            _log.exception("! %s could not be described", self.service)
+            return f"service [{self.service}]: [{self.caller_id}] failed to describe it; its log says why"
+
+    def _refuse_waiting(self, text: str) -> None:
+        waiting, self._waiting = self._waiting, []
+        for session in waiting:
+            session.refuse(text)
+
+
+class _ClientConnection:
+    """One client's connection: a request, its reply, and the next one where it is persistent."""
+
+    def __init__(self, endpoint: ServiceEndpoint, link: AcceptedConnection) -> None:
+        self._endpoint = endpoint
+        self._link = link
+        self._loop = asyncio.get_running_loop()
+        self._persistent = is_persistent(link.fields)
+        self._open = False
+        self._ended = False
+        self._taking = False
+        self._served = False
+        self._call: ServiceCall | None = None
+        self._body: BodyBuffer | None = None
+        self._discard = 0
+        self._sending: asyncio.Task[None] | None = None
+        self._deadline: asyncio.TimerHandle | None = None
+        self._stall: asyncio.TimerHandle | None = None
+        self._seen = 0
+        link.on_bytes = self._take
+        link.on_end = self._left
+
+    def open(self, description: ServiceDescription, *, resume: bool = True) -> None:
+        """Answer the header; ``resume`` unless this is the very read that the header came with."""
+        link, endpoint = self._link, self._endpoint
+        problem = check_client(link.fields, endpoint.service, endpoint.caller_id, description)
+        if problem is not None:
+            endpoint.mismatch(link.fields, problem)
+            self.refuse(problem)
+            return
+        self._open = True
+        link.stream.outbox.set_terms(BODIES, limits.SUBSCRIBER_QUEUE_MESSAGES, spared=True)
+        header = server_header(endpoint.caller_id, description)
+        link.accept(header, limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SERVICE_MESSAGE_MAX, nodelay=True)
+        if not self._persistent or is_probe(link.fields):
+            self._watch()
+        if resume:
+            self._resume()
+
+    def refuse(self, text: str) -> None:
+        """Answer with an error header and close."""
+        self._link.refuse(text)
+        self._over()
+
+    def withdraw(self, text: str) -> None:
+        """The service is gone."""
+        call, self._call = self._call, None
+        if call is not None and not self._ended:
+            call.abandon()
+            self._persistent = False
+            self._respond(False, text.encode(errors="replace"))
+        elif self._sending is not None:
+            self._persistent = False
+        elif not self._served:
+            self.close()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._link.close()
+        self._over()
+
+    def reply(self, ok: bool, body: Buffer) -> None:
+        """Answer the call that is under way."""
+        self._call = None
+        if not self._ended:
+            self._respond(ok, body)
+
+    # --- requests ---------------------------------------------------------------------------------------------
+
+    def _take(self, data: memoryview) -> tuple[int, int]:
+        consumed, wanted, self._taking = 0, 0, True
+        try:
+            while not self._ended:
+                taken, wanted = self._step(data[consumed:])
+                consumed += taken
+                if not taken or consumed == len(data):
+                    break
+        finally:
+            self._taking = False
+        return consumed, wanted
+
+    def _step(self, data: memoryview) -> tuple[int, int]:
+        """Take one thing off what has come: a request, a part of a large one, or of one that is too large."""
+        if self._discard:
+            count = min(self._discard, len(data))
+            self._discard -= count
+            if not self._discard:
+                self._unwatch()
+                self._settle()
+            return count, 0
+        if self._body is not None:
+            return self._grow(data)
+        if self._busy:
+            # One request at a time; what comes before its answer waits, one more at the most.
+            if len(data) > limits.SERVICE_MESSAGE_MAX + LENGTH.size:
+                raise LimitExceeded("what was sent ahead of a reply", len(data), limits.SERVICE_MESSAGE_MAX)
+            return 0, 0
+        size = parse_request_length(data)
+        if size is None:
+            return 0, LENGTH.size
+        end = LENGTH.size + size
+        if size <= _WHOLE:
+            if len(data) < end:
+                self._watch()
+                return 0, end
+            self._begin(bytes(data[LENGTH.size : end]))
+            return end, 0
+        if size > limits.SERVICE_MESSAGE_MAX:
+            self._too_large(size)
+        else:
+            self._body = BodyBuffer(size)
+        self._watch()
+        return LENGTH.size, 0
+
+    def _grow(self, data: memoryview) -> tuple[int, int]:
+        body = self._body
+        assert body is not None  # noqa: S101 - the caller looked
+        count = body.take(data)
+        if body.whole:
+            self._body = None
+            self._begin(body.data)
+        return count, 0
+
+    @property
+    def _busy(self) -> bool:
+        return not self._open or self._call is not None or self._sending is not None or self._served
+
+    def _begin(self, request: bytes | bytearray) -> None:
+        self._unwatch()
+        endpoint = self._endpoint
+        endpoint.calls += 1
+        deadline = self._loop.time() + endpoint.timeout
+        call = ServiceCall(self, endpoint.service, self._link.caller_id, request, deadline)
+        self._call = call
+        try:
+            endpoint.serve(call)
+        except RmpaError as error:
+            call.fail(str(error))
+        except Exception:  # noqa: BLE001 - a stranger's code within a connection
+            _log.exception("! %s: a call of %s failed", endpoint.service, printable(call.caller_id))
+            call.fail(f"service [{endpoint.service}]: [{endpoint.caller_id}] failed at this call; its log says why")
+        if not call.answered:
+            self._deadline = self._loop.call_at(deadline, self._too_late)
+
+    def _too_late(self) -> None:
+        self._deadline = None
+        call, self._call = self._call, None
+        if call is not None:
+            call.abandon()
+            timeout = f"{self._endpoint.timeout:g} s"
+            self._respond(False, f"service [{self._endpoint.service}] did not answer within {timeout}".encode())
+
+    def _too_large(self, size: int) -> None:
+        self._discard = size
+        self._endpoint.calls += 1
+        text = (
+            f"request of {size} bytes to service [{self._endpoint.service}] exceeds the limit of "
+            f"{limits.SERVICE_MESSAGE_MAX}"
+        )
+        _log.warning("! %s: a %s", printable(self._link.caller_id), text)
+        self._respond(False, text.encode())
+
+    # --- replies ----------------------------------------------------------------------------------------------
+
+    def _respond(self, ok: bool, body: Buffer) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()
+            self._deadline = None
+        if ok and len(body) > limits.SERVICE_MESSAGE_MAX:
+            ok, size = False, len(body)
+            text = f"response of {size} bytes of service [{self._endpoint.service}] exceeds the limit of "
+            body = f"{text}{limits.SERVICE_MESSAGE_MAX}".encode()
+        self._endpoint.failed += not ok
+        head, body = frame_reply(ok, body)
+        stream = self._link.stream
+        if len(body) > INLINE:
+            if isinstance(body, memoryview):
+                body = bytes(body)  # it may be valid for this call only
+            self._sending = self._loop.create_task(self._send_large(head, body), name="service response")
+            return
+        stream.send([head, body], BODIES)
+        if stream.pending_bytes:
+            # Nothing is taken from a client that does not read what it asked for.
+            self._sending = self._loop.create_task(self._drain(), name="service response drains")
+            return
+        self._settle()
+
+    async def _send_large(self, head: bytes, body: Buffer) -> None:
+        try:
+            await send_large(self._link.stream, head, body)
+            await self._drained()
+        finally:
+            self._sending = None
+        self._settle()
+
+    async def _drain(self) -> None:
+        try:
+            await self._drained()
+        finally:
+            self._sending = None
+        self._settle()
+
+    async def _drained(self) -> None:
+        stream = self._link.stream
+        while stream.pending_bytes and not stream.closed:
+            await stream.drained()
+
+    def _settle(self) -> None:
+        """A reply has left: close, or go on with what has come meanwhile."""
+        if self._discard or self._ended or self._sending is not None or self._call is not None:
+            return
+        if self._persistent:
+            self._resume()
+            return
+        self._served = True
+        # Not now: a reply from within a read of another connection leaves at the end of that.
+        self._loop.call_soon(self._close_served)
+
+    def _close_served(self) -> None:
+        if self._ended:
+            return
+        if self._link.stream.pending_bytes and self._sending is None:
+            self._sending = self._loop.create_task(self._drain(), name="service response drains")
+            return
+        self.close()
+
+    def _resume(self) -> None:
+        if not self._taking and not self._ended:
+            self._link.stream.feed(b"")
+
+    # --- the end ----------------------------------------------------------------------------------------------
+
+    def _watch(self) -> None:
+        """Bytes must come soon."""
+        if self._stall is None:
+            self._seen = self._link.stream.bytes_in
+            self._stall = self._loop.call_later(limits.SERVICE_STALL, self._stalled)
+
+    def _unwatch(self) -> None:
+        if self._stall is not None:
+            self._stall.cancel()
+            self._stall = None
+
+    def _stalled(self) -> None:
+        self._stall = None
+        if self._link.stream.bytes_in != self._seen:
+            self._watch()
+            return
+        who = printable(self._link.caller_id)
+        _log.debug("! %s: %s sent nothing for %g s; closed", self._endpoint.service, who, limits.SERVICE_STALL)
+        self.close()
+
+    def _left(self, _link: AcceptedConnection, error: Exception | None) -> None:
+        if error is not None and not isinstance(error, OSError):
+            _log.warning("! %s: %s: %s", self._endpoint.service, printable(self._link.caller_id), error)
+        self._over()
+
+    def _over(self) -> None:
+        self._ended = True
+        self._unwatch()
+        if self._deadline is not None:
+            self._deadline.cancel()
+            self._deadline = None
+        if self._sending is not None:
+            self._sending.cancel()
+        self._link.on_bytes = None
+        self._link.on_end = _ended
+        self._endpoint.left(self)
+        call, self._call = self._call, None
+        if call is not None:
+            self._endpoint.failed += 1
+            call.abandon()
+
+
+def _ended(_link: AcceptedConnection, _error: Exception | None) -> None:
+    """Of a connection that was let go of."""
+
+
+def responding(respond: Respond) -> Serve:
+    """A ``serve`` that runs a coroutine function for each call; it is cancelled when the client leaves."""
+    tasks: set[asyncio.Task[None]] = set()
+
+    async def run(call: ServiceCall) -> None:
+        try:
+            ok, body = await respond(call)
+        except RmpaError as error:
+            call.fail(str(error))
+        except Exception:  # noqa: BLE001 - a task's top: the client must hear of it
+            _log.exception("! %s: a call of %s failed", call.service, printable(call.caller_id))
+            call.fail(f"service [{call.service}] failed at this call; its log says why")
+        else:
+            call.reply(ok, body)
+
+    def serve(call: ServiceCall) -> None:
+        task = asyncio.get_running_loop().create_task(run(call), name=f"call of {call.service}")
+        tasks.add(task)
+        task.add_done_callback(tasks.discard)
+
+        def gone() -> None:
+            task.cancel()
+
+        call.on_gone = gone
+
+    return serve

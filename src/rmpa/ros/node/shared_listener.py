@@ -1,0 +1,196 @@
+"""Two listening sockets for any number of nodes: each node has a loopback address, all have the same two ports.
+
+A socket that listens at all addresses and is bound to the device ``lo`` takes what is dialled to any address
+``127.a.b.c`` (there are 16 million), and nothing that comes from the network. The accepted socket says which node is
+meant: its own address is the one that was dialled. A path in the URI could say it too, but roscpp drops that.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import struct
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.counters import Counters
+from rmpa.core.errors import StartError
+from rmpa.ros.http.server import XmlRpcServer
+from rmpa.ros.node.loopback_addresses import LoopbackAddresses
+from rmpa.runtime.acceptor import Acceptor
+from rmpa.runtime.descriptors import DESCRIPTORS, Use
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+
+    Adopt = Callable[[socket.socket, tuple[str, int]], None]
+    """Gets an accepted connection, non-blocking, which is its own from there on, and the client's address."""
+
+_log = logging.getLogger(__name__)
+_DEVICE: Final = b"lo"
+_RESET: Final = struct.pack("ii", 1, 0)
+"""SO_LINGER: closing resets the connection, as a port does where nothing listens."""
+
+
+class SharedListener:
+    """The two sockets, and which node has which address.
+
+    Args:
+        salt: Tells apart the nodes of one name in several graphs of this machine: the master's URI.
+        counters: ``address.unknown.xmlrpc``, ``address.unknown.tcpros``: connections to addresses without a node.
+    """
+
+    def __init__(self, salt: str, *, counters: Counters | None = None) -> None:
+        self._counters = counters if counters is not None else Counters()
+        self._salt = salt
+        self._addresses = LoopbackAddresses(salt)
+        self._http = _Port("XML-RPC of the proxies", self._answer_stray)
+        self._tcpros = _Port("TCPROS of the proxies", self._reset_stray)
+        self._strays = XmlRpcServer(_nobody, counters=self._counters, name="addresses of former nodes")
+
+    def __len__(self) -> int:
+        """How many nodes have an address here."""
+        return len(self._addresses)
+
+    @property
+    def ports(self) -> tuple[int, int]:
+        """The port of XML-RPC and that of TCPROS; 0 before ``start()``."""
+        return self._http.number, self._tcpros.number
+
+    async def start(self) -> None:
+        """Listen, and try whether the addresses work here.
+
+        Raises:
+            StartError: The device cannot be bound, or its addresses are not 127.0.0.0/8.
+        """
+        try:
+            for port in (self._http, self._tcpros):
+                port.listen()
+            # Containers, sandboxes and firewalls differ: what works is found by trying it once.
+            await _try(LoopbackAddresses(self._salt).take("", 0.0), self._tcpros)
+        except BaseException as error:
+            await self.close()
+            if isinstance(error, OSError):
+                problem = error.strerror or str(error) or type(error).__name__
+                raise StartError("one listening socket for all proxies", problem) from error
+            raise
+        _log.info("= proxies listen at 127.x addresses of their own, ports %d (XML-RPC) and %d (TCPROS)", *self.ports)
+
+    async def close(self) -> None:
+        """Listen no longer; the nodes are closed before."""
+        self._http.close()
+        self._tcpros.close()
+        await self._strays.close()
+
+    def attach(self, name: str, http: Adopt, tcpros: Adopt) -> str:
+        """Give a node an address; only between ``start()`` and ``close()``.
+
+        Args:
+            name: The node's.
+            http: Gets each connection to its XML-RPC port.
+            tcpros: Gets each connection to its TCPROS port.
+
+        Returns:
+            The address; the ports are ``ports``.
+        """
+        address = self._addresses.take(name, asyncio.get_running_loop().time())
+        self._http.nodes[address] = http
+        self._tcpros.nodes[address] = tcpros
+        return address
+
+    def detach(self, address: str) -> None:
+        """Let an address be no node's from now on; its connections are the node's own matter."""
+        self._http.nodes.pop(address, None)
+        self._tcpros.nodes.pop(address, None)
+        self._addresses.free(address, asyncio.get_running_loop().time())
+
+    def _answer_stray(self, sock: socket.socket, client: tuple[str, int]) -> None:
+        """Answer who calls a node that is gone.
+
+        A reset would be "try again" to rospy's ``requestTopic``: twice a minute, in a thread, as long as it lives.
+        """
+        self._counters.add("address.unknown.xmlrpc")
+        self._strays.adopt(sock, client)
+
+    def _reset_stray(self, sock: socket.socket, _client: tuple[str, int]) -> None:
+        """Hang up on who dials a node that is gone, as a port does where nothing listens: roscpp backs off."""
+        self._counters.add("address.unknown.tcpros")
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+        sock.close()
+
+
+class _Port:
+    """One of the two sockets.
+
+    Args:
+        name: What it is for, for messages.
+        stray: Gets the connections to addresses that no node has.
+    """
+
+    def __init__(self, name: str, stray: Adopt) -> None:
+        self.nodes: dict[str, Adopt] = {}
+        """By the address that is dialled."""
+        self.number = 0
+        self._name = name
+        self._stray = stray
+        self._acceptor: Acceptor | None = None
+
+    def listen(self) -> None:
+        """Bind and accept.
+
+        Raises:
+            OSError: This is not allowed here, or there is no such device.
+        """
+        sock = DESCRIPTORS.open_socket(Use.DATA)
+        try:
+            # Before it is bound to all addresses: at no moment the network can reach it.
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _DEVICE)
+            sock.bind(("0.0.0.0", 0))  # noqa: S104 - of the device lo
+            sock.listen(limits.SHARED_BACKLOG)
+        except BaseException:
+            sock.close()
+            raise
+        self.number = sock.getsockname()[1]
+        self._acceptor = Acceptor(sock, self._accepted, name=self._name)
+        self._acceptor.start()
+
+    def close(self) -> None:
+        """Listen no longer."""
+        if self._acceptor is not None:
+            self._acceptor.close()
+
+    def _accepted(self, sock: socket.socket, client: tuple[str, int]) -> None:
+        self.nodes.get(sock.getsockname()[0], self._stray)(sock, client)
+
+
+async def _try(address: str, port: _Port) -> None:
+    """Dial an address and see the connection arrive under it.
+
+    Raises:
+        OSError: It does not.
+    """
+    loop = asyncio.get_running_loop()
+    arrived: asyncio.Future[None] = loop.create_future()
+
+    def arrive(sock: socket.socket, _client: tuple[str, int]) -> None:
+        sock.close()
+        if not arrived.done():
+            arrived.set_result(None)
+
+    port.nodes[address] = arrive
+    try:
+        with DESCRIPTORS.open_socket(Use.DATA) as probe:
+            async with asyncio.timeout(limits.SHARED_PROBE_TIMEOUT):
+                await loop.sock_connect(probe, (address, port.number))
+                await arrived
+    except TimeoutError as error:
+        raise OSError(f"a connection to {address} on this machine does not arrive") from error
+    finally:
+        del port.nodes[address]
+
+
+def _nobody(_method: str, _params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
+    return [-1, "the node that had this address is gone", 0]

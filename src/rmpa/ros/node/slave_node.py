@@ -1,0 +1,249 @@
+"""One node, seen from its graph: XML-RPC endpoint and TCPROS server on one address, and any number of topics."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+import os
+from typing import TYPE_CHECKING
+
+from rmpa.core.counters import Counters
+from rmpa.ros.http.server import XmlRpcServer
+from rmpa.ros.node.tcpros_server import TcprosServer
+from rmpa.ros.wire.slave_api import METHODS, SlaveApi
+from rmpa.ros.wire.tcpros import ANY
+from rmpa.ros.wire.xmlrpc import RosFault
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterable, Sequence
+
+    from rmpa.ros.node.publication import Publication
+    from rmpa.ros.node.service_server import ServiceEndpoint
+    from rmpa.ros.node.shared_listener import SharedListener
+    from rmpa.ros.node.subscription import PublisherConnection, Subscription
+    from rmpa.ros.wire.slave_api import BusConnection
+    from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
+
+_log = logging.getLogger(__name__)
+
+
+def _ignore(*_: object) -> None:
+    pass
+
+
+def _not_followed(_key: str, _value: XmlRpcValue) -> bool:
+    return False
+
+
+class SlaveNode:
+    """Serves the topics of one node; registering them at a master is its owner's work.
+
+    Light: no task, and two listening sockets, or none where many nodes share a listener. An agent can have thousands.
+
+    Args:
+        name: The node's global name.
+        host: The address to listen at, and to tell others unless ``advertised_host`` is given.
+        master_uri: What ``getMasterUri`` answers.
+        advertised_host: What others are told to connect to, where it differs from ``host``.
+        port: Of the XML-RPC server; 0 lets the system choose.
+        listener: Started; accepts for this node in place of sockets of its own, and gives it its address: ``host``,
+            ``advertised_host`` and ``port`` mean nothing then.
+        counters: Where refusals are counted.
+        on_shutdown: ``(reason)``: the master wants this node to end; its owner closes it.
+        on_param_update: ``(key, value) -> whether the node follows that key``.
+        on_publisher_update: ``(topic, uris)``, behind the node's own subscriptions.
+        on_kill: ``(caller id, reason) -> reply``: answers ``shutdown`` in place of ``on_shutdown``, when it can.
+        taps: Connections to publishers that the owner made by itself, for ``getBusInfo`` and its like.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        host: str,
+        master_uri: str,
+        *,
+        advertised_host: str = "",
+        port: int = 0,
+        listener: SharedListener | None = None,
+        counters: Counters | None = None,
+        on_shutdown: Callable[[str], None] = _ignore,
+        on_param_update: Callable[[str, XmlRpcValue], bool] = _not_followed,
+        on_publisher_update: Callable[[str, Sequence[str]], None] = _ignore,
+        on_kill: Callable[[str, str], Awaitable[RosReply]] | None = None,
+        taps: Callable[[], Iterable[PublisherConnection]] = tuple,
+    ) -> None:
+        self.name = name
+        self.counters = counters if counters is not None else Counters()
+        self._host = host
+        self._listener = listener
+        self._advertised = advertised_host or host
+        self._publications: dict[str, Publication] = {}
+        self._subscriptions: dict[str, Subscription] = {}
+        self._services: dict[str, ServiceEndpoint] = {}
+        self._numbers = itertools.count(1)
+        self._on_shutdown = on_shutdown
+        self._on_kill = on_kill
+        self._on_param_update = on_param_update
+        self._on_publisher_update = on_publisher_update
+        self._taps = taps
+        self._api = SlaveApi(name, master_uri, os.getpid(), self)
+        self._http = XmlRpcServer(self._call, host, port, counters=self.counters, name=f"node {name}")
+        self._tcpros = TcprosServer(
+            name, self._publications, services=self._services, counters=self.counters, numbers=self._numbers
+        )
+
+    @property
+    def uri(self) -> str:
+        """The slave API's URI, ``http://host:port/``; empty before ``start()``."""
+        return self._api.uri
+
+    async def start(self) -> None:
+        """Listen.
+
+        Raises:
+            StartError: The address cannot be used.
+        """
+        if self._listener is not None:
+            self._advertised = self._listener.attach(self.name, self._http.adopt, self._tcpros.adopt)
+            self._http.port, tcpros_port = self._listener.ports
+            self._tcpros.address = (self._advertised, tcpros_port)
+            self._api.uri = f"http://{self._advertised}:{self._http.port}/"
+            return
+        await self._http.start()
+        try:
+            self._tcpros.start(self._host)
+        except BaseException:
+            await self._http.close()
+            raise
+        self._api.uri = f"http://{self._advertised}:{self._http.port}/"
+
+    async def close(self) -> None:
+        """Close the topics, then the servers; unregister before."""
+        for topic in tuple(self._publications):
+            self.remove_publication(topic)
+        services = tuple(self._services.values())
+        for endpoint in services:
+            self.remove_service(endpoint.service)
+        subscriptions, self._subscriptions = self._subscriptions, {}
+        for subscription in subscriptions.values():
+            subscription.close()
+        if self._listener is not None and self.uri:
+            self._listener.detach(self._advertised)
+            self._listener = None  # what is closed twice must not free the next node's address
+        self._tcpros.close()
+        await self._http.close()
+        await asyncio.gather(*(endpoint.closed() for endpoint in services))
+        for subscription in subscriptions.values():
+            await subscription.closed()
+        # We and our servers know each other, and wait for the collector; what our owner knows must not.
+        self._on_shutdown, self._on_publisher_update, self._on_kill = _ignore, _ignore, None
+        self._on_param_update, self._taps = _not_followed, tuple
+
+    def next_number(self) -> int:
+        """A number for a connection of this node."""
+        return next(self._numbers)
+
+    def add_publication(self, publication: Publication) -> None:
+        """Serve a topic from now on.
+
+        Raises:
+            ValueError: The node publishes that topic already.
+        """
+        if publication.topic in self._publications:
+            raise ValueError(f"{self.name} publishes {publication.topic} already")
+        self._publications[publication.topic] = publication
+
+    def remove_publication(self, topic: str) -> None:
+        """Serve a topic no longer and close its connections; nothing happens if it is not served."""
+        publication = self._publications.pop(topic, None)
+        if publication is not None:
+            publication.withdraw()
+
+    def add_subscription(self, subscription: Subscription) -> None:
+        """Let a subscription follow ``publisherUpdate``."""
+        self._subscriptions[subscription.topic] = subscription
+
+    async def remove_subscription(self, topic: str) -> None:
+        """Leave a topic's publishers."""
+        subscription = self._subscriptions.pop(topic, None)
+        if subscription is not None:
+            subscription.close()
+            await subscription.closed()
+
+    @property
+    def service_uri(self) -> str:
+        """Where this node's services are called, ``rosrpc://host:port``; only after ``start()``."""
+        return f"rosrpc://{self._advertised}:{self._tcpros.address[1]}"
+
+    def add_service(self, endpoint: ServiceEndpoint) -> None:
+        """Serve a service from now on.
+
+        Raises:
+            ValueError: The node serves one of that name already.
+        """
+        if endpoint.service in self._services:
+            raise ValueError(f"{self.name} serves {endpoint.service} already")
+        self._services[endpoint.service] = endpoint
+
+    def remove_service(self, service: str, text: str = "") -> None:
+        """Serve a service no longer; calls under way get an error with ``text``.
+
+        Nothing happens if it is not served.
+        """
+        endpoint = self._services.pop(service, None)
+        if endpoint is not None:
+            endpoint.withdraw(text)
+
+    # --- ros.slave.NodeView -----------------------------------------------------------------------------------
+
+    def publications(self) -> list[tuple[str, str]]:
+        """Topics and types that are published; ``*`` where the type is not known yet."""
+        return [(p.topic, p.description.type if p.description else ANY) for p in self._publications.values()]
+
+    def subscriptions(self) -> list[tuple[str, str]]:
+        """Topics and types that are subscribed to."""
+        found = {s.topic: s.type_name for s in self._subscriptions.values()}
+        found |= {tap.topic: tap.fields.get("type", ANY) for tap in self._taps()}
+        return list(found.items())
+
+    def connections(self) -> list[BusConnection]:
+        """All topic connections."""
+        found = [c for publication in self._publications.values() for c in publication.connections()]
+        found += [c for subscription in self._subscriptions.values() for c in subscription.connections()]
+        return found + [tap.connection() for tap in self._taps()]
+
+    def address_of(self, topic: str) -> tuple[str, int] | None:
+        """Where to connect for a published topic."""
+        return (self._advertised, self._tcpros.address[1]) if topic in self._publications else None
+
+    def publisher_update(self, topic: str, publishers: Sequence[str]) -> None:
+        """The master's list of a topic's publishers."""
+        subscription = self._subscriptions.get(topic)
+        if subscription is not None:
+            subscription.update(publishers)
+        self._on_publisher_update(topic, publishers)
+
+    def param_update(self, key: str, value: XmlRpcValue) -> bool:
+        """A parameter has changed."""
+        return self._on_param_update(key, value)
+
+    def shut_down(self, reason: str) -> None:
+        """The master wants us to end."""
+        _log.info("< %s: asked to shut down: %s", self.name, reason)
+        self._on_shutdown(reason)
+
+    def _call(
+        self, method: str, params: tuple[XmlRpcValue, ...], _client: str
+    ) -> XmlRpcValue | Awaitable[XmlRpcValue]:
+        if method not in METHODS:
+            raise RosFault(-1, f"{self.name} has no method {method}")
+        reply = self._api.dispatch(method, params)
+        if method == "shutdown" and reply.code == 1 and self._on_kill is not None:
+            caller, reason = [*map(str, params), ""][:2]
+            return self._answer(self._on_kill(caller, reason))
+        return list(reply)
+
+    @staticmethod
+    async def _answer(reply: Awaitable[RosReply]) -> XmlRpcValue:
+        return list(await reply)

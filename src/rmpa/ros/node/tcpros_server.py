@@ -1,0 +1,174 @@
+"""The listening TCPROS socket of one node: it accepts, reads the header and hands over to the publication."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+import socket
+from typing import TYPE_CHECKING
+
+from rmpa.core import limits
+from rmpa.core.counters import Counters, RefusalLog
+from rmpa.core.errors import StartError
+from rmpa.core.open_files import remedy
+from rmpa.ros.node.accepted_connection import AcceptedConnection
+from rmpa.ros.wire.tcpros import check_request, printable
+from rmpa.runtime.acceptor import Acceptor
+from rmpa.runtime.descriptors import DESCRIPTORS, Use, is_shortage
+from rmpa.runtime.system_clock import SystemClock
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from rmpa.core.clock import Clock
+    from rmpa.ros.node.publication import Publication
+    from rmpa.ros.node.service_server import ServiceEndpoint
+    from rmpa.ros.wire.tcpros import Header
+
+_log = logging.getLogger(__name__)
+
+
+class TcprosServer:
+    """Accepts subscribers for the publications of one node.
+
+    Args:
+        name: The node's name, for the texts.
+        publications: By topic; read at each header, so the owner just changes it.
+        counters: Counts ``tcpros.refused.*``.
+        numbers: Gives each connection its number; shared with the node's outgoing ones.
+        services: By name; read at each header too.
+        clock: For the rate limit of the log.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        publications: Mapping[str, Publication],
+        *,
+        services: Mapping[str, ServiceEndpoint] | None = None,
+        counters: Counters | None = None,
+        numbers: Iterator[int] | None = None,
+        clock: Clock | None = None,
+    ) -> None:
+        self._name = name
+        self._publications = publications
+        self._services: Mapping[str, ServiceEndpoint] = services if services is not None else {}
+        self._refusals = RefusalLog(_log, counters if counters is not None else Counters())
+        self._numbers = numbers if numbers is not None else itertools.count(1)
+        self._clock = clock if clock is not None else SystemClock()
+        self._acceptor: Acceptor | None = None
+        self._waiting: dict[AcceptedConnection, asyncio.TimerHandle] = {}
+        self._accepted: set[AcceptedConnection] = set()
+        self._forget_at = 16
+        self.address: tuple[str, int] = ("", 0)
+        """Where the socket listens."""
+
+    def start(self, host: str = "127.0.0.1", port: int = 0) -> None:
+        """Listen; ``port`` 0 lets the system choose.
+
+        Raises:
+            StartError: The address cannot be used.
+        """
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        where = f"TCPROS server of {self._name} at {host}:{port}"
+        try:
+            sock = DESCRIPTORS.open_socket(Use.DATA, family, what=f"TCPROS server of {self._name}")
+        except OSError as error:
+            if is_shortage(error):
+                raise StartError(where, "no file descriptors left", remedy()) from error
+            raise StartError(where, str(error)) from error
+        try:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            sock.bind((host, port))
+            sock.listen(limits.TCPROS_BACKLOG)
+        except OSError as error:
+            sock.close()
+            raise StartError(where, str(error)) from error
+        self.address = sock.getsockname()[:2]
+        self._acceptor = Acceptor(sock, self.adopt, name=f"TCPROS server of {self._name}")
+        self._acceptor.start()
+
+    def close(self) -> None:
+        """Stop listening, and close what has not reached a publication; the rest is the publications' own."""
+        if self._acceptor is not None:
+            self._acceptor.close()
+            self._acceptor = None
+        waiting, self._waiting = self._waiting, {}
+        for link, timer in waiting.items():
+            timer.cancel()
+            link.close()
+        self._accepted.clear()  # they know us: a cycle otherwise, with all that the publications know
+
+    def adopt(self, sock: socket.socket, _client: tuple[str, int]) -> None:
+        """Serve a connection that was accepted, by this server's own socket or by one that several nodes share.
+
+        Args:
+            sock: Non-blocking; owned from here on.
+        """
+        try:
+            link = AcceptedConnection(sock, next(self._numbers), on_header=self._header, on_end=self._ended)
+        except OSError:  # it is gone already
+            sock.close()
+            return
+        if len(self._accepted) >= min(self._forget_at, limits.TCPROS_CONNECTIONS_MAX):
+            self._forget_closed()
+        if len(self._accepted) >= limits.TCPROS_CONNECTIONS_MAX or len(self._waiting) >= limits.TCPROS_HANDSHAKES_MAX:
+            self._refuse("full", link.peer[0], f"{self._name}: too many connections, one from {link.peer[0]} closed")
+            link.close()
+            return
+        self._accepted.add(link)
+        self._waiting[link] = asyncio.get_running_loop().call_later(
+            limits.TCPROS_HANDSHAKE_TIMEOUT, self._timed_out, link
+        )
+
+    def _forget_closed(self) -> None:
+        """Publications do not report back who left, so the closed ones are sorted out each time they may be half."""
+        self._accepted = {link for link in self._accepted if not link.stream.closed}
+        self._forget_at = 2 * len(self._accepted) + 16
+
+    def _header(self, link: AcceptedConnection, fields: Header) -> None:
+        timer = self._waiting.pop(link, None)
+        if timer is not None:
+            timer.cancel()
+        problem = check_request(fields)
+        if problem is not None:
+            self._refuse("header", link.peer[0], f"{self._name}: a connection from {link.peer[0]}: {problem}")
+            link.refuse(problem)
+            return
+        if "service" in fields:
+            endpoint = self._services.get(fields["service"])
+            if endpoint is not None:
+                endpoint.attach(link)
+                return
+            # Quiet: a client, or only its probe, that was told of a service which is gone.
+            _log.debug("! %s: no service %s", self._name, printable(fields["service"]))
+            link.refuse(f"[{self._name}] does not offer the service [{printable(fields['service'])}]")
+            return
+        publication = self._publications.get(fields["topic"])
+        if publication is None:
+            # Quiet: a subscriber that was told of a publisher which left in the meantime.
+            _log.debug("! %s: no publication %s", self._name, printable(fields["topic"]))
+            link.refuse(f"[{self._name}] is not a publisher of [{printable(fields['topic'])}]")
+            return
+        publication.attach(link)
+
+    def _ended(self, link: AcceptedConnection, error: Exception | None) -> None:
+        """It left, or broke the protocol, before its header was there; leaving is normal for rospy."""
+        timer = self._waiting.pop(link, None)
+        if timer is not None:
+            timer.cancel()
+        if error is not None and not isinstance(error, OSError):
+            self._refuse("malformed", link.peer[0], f"{self._name}: a connection from {link.peer[0]}: {error}")
+
+    def _timed_out(self, link: AcceptedConnection) -> None:
+        del self._waiting[link]
+        link.close()
+        self._refuse(
+            "silent",
+            link.peer[0],
+            f"{self._name}: {link.peer[0]} sent no header within {limits.TCPROS_HANDSHAKE_TIMEOUT:g} s; closed",
+        )
+
+    def _refuse(self, kind: str, who: str, text: str) -> None:
+        self._refusals.refuse(self._clock.now(), f"tcpros.refused.{kind}", who, text)

@@ -1,0 +1,252 @@
+"""What a ``Node`` hands out: publishers, subscribers, and the messages that came."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import deque
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from rmpa.core import limits
+from rmpa.core.counters import Counters, RefusalLog
+from rmpa.core.errors import LocalProtocolError
+from rmpa.ros.node.publication import Publication
+from rmpa.ros.node.subscription import Subscription
+from rmpa.ros.types.header_types import type_of_header
+from rmpa.ros.wire.tcpros import ANY, LENGTH, frame_message, printable
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+
+    from rmpa.ros.node.subscription import PublisherConnection
+    from rmpa.ros.types.messages import MessageType, Plain
+    from rmpa.ros.wire.tcpros import Buffer, TopicDescription
+
+_log = logging.getLogger(__name__)
+
+
+class Received:
+    """One message that came.
+
+    Args:
+        raw: Its bytes, without the length.
+        header: The publisher's connection header: ``type``, ``md5sum``, ``message_definition``, ``callerid`` …
+        stamp_ns: When it came, by the wall clock in nanoseconds.
+        kind: Its type, if the subscriber named one.
+    """
+
+    def __init__(self, raw: bytes, header: Mapping[str, str], stamp_ns: int, kind: MessageType | None) -> None:
+        self.raw = raw
+        self.header = header
+        self.stamp_ns = stamp_ns
+        self._kind = kind
+
+    @cached_property
+    def kind(self) -> MessageType:
+        """The message type, learnt from the publisher's header if need be.
+
+        Raises:
+            DefinitionError: The publisher's definition cannot be used.
+        """
+        return self._kind if self._kind is not None else type_of_header(self.header)
+
+    @cached_property
+    def message(self) -> Any:
+        """The message object, read at the first look.
+
+        Raises:
+            MessageError: The bytes are not such a message.
+            DefinitionError: As for ``kind``.
+        """
+        return self.kind.deserialize(self.raw)
+
+    @property
+    def plain(self) -> dict[str, Plain]:
+        """The message as plain values; the errors are those of ``message``."""
+        return self.kind.to_plain(self.message)
+
+    @property
+    def caller_id(self) -> str:
+        """The publishing node."""
+        return self.header.get("callerid", "")
+
+
+class Publisher:
+    """Publishes one topic of a ``Node``; made by ``Node.advertise``."""
+
+    def __init__(
+        self,
+        topic: str,
+        caller_id: str,
+        description: TopicDescription,
+        kind: MessageType | None,
+        queue_messages: int,
+        on_close: Callable[[str], Awaitable[None]],
+    ) -> None:
+        self.topic = topic
+        self.description = description
+        self.kind = kind
+        self._on_close = on_close
+        self._change = asyncio.Event()
+        self._log = RefusalLog(_log, Counters())
+        self.refusals: dict[str, str] = {}
+        """Why subscribers (by caller id) were refused."""
+        self.publication = Publication(
+            topic,
+            caller_id,
+            description,
+            on_first_subscriber=self._change.set,
+            on_last_subscriber=self._change.clear,
+            on_mismatch=self._refused,
+            queue_messages=queue_messages,
+        )
+
+    @property
+    def subscribers(self) -> int:
+        """Connected subscribers."""
+        return self.publication.subscribers
+
+    def make(self, values: Plain = None) -> Any:
+        """A message of this topic's type from plain values; see ``MessageType.make``."""
+        return self._known().make(values)
+
+    def publish(self, message: object) -> int:
+        """Publish a message object; return how many older messages slow subscribers lost for it.
+
+        Raises:
+            MessageError: The message does not fit the type.
+        """
+        return self.publish_raw(self._known().serialize(message))
+
+    def publish_raw(self, payload: Buffer) -> int:
+        """Publish bytes, without a length in front.
+
+        Raises:
+            ValueError: They are more than ``limits.TCPROS_MESSAGE_MAX``.
+        """
+        return self.publication.publish_framed(frame_message(payload))
+
+    async def wait_for_subscriber(self) -> None:
+        """Wait until there is at least one."""
+        await self._change.wait()
+
+    async def drained(self) -> None:
+        """Wait, a moment at the most, until all that was published has left."""
+        await self.publication.drained()
+
+    async def close(self) -> None:
+        """Let what was published leave, unregister, and close the connections."""
+        await self.drained()
+        await self._on_close(self.topic)
+
+    def _refused(self, fields: Mapping[str, str], text: str) -> None:
+        who = printable(fields.get("callerid", ""))
+        _remember(self.refusals, who, text)
+        self._log.refuse(asyncio.get_running_loop().time(), "publication.refused", who, f"{self.topic}: {text}")
+
+    def _known(self) -> MessageType:
+        if self.kind is None:
+            raise LocalProtocolError(f"{self.topic} was advertised for raw bytes; use publish_raw")
+        return self.kind
+
+
+class Subscriber:
+    """Receives one topic of a ``Node``, by callback or ``async for``; made by ``Node.subscribe``."""
+
+    def __init__(
+        self,
+        topic: str,
+        caller_id: str,
+        kind: MessageType | None,
+        callback: Callable[[Received], None] | None,
+        *,
+        type_name: str = ANY,
+        own_uri: str,
+        nodelay: bool,
+        queue_messages: int,
+        number: Callable[[], int],
+        on_close: Callable[[str], Awaitable[None]],
+    ) -> None:
+        self.topic = topic
+        self.kind = kind
+        self.type_name = kind.name if kind is not None else type_name
+        self.dropped = 0
+        """Messages that the ``async for`` was too slow for."""
+        self.refusals: dict[str, str] = {}
+        """Why publishers (by slave API URI) refused us, or do not fit."""
+        self._callback = callback
+        self._refusals = RefusalLog(_log, Counters())
+        self._queue: deque[Received] = deque()
+        self._queue_messages = queue_messages
+        self._wake = asyncio.Event()
+        self._ended = False
+        self._on_close = on_close
+        self.subscription = Subscription(
+            topic,
+            caller_id,
+            on_message=self._message,
+            on_refused=self._refused,
+            own_uri=own_uri,
+            type_name=self.type_name,
+            md5sum=kind.md5sum if kind is not None else ANY,
+            definition=kind.definition if kind is not None else "",
+            nodelay=nodelay,
+            number=number,
+        )
+
+    @property
+    def publishers(self) -> int:
+        """Publishers that we are connected to."""
+        return self.subscription.publishers
+
+    @property
+    def callers(self) -> set[str]:
+        """The names of the publishers that we are connected to."""
+        return self.subscription.callers
+
+    async def __aiter__(self) -> AsyncIterator[Received]:
+        """The messages, until the subscriber or its node is closed."""
+        while True:
+            while self._queue:
+                yield self._queue.popleft()
+            if self._ended:
+                return
+            self._wake.clear()
+            await self._wake.wait()
+
+    async def close(self) -> None:
+        """Unregister and leave all publishers."""
+        self.ended()
+        await self._on_close(self.topic)
+
+    def ended(self) -> None:
+        """No message will come any more: let the ``async for`` end."""
+        self._ended = True
+        self._wake.set()
+
+    def _message(self, link: PublisherConnection, framed: memoryview) -> None:
+        received = Received(bytes(framed[LENGTH.size :]), link.fields, time.time_ns(), self.kind)
+        if self._callback is not None:
+            try:
+                self._callback(received)
+            except Exception:  # noqa: BLE001 - the top of the user's code: the connection must outlive its mistakes
+                _log.exception("! %s: the callback failed on a message from %s", self.topic, received.caller_id)
+            return
+        if len(self._queue) >= self._queue_messages:
+            self._queue.popleft()
+            self.dropped += 1
+        self._queue.append(received)
+        self._wake.set()
+
+    def _refused(self, link: PublisherConnection, text: str) -> None:
+        _remember(self.refusals, link.uri, text)
+        now = asyncio.get_running_loop().time()
+        self._refusals.refuse(now, "subscription.refused", link.uri, f"{self.topic}: publisher {link.uri}: {text}")
+
+
+def _remember(refusals: dict[str, str], who: str, text: str) -> None:
+    refusals[who] = text
+    if len(refusals) > limits.LOG_KINDS_MAX:
+        refusals.pop(next(iter(refusals)))

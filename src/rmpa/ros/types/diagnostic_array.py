@@ -1,0 +1,109 @@
+"""``diagnostic_msgs/DiagnosticArray`` as bytes (REP 107): what an agent says of itself to rqt and its like.
+
+Written by hand, for the agent decodes and encodes no other message, and the libraries for it would double its memory.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING, Final
+
+from rmpa.ros.types.std_header import HEADER_PART
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+ARRAY_TYPE: Final = "diagnostic_msgs/DiagnosticArray"
+ARRAY_MD5: Final = "60810da900de1dd6ddd437c3503511da"
+ARRAY_DEFINITION: Final = (
+    "# This message is used to send diagnostic information about the state of the robot\n"
+    "Header header #for timestamp\n"
+    "DiagnosticStatus[] status # an array of components being reported on\n"
+    f"{HEADER_PART}"
+    "\n"
+    "================================================================================\n"
+    "MSG: diagnostic_msgs/DiagnosticStatus\n"
+    "# This message holds the status of an individual component of the robot.\n"
+    "# \n"
+    "\n"
+    "# Possible levels of operations\n"
+    "byte OK=0\n"
+    "byte WARN=1\n"
+    "byte ERROR=2\n"
+    "byte STALE=3\n"
+    "\n"
+    "byte level # level of operation enumerated above \n"
+    "string name # a description of the test/component reporting\n"
+    "string message # a description of the status\n"
+    "string hardware_id # a hardware unique string\n"
+    "KeyValue[] values # an array of values associated with the status\n"
+    "\n"
+    "\n"
+    "================================================================================\n"
+    "MSG: diagnostic_msgs/KeyValue\n"
+    "string key # what to label this value when viewing\n"
+    "string value # a value to track over time\n"
+)
+"""As ROS's own publishers send it: rosbag and others compute the md5 sum from it."""
+_LENGTH: Final = struct.Struct("<I")
+_HEADER: Final = struct.Struct("<III")
+_SECOND: Final = 1_000_000_000
+_WORD: Final = 0xFFFFFFFF
+
+
+class DiagnosticLevel(IntEnum):
+    """How a component is; the numbers are the message's."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosticStatus:
+    """How one component is.
+
+    Args:
+        level: The worst that is true of it.
+        name: Which component; unique in an array.
+        message: In a few words.
+        hardware_id: The module that says so.
+        values: Figures and facts, each ready to read.
+    """
+
+    level: DiagnosticLevel
+    name: str
+    message: str
+    hardware_id: str
+    values: Mapping[str, str]
+
+    def serialize(self) -> bytes:
+        """One element of the array."""
+        parts = [bytes((self.level,)), *map(_text, (self.name, self.message, self.hardware_id))]
+        parts.append(_LENGTH.pack(len(self.values)))
+        for key, value in self.values.items():
+            parts += (_text(key), _text(value))
+        return b"".join(parts)
+
+
+def frame_array(sequence: int, stamp_ns: int, statuses: Iterable[bytes]) -> bytes:
+    """A whole message with its length in front, as TCPROS sends it.
+
+    Args:
+        sequence: The header's; wraps.
+        stamp_ns: The header's, wall clock.
+        statuses: What ``DiagnosticStatus.serialize`` gave.
+    """
+    elements = tuple(statuses)
+    seconds, nanoseconds = divmod(stamp_ns, _SECOND)
+    header = _HEADER.pack(sequence & _WORD, seconds & _WORD, nanoseconds) + _text("")
+    body = b"".join((header, _LENGTH.pack(len(elements)), *elements))
+    return _LENGTH.pack(len(body)) + body
+
+
+def _text(text: str) -> bytes:
+    data = text.encode(errors="replace")
+    return _LENGTH.pack(len(data)) + data

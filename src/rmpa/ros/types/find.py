@@ -1,0 +1,247 @@
+"""Finds the definition of a message or service type by its name: one way for commands, nodes and Smart Resources.
+
+In this order: the workspaces that are sourced (``ros.types.installed`` says where), what comes with us, and where
+ROS is
+installed on this machine. So a workspace's version of a standard type is preferred to ours, as it is by the nodes of
+that workspace. Where an md5 sum is given (a service's server or a publisher has one), the version with that sum is
+taken, wherever it is. What none of these knows may be learnt from a publisher: ``ros.node.learn_type``.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from typing import TYPE_CHECKING, Final, NoReturn, Protocol, TypeVar
+
+from rmpa.config.values import did_you_mean
+from rmpa.core import limits
+from rmpa.core.errors import RmpaError
+from rmpa.core.names import is_type_name
+from rmpa.ros.types.definitions import (
+    DefinitionError,
+    Specification,
+    UnknownTypeError,
+    complete,
+    full_text,
+    known_text,
+    known_types,
+    parse_definition,
+)
+from rmpa.ros.types.installed import SearchPath, definitions_of, find_messages, find_services
+from rmpa.ros.types.messages import MessageType
+from rmpa.ros.types.packages import packages_below
+from rmpa.ros.types.service_types import ServiceType, known_service, known_services
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from rmpa.ros.types.installed import Found
+
+
+class _Versioned(Protocol):
+    md5sum: str
+    source: str
+
+
+_Type = TypeVar("_Type", bound=_Versioned)
+EMPTY_MD5: Final = "d41d8cd98f00b204e9800998ecf8427e"
+"""Of a message without fields, whose publishers send an empty definition."""
+_REMEDIES: Final = {
+    "msg": "source the workspace that has it, or let a node that publishes it run, here or at a peer",
+    "srv": "source the workspace that has it; no server sends its definition",
+}
+
+
+def find_message_type(name: str, md5: str = "", environ: Mapping[str, str] | None = None) -> MessageType:
+    """Find a message type.
+
+    Args:
+        name: ``package/Name``.
+        md5: The version that is meant; by default the first that is found.
+        environ: Instead of this process's variables.
+
+    Raises:
+        UnknownTypeError: It is in none of the places, which are named.
+        DefinitionError: What is there is malformed, or has another sum.
+        LimitExceeded: It is too long.
+    """
+    return _again(_message, name, md5, SearchPath.read(os.environ if environ is None else environ))
+
+
+def find_service_type(name: str, md5: str = "", environ: Mapping[str, str] | None = None) -> ServiceType:
+    """Find a service type; arguments and errors are those of ``find_message_type``."""
+    return _again(_service, name, md5, SearchPath.read(os.environ if environ is None else environ))
+
+
+# --- inside ---------------------------------------------------------------------------------------------------
+
+
+def _again(find: Callable[[str, str, SearchPath], _Type], name: str, md5: str, path: SearchPath) -> _Type:
+    """Find a type; where it is missing, look at the folders anew: it may have been built since the last look."""
+    fresh = packages_below.cache_info().currsize == 0
+    try:
+        return find(name, md5, path)
+    except UnknownTypeError:
+        if fresh:
+            raise
+    packages_below.cache_clear()
+    return find(name, md5, path)
+
+
+@functools.lru_cache(maxsize=limits.TYPES_FOUND_MAX)
+def message_with_sum(name: str, md5: str, path: SearchPath) -> MessageType:
+    """The message type of this name and md5 sum.
+
+    Raises:
+        DefinitionError: As for ``find_message_type``.
+    """
+    # Asked for each message. With a sum it stays true whatever becomes of the files.
+    return _again(_message, name, md5, path)
+
+
+def _message(name: str, md5: str, path: SearchPath) -> MessageType:
+    return _choose(name, md5, _messages(name, path)) or _unknown(name, path, "msg")
+
+
+def _service(name: str, md5: str, path: SearchPath) -> ServiceType:
+    return _choose(name, md5, _services(name, path)) or _unknown(name, path, "srv")
+
+
+def _choose(name: str, md5: str, versions: Iterator[Callable[[], _Type]]) -> _Type | None:
+    """The first version that can be made and has the sum; ``None`` if there is none at all.
+
+    Raises:
+        RmpaError: There are some, but none of them will do.
+    """
+    problem: RmpaError | None = None
+    for make in versions:
+        try:
+            kind = make()
+        except RmpaError as error:
+            problem = problem or error
+            continue
+        if not md5 or kind.md5sum == md5:
+            return kind
+        where = kind.source or "it comes with rmpa"
+        text = f"has the md5 sum {kind.md5sum} here ({where}), and {md5} there"
+        problem = problem or DefinitionError(name, text, "source the workspace that the node over there was built in")
+    if problem is not None:
+        raise problem
+    return None
+
+
+def _messages(name: str, path: SearchPath) -> Iterator[Callable[[], MessageType]]:
+    """Makers of the versions of a message type, best first."""
+    for found in find_messages(name, path, sourced=True):
+        yield functools.partial(_make_message, name, found, path)
+    if known_text(name) is not None:
+        yield functools.partial(MessageType, name)
+    for found in find_messages(name, path, sourced=False):
+        yield functools.partial(_make_message, name, found, path)
+
+
+def _services(name: str, path: SearchPath) -> Iterator[Callable[[], ServiceType]]:
+    for found in find_services(name, path, sourced=True):
+        yield functools.partial(_make_service, name, found, path)
+    if name in known_services():
+        yield functools.partial(_built_service, name, known_service(name))
+    for found in find_services(name, path, sourced=False):
+        yield functools.partial(_make_service, name, found, path)
+
+
+def _make_message(name: str, found: Found, path: SearchPath) -> MessageType:
+    known = {name: Specification.parse(name, found.text)}
+    try:
+        complete(known, functools.partial(_embedded, found, path))
+    except UnknownTypeError as error:
+        raise _embedding(name, error, "message type") from None
+    made = _built_message(name, full_text(name, known), str(found.where))
+    if known_text(name) is not None:
+        ours = MessageType(name)
+        if ours.md5sum == made.md5sum:
+            return ours  # it is ready sooner
+    return made
+
+
+def _make_service(name: str, found: Found, path: SearchPath) -> ServiceType:
+    embedded: dict[str, str] = {}
+
+    def find(inner: str) -> str | None:
+        text = _embedded(found, path, inner)
+        if text is not None:
+            embedded[inner] = text
+        return text
+
+    try:
+        ServiceType(name, found.text, find)
+    except UnknownTypeError as error:
+        raise _embedding(name, error, "service type") from None
+    return _built_service(name, found.text, tuple(embedded.items()), str(found.where))
+
+
+# Types are kept by their text, with the code that reads and writes them: making that takes some 10 ms.
+@functools.lru_cache(maxsize=limits.TYPES_FOUND_MAX)
+def _built_message(name: str, definition: str, source: str) -> MessageType:
+    return MessageType(name, parse_definition(name, definition), source)
+
+
+@functools.lru_cache(maxsize=limits.TYPES_FOUND_MAX)
+def _built_service(
+    name: str, text: str, embedded: tuple[tuple[str, str], ...] | None = None, source: str = ""
+) -> ServiceType:
+    return ServiceType(name, text, dict(embedded).get if embedded is not None else None, source)
+
+
+def _embedding(name: str, error: UnknownTypeError, what: str) -> UnknownTypeError:
+    return UnknownTypeError(name, f"embeds {error.type}, which {error.problem}", error.remedy, what)
+
+
+def _embedded(found: Found, path: SearchPath, name: str) -> str | None:
+    """The own text of a type that is embedded in one that was found.
+
+    Raises:
+        UnknownTypeError: There is none.
+    """
+    if name in found.embedded:
+        return found.embedded[name]
+    for each in find_messages(name, path, sourced=True):
+        return each.text
+    ours = known_text(name)
+    if ours is not None:
+        return ours
+    for each in find_messages(name, path, sourced=False):
+        return each.text
+    return _unknown(name, path, "msg")
+
+
+def _unknown(name: str, path: SearchPath, kind: str) -> NoReturn:
+    """Say where was looked, and what there is instead.
+
+    Args:
+        name: The type.
+        path: Where was looked.
+        kind: ``msg`` or ``srv``.
+
+    Raises:
+        UnknownTypeError: Always.
+        DefinitionError: It is not the name of a type.
+    """
+    what = "message type" if kind == "msg" else "service type"
+    if not is_type_name(name):
+        raise DefinitionError(name[:80], "is not a type's name", "write it like std_msgs/String", what)
+    package = name.partition("/")[0]
+    ours = known_types() if kind == "msg" else known_services()
+    ours_too = any(each.startswith(f"{package}/") for each in ours)
+    folders, names = definitions_of(package, path, kind)
+    if folders:
+        problem = f"is not in package {package} ({', '.join(map(str, folders))})"
+    elif ours_too:
+        problem = f"is not in package {package} as it comes with rmpa"
+    else:
+        problem = "is not known here"
+    there = {f"{package}/{base}" for base in names}.union(each for each in ours if each.startswith(f"{package}/"))
+    base = name.partition("/")[2]
+    near = did_you_mean(name, there or [each for each in ours if each.endswith(f"/{base}")])
+    guess = f"did you mean {near}? Else " if near else ""
+    problem += f"; looked in {path}, and at what comes with rmpa"
+    raise UnknownTypeError(name, problem, guess + _REMEDIES[kind], what, learnable=not ours_too)

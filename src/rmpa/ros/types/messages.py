@@ -1,0 +1,362 @@
+"""Messages as Python objects: serialize, read, build from plain values, and turn back into them.
+
+``rosbags`` does the work; it and numpy are imported when the first message is built or read, never before: the agent
+carries bytes and starts without them. MD5 sums and definitions need neither.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, Union
+
+from rmpa.core import limits
+from rmpa.core.errors import RmpaError
+from rmpa.ros.types.definitions import (
+    DefinitionError,
+    Field,
+    Specification,
+    full_text,
+    known_specifications,
+    md5sum,
+    parse_definition,
+)
+from rmpa.ros.wire.tcpros import TopicDescription
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+    from rmpa.ros.wire.tcpros import Buffer
+
+Plain: TypeAlias = Union[  # noqa: UP007 - | does not take the forward references of a recursive type
+    bool, int, float, str, list["Plain"], dict[str, "Plain"], None
+]
+"""What YAML and JSON can say."""
+
+_TIMES: Final = {"time": "builtin_interfaces/msg/Time", "duration": "builtin_interfaces/msg/Duration"}
+_NANO: Final = 1_000_000_000
+_FLOATS: Final = frozenset(("float32", "float64"))
+_SHOWN: Final = 80
+"""Characters of a wrong value that an error shows."""
+_DTYPES: Final = {"bool": "bool_", "byte": "uint8", "char": "uint8"}
+
+
+class MessageError(RmpaError):
+    """A value does not fit a message type, or bytes are not a message of it."""
+
+
+class MessageType:
+    """One message type.
+
+    Args:
+        name: ``package/Name``.
+        specifications: The type and all that it embeds, by name; by default those that come with us. To find those of
+            this machine's packages, use ``rmpa.ros.types.find``.
+        source: The file that its definition is from; empty: it comes with us, or was learnt.
+
+    Raises:
+        DefinitionError: The type is not known, or malformed.
+    """
+
+    def __init__(
+        self, name: str, specifications: Mapping[str, Specification] | None = None, source: str = ""
+    ) -> None:
+        self.name = name
+        self.source = source
+        self._learnt = specifications is not None
+        self._specifications = specifications if specifications is not None else known_specifications(name)
+        self.md5sum = md5sum(name, self._specifications)
+        self.definition = full_text(name, self._specifications)
+
+    @classmethod
+    def learn(cls, name: str, definition: str, md5: str = "") -> MessageType:
+        """A type from what its publisher says about it; the last ``limits.LEARNT_TYPES_MAX`` are remembered.
+
+        Args:
+            name: ``package/Name``.
+            definition: The full text.
+            md5: The sum that the publisher names; with it the text is checked.
+
+        Raises:
+            DefinitionError: The text is malformed, or has another sum.
+            LimitExceeded: It is too long.
+        """
+        learnt = _learn(name, definition)
+        if md5 and learnt.md5sum != md5:
+            raise DefinitionError(name, f"its definition has the md5 sum {learnt.md5sum}, its publisher says {md5}")
+        return learnt
+
+    def describe(self, *, latching: bool = False) -> TopicDescription:
+        """What a publisher of this type says."""
+        return TopicDescription(self.name, self.md5sum, self.definition, latching)
+
+    @property
+    def fields(self) -> tuple[Field, ...]:
+        """The fields, in order."""
+        return self._specifications[self.name].fields
+
+    def serialize(self, message: object) -> bytes:
+        """A message object as bytes, without a length in front.
+
+        Raises:
+            MessageError: A field holds what its type does not allow.
+        """
+        try:
+            return bytes(self._store.serialize_ros1(message, _inner(self.name)))
+        except Exception as error:
+            # rosbags checks nothing: what it meets depends on the field.
+            raise MessageError(f"cannot serialize a {self.name}: {type(error).__name__}: {error}") from error
+
+    def deserialize(self, raw: Buffer) -> Any:
+        """Bytes to a message object, with numpy arrays for arrays of numbers.
+
+        Raises:
+            MessageError: The bytes are too short, too long, or a string in them is not UTF-8.
+        """
+        try:
+            return self._store.deserialize_ros1(bytes(raw), _inner(self.name))
+        except Exception as error:
+            raise MessageError(f"{len(raw)} bytes are not a {self.name}: {error}") from error
+
+    def make(self, values: Plain | Mapping[str, object] = None) -> Any:
+        """A message object from plain values; what is not given is 0, empty or false, as in ROS.
+
+        Args:
+            values: A mapping of fields; or a list of all fields in order; or the value itself where there is one
+                field only. Times are ``{secs, nsecs}`` or seconds.
+
+        Raises:
+            MessageError: A field is unknown, or its value does not fit.
+        """
+        return self._make(self.name, values, "")
+
+    def to_plain(self, message: object) -> dict[str, Plain]:
+        """A message object as what JSON and YAML can say; times are ``{secs, nsecs}``."""
+        return self._plain(self.name, message)
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    @functools.cached_property
+    def _store(self) -> Typestore:
+        # rosbags brings most of the types that come with us; TFMessage is one that it does not.
+        if self._learnt or _inner(self.name) not in _known_store().types:
+            return _learnt_store(self.name, self._specifications)
+        return _known_store()
+
+    def _class(self, name: str) -> Any:
+        return self._store.types[_inner(name)]
+
+    def _make(self, name: str, values: Plain | Mapping[str, object], path: str) -> object:
+        fields = self._specifications[name].fields
+        if values is None:
+            given: Mapping[str, object] = {}
+        elif isinstance(values, Mapping):
+            given = values
+        elif isinstance(values, list):
+            if values and len(values) != len(fields):
+                raise MessageError(f"{path or name} has {len(fields)} fields, not {len(values)}")
+            given = dict(zip((field.name for field in fields), values, strict=False))
+        elif len(fields) == 1:
+            given = {fields[0].name: values}
+        else:
+            raise MessageError(f"{path or name} is made of the fields {_names(fields)}, not of {values!r}")
+        if given and (unknown := given.keys() - {field.name for field in fields}):
+            raise MessageError(f"{path or name} has no field {min(unknown)!r}; it has {_names(fields)}")
+        within = f"{path}." if path else ""
+        made = {
+            _python_name(field.name): self._value(field, given.get(field.name), within + field.name)
+            for field in fields
+        }
+        if not fields:
+            made["structure_needs_at_least_one_member"] = 0
+        return self._class(name)(**made)
+
+    def _value(self, field: Field, value: Any, path: str) -> object:
+        if not field.array:
+            return self._scalar(field, value, path)
+        if isinstance(value, str) and field.type in ("uint8", "char"):
+            value = list(value.encode())
+        if not isinstance(value, list | str | None):
+            value = _sequence(field, value, path)
+            if not isinstance(value, list):
+                return value
+        items = value if value is not None else []
+        if not isinstance(items, list):
+            raise MessageError(f"{path} is a list of {field.type}, not {_short(value)}")
+        if not items and (not field.size or value is None) and field.type in _NUMBERS:
+            return _zeros(field.type, field.size or 0)
+        if field.size and not items:
+            items = [None] * field.size
+        if field.size and len(items) != field.size:
+            raise MessageError(f"{path} has {field.size} elements, not {len(items)}")
+        made = [self._scalar(field, item, path) for item in items]
+        if field.type in ("string", *_TIMES) or not field.primitive:
+            return made
+        import numpy as np  # noqa: PLC0415 - see the module's docstring
+
+        return np.array(made, dtype=_DTYPES.get(field.type, field.type))
+
+    def _scalar(self, field: Field, value: Any, path: str) -> object:
+        if field.type in _TIMES:
+            if getattr(value, "__msgtype__", None) == _TIMES[field.type]:
+                return value
+            secs, nsecs = _time(value, path)
+            return self._store.types[_TIMES[field.type]](sec=secs, nanosec=nsecs)
+        if not field.primitive:
+            if getattr(value, "__msgtype__", None) == _inner(field.type):
+                return value
+            return self._make(field.type, value, path)
+        if not isinstance(value, bool | int | float | str | list | dict | None) and hasattr(value, "item"):
+            value = value.item()  # numpy's
+        return _primitive(field.type, value, path)
+
+    def _plain(self, name: str, message: object) -> dict[str, Plain]:
+        plain: dict[str, Plain] = {}
+        for field in self._specifications[name].fields:
+            value = getattr(message, _python_name(field.name))
+            if not field.array:
+                plain[field.name] = self._plain_scalar(field, value)
+            elif hasattr(value, "tolist"):
+                plain[field.name] = value.tolist()
+            else:
+                plain[field.name] = [self._plain_scalar(field, item) for item in value]
+        return plain
+
+    def _plain_scalar(self, field: Field, value: Any) -> Plain:
+        if field.type in _TIMES:
+            return {"secs": int(value.sec), "nsecs": int(value.nanosec)}
+        if field.primitive:
+            plain: Plain = value
+            return plain
+        return self._plain(field.type, value)
+
+
+_RANGES: Final = {
+    f"{sign}int{bits}": (0, (1 << bits) - 1) if sign else (-(1 << bits - 1), (1 << bits - 1) - 1)
+    for sign in ("u", "")
+    for bits in (8, 16, 32, 64)
+} | {"byte": (0, 255), "char": (0, 255)}
+_NUMBERS: Final = _FLOATS | _RANGES.keys()
+
+
+def _primitive(kind: str, value: Plain, path: str) -> bool | float | str:
+    if kind == "string":
+        if value is None or isinstance(value, str | int | float):
+            return "" if value is None else str(value)
+    elif kind == "bool":
+        if value is None or isinstance(value, bool | int):
+            return bool(value)
+    elif kind in _FLOATS:
+        if value is None or isinstance(value, int | float):
+            return float(value or 0.0)
+        if isinstance(value, str) and value.lstrip("+-.").lower() in ("nan", "inf"):
+            return float(value.replace(".", ""))
+    else:
+        low, high = _RANGES[kind]
+        if value is None or (isinstance(value, int) and low <= value <= high):
+            return int(value or 0)
+        if isinstance(value, int):
+            raise MessageError(f"{path}: {value} does not fit {kind} ({low} to {high})")
+    raise MessageError(f"{path} is a {kind}, not {value!r}")
+
+
+def _sequence(field: Field, value: Any, path: str) -> Any:
+    """What a program has for an array: numpy's array or bytes, ready to be sent; else as a list."""
+    if isinstance(value, tuple):
+        return list(value)
+    raw = isinstance(value, bytes | bytearray | memoryview) and field.type in ("uint8", "char", "byte", "int8")
+    if not raw and not (hasattr(value, "dtype") and value.ndim):
+        raise MessageError(f"{path} is a list of {field.type}, not {_short(value)}")
+    if not field.primitive or field.type in ("string", *_TIMES):
+        return list(value)
+    import numpy as np  # noqa: PLC0415 - see the module's docstring
+
+    kind = np.dtype(_DTYPES.get(field.type, field.type))
+    # A copy: the caller may go on to change what it gave.
+    given = np.frombuffer(value, kind).copy() if raw else np.asarray(value).ravel()
+    if field.size and given.size != field.size:
+        raise MessageError(f"{path} has {field.size} elements, not {given.size}")
+    if given.dtype == kind:
+        return given if raw else given.copy()
+    whole = kind.kind in "iu"
+    if given.dtype.kind not in ("biu" if whole or kind.kind == "b" else "biuf"):
+        raise MessageError(f"{path} is a list of {field.type}, not of {given.dtype}")
+    if whole and given.size:
+        low, high = _RANGES[field.type]
+        if int(given.min()) < low or int(given.max()) > high:
+            raise MessageError(f"{path}: {given.min()} to {given.max()} do not fit {field.type} ({low} to {high})")
+    return given.astype(kind)
+
+
+def _zeros(kind: str, count: int) -> object:
+    import numpy as np  # noqa: PLC0415 - see the module's docstring
+
+    return np.zeros(count, dtype=_DTYPES.get(kind, kind))
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
+
+
+def _time(value: Plain, path: str) -> tuple[int, int]:
+    if value is None:
+        return 0, 0
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return divmod(round(value * _NANO), _NANO)
+    if isinstance(value, Mapping):
+        secs, nsecs = value.get("secs", value.get("sec", 0)), value.get("nsecs", value.get("nanosec", 0))
+        known = value.keys() <= {"secs", "nsecs", "sec", "nanosec"}
+        if known and isinstance(secs, int) and isinstance(nsecs, int):
+            return secs, nsecs
+    raise MessageError(f"{path} is a time, {{secs: 0, nsecs: 0}} or seconds, not {value!r}")
+
+
+def _names(fields: Sequence[Field]) -> str:
+    return ", ".join(field.name for field in fields) or "none"
+
+
+@functools.cache
+def _inner(name: str) -> str:
+    """``package/Name`` as rosbags writes it."""
+    package, _, base = name.partition("/")
+    return f"{package}/msg/{base}"
+
+
+@functools.cache
+def _python_name(name: str) -> str:
+    from rosbags.typesys.base import normalize_fieldname  # noqa: PLC0415 - see the module's docstring
+
+    return normalize_fieldname(name)
+
+
+@functools.cache
+def _known_store() -> Typestore:
+    from rosbags.typesys import Stores  # noqa: PLC0415 - see the module's docstring
+
+    from rmpa.ros.types.typestore import Ros1Store  # noqa: PLC0415
+
+    return Ros1Store(Stores.ROS1_NOETIC)
+
+
+@functools.lru_cache(maxsize=limits.LEARNT_TYPES_MAX)
+def _learn(name: str, definition: str) -> MessageType:
+    return MessageType(name, parse_definition(name, definition))
+
+
+def _learnt_store(name: str, specifications: Mapping[str, Specification]) -> Typestore:
+    from rosbags.typesys import Stores, get_types_from_msg  # noqa: PLC0415 - see the module's docstring
+    from rosbags.typesys.base import TypesysError  # noqa: PLC0415
+
+    from rmpa.ros.types.typestore import Ros1Store  # noqa: PLC0415
+
+    store = Ros1Store(Stores.EMPTY)
+    try:
+        for each in specifications.values():
+            # Written anew from the parsed fields: comments and constants, which a reader does not need, stay out of
+            # the code that rosbags generates, and so do lines that it reads differently.
+            text = "".join(f"{field} {field.name}\n" for field in each.fields)
+            store.register(get_types_from_msg(text, _inner(each.name)))
+    except (TypesysError, SyntaxError, ValueError) as error:
+        raise DefinitionError(name, f"rosbags cannot read its definition: {error}") from error
+    return store

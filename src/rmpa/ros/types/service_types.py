@@ -1,0 +1,94 @@
+"""Service types: their definitions, MD5 sums, and requests and responses as Python objects.
+
+A definition is the request's text, a line ``---``, and the response's (wiki.ros.org/srv). Those of ROS's own packages
+come with us; ``ros.types.find`` finds those of this machine's packages, for no server sends its own.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+from rmpa.ros.types.definitions import (
+    DefinitionError,
+    Specification,
+    UnknownTypeError,
+    complete,
+    known_text,
+    packaged_texts,
+    service_md5sum,
+)
+from rmpa.ros.types.messages import MessageType
+from rmpa.ros.wire.services import ServiceDescription
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+_MARK = re.compile(r"^---[ \t]*$", re.MULTILINE)
+
+
+class ServiceType:
+    """One service type.
+
+    Args:
+        name: ``package/Name``.
+        text: Its definition; by default that which comes with us.
+        find: Gives the own text of a message type that it embeds, or ``None``; by default those that come with us.
+        source: The file that its definition is from; empty: it comes with us.
+
+    Raises:
+        DefinitionError: The type is not known, or malformed.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        text: str | None = None,
+        find: Callable[[str], str | None] | None = None,
+        source: str = "",
+    ) -> None:
+        self.name = name
+        self.source = source
+        text = text if text is not None else known_service(name)
+        halves = _MARK.split(text)
+        if len(halves) != 2:
+            raise DefinitionError(
+                name,
+                f"has {len(halves) - 1} lines '---' instead of one",
+                "is it a message's type?",
+                "service type",
+            )
+        parts = (f"{name}Request", f"{name}Response")
+        known = {part: Specification.parse(part, half) for part, half in zip(parts, halves, strict=True)}
+        complete(known, find if find is not None else known_text)
+        self.request, self.response = (MessageType(part, known) for part in parts)
+        self.md5sum = service_md5sum(*parts, known)
+
+    def describe(self) -> ServiceDescription:
+        """What a server of this type says."""
+        return ServiceDescription(self.name, self.md5sum, self.request.name, self.response.name)
+
+
+def _texts() -> Mapping[str, str]:
+    return packaged_texts("service_definitions.json")
+
+
+def known_services() -> tuple[str, ...]:
+    """The names of all service types that come with us."""
+    return tuple(_texts())
+
+
+def known_service(name: str) -> str:
+    """The definition of a service type that comes with us.
+
+    Raises:
+        DefinitionError: It does not.
+    """
+    if name not in _texts():
+        raise UnknownTypeError(
+            name,
+            "is not a service that comes with rmpa",
+            "rmpa.ros.types.find finds those of this machine's packages",
+            "service type",
+        )
+    return _texts()[name]

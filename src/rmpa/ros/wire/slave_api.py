@@ -1,0 +1,240 @@
+"""The Slave API: what a node answers over XML-RPC (wiki.ros.org/ROS/Slave_API).
+
+Pure: a call comes in as a method and its parameters, and leaves as ``Reply(code, status, value)``. What the node
+has and what is to be done are asked from a ``NodeView``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Final, Protocol
+
+from rmpa.core.names import is_global_name, is_legal_name
+from rmpa.ros.wire.xmlrpc import RosReply
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+    from rmpa.ros.wire.xmlrpc import XmlRpcValue
+
+TCPROS: Final = "TCPROS"
+INBOUND: Final = "i"
+OUTBOUND: Final = "o"
+_ERROR: Final = -1
+_FAILURE: Final = 0
+_SUCCESS: Final = 1
+_INT_MAX: Final = (1 << 31) - 1
+
+
+@dataclass(frozen=True, slots=True)
+class BusConnection:
+    """One topic connection of a node, for ``getBusInfo``, ``getBusStats`` and our own tools.
+
+    Args:
+        number: The node's own number for it.
+        other: The other side: a subscriber's caller id, or a publisher's slave API URI.
+        direction: ``"o"`` to a subscriber, ``"i"`` from a publisher.
+        topic: The topic.
+        connected: Whether messages can flow.
+        info: The addresses, for people.
+        bytes: Sent or received, headers included.
+        messages: Sent or received.
+        dropped: Messages dropped because the other side is slow; 0 inbound.
+        waiting: Bytes that wait for the other side to read; 0 inbound.
+    """
+
+    number: int
+    other: str
+    direction: str
+    topic: str
+    connected: bool
+    info: str
+    bytes: int
+    messages: int
+    dropped: int = 0
+    waiting: int = 0
+
+
+class NodeView(Protocol):
+    """What the Slave API asks of a node, and tells it."""
+
+    def publications(self) -> Iterable[tuple[str, str]]:
+        """Topics with their types (``*`` where unknown) that the node publishes."""
+        ...
+
+    def subscriptions(self) -> Iterable[tuple[str, str]]:
+        """Topics with their types that the node subscribes to."""
+        ...
+
+    def connections(self) -> Iterable[BusConnection]:
+        """All topic connections."""
+        ...
+
+    def address_of(self, topic: str) -> tuple[str, int] | None:
+        """Where subscribers of a published topic connect to; ``None`` if it is not published."""
+        ...
+
+    def publisher_update(self, topic: str, publishers: Sequence[str]) -> None:
+        """The master says who publishes a topic now, by slave API URIs."""
+        ...
+
+    def param_update(self, key: str, value: XmlRpcValue) -> bool:
+        """A parameter has changed (``{}``: deleted); ``False`` if the node does not follow it."""
+        ...
+
+    def shut_down(self, reason: str) -> None:
+        """The master wants the node to end."""
+        ...
+
+
+class SlaveApi:
+    """Dispatches the calls of the Slave API.
+
+    Args:
+        name: The node's global name.
+        master_uri: Of the master that the node is registered at.
+        pid: The process's id.
+        node: What the calls are about.
+    """
+
+    def __init__(self, name: str, master_uri: str, pid: int, node: NodeView) -> None:
+        self.name = name
+        self.master_uri = master_uri
+        self.uri = ""
+        """The node's own slave API; set once its server listens."""
+        self._pid = pid
+        self._node = node
+
+    def dispatch(self, method: str, params: Sequence[XmlRpcValue]) -> RosReply:
+        """Answer one call; mistakes of the caller are answered with code -1, as rospy does.
+
+        Raises:
+            KeyError: There is no such method (the server answers a fault).
+        """
+        arity, default, answer = self._METHODS[method]
+        if not params:
+            return RosReply(_ERROR, "missing required caller_id parameter", default)
+        # The reason of shutdown may be left out, says the wiki; rospy refuses that, which helps nobody.
+        if len(params) - 1 != arity and not (method == "shutdown" and len(params) == 1):
+            return RosReply(_ERROR, "Error: bad call arity", default)
+        if not isinstance(params[0], str):
+            return RosReply(_ERROR, "caller_id must be a string", default)
+        problem = _check(method, params[1:])
+        if problem is not None:
+            return RosReply(_ERROR, problem, default)
+        return answer(self, params[1:])
+
+    def _bus_stats(self, _: Sequence[XmlRpcValue]) -> RosReply:
+        published: dict[str, list[XmlRpcValue]] = {topic: [] for topic, _type in self._node.publications()}
+        subscribed: dict[str, list[XmlRpcValue]] = {topic: [] for topic, _type in self._node.subscriptions()}
+        sent: dict[str, int] = {}
+        for c in self._node.connections():
+            size, messages = min(c.bytes, _INT_MAX), min(c.messages, _INT_MAX)
+            if c.direction == OUTBOUND:
+                published.setdefault(c.topic, []).append([c.number, size, messages, c.connected])
+                sent[c.topic] = min(sent.get(c.topic, 0) + c.bytes, _INT_MAX)
+            else:
+                subscribed.setdefault(c.topic, []).append([c.number, size, messages, -1, c.connected])
+        value: list[XmlRpcValue] = [
+            [[topic, sent.get(topic, 0), links] for topic, links in published.items()],
+            [[topic, links] for topic, links in subscribed.items()],
+            [],
+        ]
+        return RosReply(_SUCCESS, "", value)
+
+    def _bus_info(self, _: Sequence[XmlRpcValue]) -> RosReply:
+        return RosReply(
+            _SUCCESS,
+            "bus info",
+            [
+                [c.number, c.other, c.direction, TCPROS, c.topic, c.connected, c.info]
+                for c in self._node.connections()
+            ],
+        )
+
+    def _master_uri(self, _: Sequence[XmlRpcValue]) -> RosReply:
+        if not self.master_uri:
+            return RosReply(_FAILURE, "master URI not set", "")
+        return RosReply(_SUCCESS, self.master_uri, self.master_uri)
+
+    def _shutdown(self, params: Sequence[XmlRpcValue]) -> RosReply:
+        self._node.shut_down(str(params[0]) if params else "")
+        return RosReply(_SUCCESS, "shutdown", 0)
+
+    def _get_pid(self, _: Sequence[XmlRpcValue]) -> RosReply:
+        return RosReply(_SUCCESS, "", self._pid)
+
+    def _subscriptions(self, _: Sequence[XmlRpcValue]) -> RosReply:
+        return RosReply(_SUCCESS, "subscriptions", [list(pair) for pair in self._node.subscriptions()])
+
+    def _publications(self, _: Sequence[XmlRpcValue]) -> RosReply:
+        return RosReply(_SUCCESS, "publications", [list(pair) for pair in self._node.publications()])
+
+    def _param_update(self, params: Sequence[XmlRpcValue]) -> RosReply:
+        # rosmaster writes the key with a slash at its end, and roscpp cleans it off (trap of every new client).
+        key = str(params[0]).rstrip("/") or "/"
+        if self._node.param_update(key, params[1]):
+            return RosReply(_SUCCESS, "", 0)
+        return RosReply(_ERROR, "not subscribed", 0)
+
+    def _publisher_update(self, params: Sequence[XmlRpcValue]) -> RosReply:
+        topic, publishers = params
+        if isinstance(publishers, list):
+            self._node.publisher_update(str(topic), [str(uri) for uri in publishers])
+        return RosReply(_SUCCESS, "", 0)
+
+    def _request_topic(self, params: Sequence[XmlRpcValue]) -> RosReply:
+        topic, protocols = str(params[0]), params[1]
+        address = self._node.address_of(topic)
+        if address is None:
+            return RosReply(_ERROR, f"Not a publisher of [{topic}]", [])
+        if isinstance(protocols, list) and any(isinstance(p, list) and p and p[0] == TCPROS for p in protocols):
+            return RosReply(_SUCCESS, f"ready on {address[0]}:{address[1]}", [TCPROS, address[0], address[1]])
+        return RosReply(_FAILURE, "no supported protocol implementations", [])
+
+    def _get_name(self, _: Sequence[XmlRpcValue]) -> RosReply:
+        return RosReply(_SUCCESS, "", self.name)
+
+    def _get_uri(self, _: Sequence[XmlRpcValue]) -> RosReply:
+        return RosReply(_SUCCESS, "", self.uri)
+
+    _METHODS: ClassVar[
+        Mapping[str, tuple[int, XmlRpcValue, Callable[[SlaveApi, Sequence[XmlRpcValue]], RosReply]]]
+    ] = {
+        "getBusStats": (0, [], _bus_stats),
+        "getBusInfo": (0, [], _bus_info),
+        "getMasterUri": (0, "", _master_uri),
+        "shutdown": (1, 0, _shutdown),
+        "getPid": (0, -1, _get_pid),
+        "getSubscriptions": (0, [], _subscriptions),
+        "getPublications": (0, [], _publications),
+        "paramUpdate": (2, -1, _param_update),
+        "publisherUpdate": (2, -1, _publisher_update),
+        "requestTopic": (2, [], _request_topic),
+        "getName": (0, "", _get_name),
+        "getUri": (0, "", _get_uri),
+    }
+    """Parameters behind the caller id, the value of an error's reply, and the answer."""
+
+
+METHODS: Final = tuple(SlaveApi._METHODS)  # noqa: SLF001 - the same module
+"""The names of all methods."""
+
+
+def _check(method: str, params: Sequence[XmlRpcValue]) -> str | None:
+    """What is wrong with the parameters behind the caller id, or ``None``."""
+    if method in ("publisherUpdate", "requestTopic"):
+        topic, items = params
+        if not isinstance(topic, str) or not topic:
+            return "topic name must be a non-empty string"
+        if not is_legal_name(topic):
+            return f"topic name [{topic}] contains illegal chars"
+        if not isinstance(items, list):
+            return f"{'publishers' if method == 'publisherUpdate' else 'protocols'} must be a list"
+        if method == "requestTopic" and not items:
+            return "ERROR: parameter [protocols] must be specified and non-empty"
+        if method == "publisherUpdate" and not all(isinstance(uri, str) and "://" in uri for uri in items):
+            return "publishers must be a list of URIs"
+    if method == "paramUpdate" and not (isinstance(params[0], str) and is_global_name(params[0].rstrip("/") or "/")):
+        return "parameter_key must be a global name"
+    return None

@@ -1,0 +1,300 @@
+"""TCPROS: connection headers and message framing (wiki.ros.org/ROS/TCPROS, wiki.ros.org/ROS/Connection%20Header).
+
+Pure: bytes in, values out. Two nodes agree on a connection by one header each way; the publisher alone decides
+whether they fit (``check_subscriber``). Behind the headers come messages, each with its length in front. All
+integers are little-endian 32-bit.
+
+The wiki leaves much open; where it does, this module does what rospy and roscpp 1.15 both accept, and never
+takes a length on trust as they do.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+Header = dict[str, str]
+"""The fields of a connection header. Bytes that are not UTF-8 are kept as lone surrogates (PEP 383)."""
+
+Buffer = bytes | bytearray | memoryview
+
+LENGTH: Final = struct.Struct("<I")
+"""The length in front of headers, fields and messages."""
+ANY: Final = "*"
+"""The type or md5 sum of a subscriber that takes whatever is published."""
+_SHOWN: Final = 200
+
+
+class MalformedHeader(RemoteProtocolError):  # noqa: N818 - the name says what happened
+    """The bytes are not a connection header."""
+
+
+class MalformedStream(RemoteProtocolError):  # noqa: N818 - the name says what happened
+    """The bytes where a message's length must be are no length: the stream is out of step."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicDescription:
+    """What a publisher says about its messages.
+
+    Args:
+        type: ``package/Name``.
+        md5sum: Of the definition, 32 hexadecimal digits.
+        definition: The full text with all embedded types, as it came from the publisher; may be empty.
+        latching: Whether the last message is kept for later subscribers.
+    """
+
+    type: str
+    md5sum: str
+    definition: str
+    latching: bool = False
+
+    @classmethod
+    def from_header(cls, fields: Mapping[str, str]) -> TopicDescription:
+        """Read a publisher's reply header; fields that it need not have are empty."""
+        return cls(
+            fields.get("type", ""),
+            fields.get("md5sum", ""),
+            fields.get("message_definition", ""),
+            fields.get("latching") == "1",
+        )
+
+    def __str__(self) -> str:
+        """``type/md5``, as ROS writes it; safe to log."""
+        return f"{printable(self.type)}/{printable(self.md5sum)}"
+
+
+def printable(text: str) -> str:
+    """What a peer sent, made safe for logs and terminals: no control characters, no surrogates, not too long."""
+    shown = text if len(text) <= _SHOWN else text[:_SHOWN] + "…"
+    return "".join(c if c.isprintable() else "�" for c in shown)
+
+
+# --- header codec ---------------------------------------------------------------------------------------------
+
+
+def encode_header(fields: Mapping[str, str]) -> bytes:
+    """A header with its length, its fields sorted by name as rospy does."""
+    parts = []
+    for key in sorted(fields):
+        field = f"{key}={fields[key]}".encode(errors="surrogateescape")
+        parts.append(LENGTH.pack(len(field)) + field)
+    body = b"".join(parts)
+    return LENGTH.pack(len(body)) + body
+
+
+def decode_header(body: Buffer) -> Header:
+    """Read the fields of a header whose own length was taken off.
+
+    A field is split at its first ``=`` and blanks around its name are taken off, as rospy does; of two fields
+    with one name the last one counts.
+
+    Raises:
+        MalformedHeader: A field is empty, has no ``=``, or is longer than what is left.
+    """
+    fields: Header = {}
+    view = memoryview(body)
+    start = 0
+    while start < len(view):
+        if len(view) - start < LENGTH.size:
+            raise MalformedHeader(f"connection header ends within a length, {len(view) - start} bytes left over")
+        (size,) = LENGTH.unpack_from(view, start)
+        start += LENGTH.size
+        if size == 0:
+            raise MalformedHeader("connection header has a field of length 0")
+        if size > len(view) - start:
+            raise MalformedHeader(f"connection header field of {size} bytes where {len(view) - start} are left")
+        field = str(view[start : start + size], "utf-8", "surrogateescape")
+        start += size
+        key, separator, value = field.partition("=")
+        if not separator:
+            raise MalformedHeader(f"connection header field without '=': {printable(field)!r}")
+        fields[key.strip()] = value
+    return fields
+
+
+def parse_header(data: Buffer) -> tuple[Header | None, int, int]:
+    """Read a header from the front of what has come so far.
+
+    Returns:
+        ``(fields, consumed, wanted)``: without enough bytes ``(None, 0, wanted)``, where ``wanted`` is how many
+        there must be in all.
+
+    Raises:
+        LimitExceeded: The header claims more than ``limits.TCPROS_HEADER_MAX``.
+        MalformedHeader: See ``decode_header``.
+    """
+    if len(data) < LENGTH.size:
+        return None, 0, LENGTH.size
+    (size,) = LENGTH.unpack_from(data)
+    if size > limits.TCPROS_HEADER_MAX:
+        raise LimitExceeded("connection header", size, limits.TCPROS_HEADER_MAX)
+    end = LENGTH.size + size
+    if len(data) < end:
+        return None, 0, end
+    return decode_header(memoryview(data)[LENGTH.size : end]), end, LENGTH.size
+
+
+# --- messages -------------------------------------------------------------------------------------------------
+
+
+def frame_message(payload: Buffer) -> bytes:
+    """A message with its length in front.
+
+    Raises:
+        ValueError: It is longer than ``limits.TCPROS_MESSAGE_MAX``.
+    """
+    if len(payload) > limits.TCPROS_MESSAGE_MAX:
+        raise ValueError(f"message of {len(payload)} bytes exceeds the limit of {limits.TCPROS_MESSAGE_MAX}")
+    return b"".join((LENGTH.pack(len(payload)), payload))
+
+
+def split_messages(data: memoryview) -> tuple[list[memoryview], int, int]:
+    """Take all whole messages off the front of what has come so far.
+
+    Returns:
+        ``(messages, consumed, wanted)``: each message is a view into ``data`` with its 4-byte length in front;
+        ``wanted`` counts from behind the consumed bytes, as ``runtime.stream`` asks for.
+
+    Raises:
+        LimitExceeded: The first message claims more than ``limits.TCPROS_MESSAGE_MAX``. Whole messages before such
+            a one are returned first, as before the next one.
+        MalformedStream: The first message claims more than ``limits.TCPROS_LENGTH_MAX``: those bytes are no length.
+    """
+    messages: list[memoryview] = []
+    start = 0
+    filled = len(data)
+    while filled - start >= LENGTH.size:
+        (size,) = LENGTH.unpack_from(data, start)
+        if size > limits.TCPROS_MESSAGE_MAX:
+            if messages:
+                break
+            if size > limits.TCPROS_LENGTH_MAX:
+                text = f"a message's length of {size} bytes cannot be (the most is {limits.TCPROS_LENGTH_MAX}): "
+                raise MalformedStream(text + "the publisher's stream is corrupt")
+            raise LimitExceeded("message", size, limits.TCPROS_MESSAGE_MAX)
+        end = start + LENGTH.size + size
+        if end > filled:
+            return messages, start, end - start
+        messages.append(data[start:end])
+        start = end
+    return messages, start, LENGTH.size
+
+
+# --- who fits whom --------------------------------------------------------------------------------------------
+
+
+def subscriber_header(
+    topic: str, caller_id: str, *, type_name: str = ANY, md5sum: str = ANY, definition: str = "", nodelay: bool = True
+) -> Header:
+    """What a subscriber says first; the definition is left out where it is not known, as roscpp does."""
+    fields = {
+        "callerid": caller_id,
+        "md5sum": md5sum,
+        "tcp_nodelay": "1" if nodelay else "0",
+        "topic": topic,
+        "type": type_name,
+    }
+    if definition:
+        fields["message_definition"] = definition
+    return fields
+
+
+def publisher_header(topic: str, caller_id: str, description: TopicDescription) -> Header:
+    """What a publisher answers.
+
+    Raises:
+        ValueError: The description has ``*`` for its type or md5 sum. Such an answer ends up in bags, and a roscpp
+            subscriber hands it on to every other publisher.
+    """
+    if ANY in (description.type, description.md5sum):
+        raise ValueError(f"a publisher of {topic} cannot have the type {description}")
+    return {
+        "callerid": caller_id,
+        "latching": "1" if description.latching else "0",
+        "md5sum": description.md5sum,
+        "message_definition": description.definition,
+        "topic": topic,
+        "type": description.type,
+    }
+
+
+def error_header(text: str) -> Header:
+    """What is answered to a header that does not fit; the connection is closed behind it."""
+    return {"error": text}
+
+
+def check_request(fields: Mapping[str, str]) -> str | None:
+    """Whether a header that came in can be answered at all: an error text for the other side, or ``None``."""
+    if "error" in fields:
+        return f"an error was sent where a request was expected: {printable(fields['error'])}"
+    if "topic" not in fields and "service" not in fields:
+        return "neither a 'topic' nor a 'service' field in the connection header"
+    for required in ("md5sum", "callerid"):
+        if required not in fields:
+            return f"required field '{required}' is missing in the connection header"
+    return None
+
+
+def check_subscriber(
+    fields: Mapping[str, str], topic: str, caller_id: str, description: TopicDescription | None
+) -> str | None:
+    """Whether a subscriber may have a publisher's messages.
+
+    The md5 sum alone decides: a subscriber that names another type with the right sum is served, as rospy and
+    roscpp do, and ``*`` matches all.
+
+    Args:
+        fields: The subscriber's header.
+        topic: What is published, compared as it is.
+        caller_id: The publisher's name, for the text.
+        description: What the publisher says, or ``None`` while that is not known: then only the rest is checked.
+
+    Returns:
+        ``None``, or the text of the error header.
+    """
+    problem = check_request(fields)
+    if problem is not None:
+        return problem
+    if fields.get("topic") != topic:
+        return f"[{caller_id}] is not a publisher of [{printable(fields.get('topic', ''))}]"
+    if description is None or fields["md5sum"] in (ANY, description.md5sum):
+        return None
+    wanted = f"{fields.get('type', '?')}/{fields['md5sum']}"
+    return (
+        f"client [{printable(fields['callerid'])}] wants topic {topic} to have type/md5sum [{printable(wanted)}], "
+        f"but publisher [{caller_id}] has [{description}]"
+    )
+
+
+def check_publisher(fields: Mapping[str, str], type_name: str = ANY, md5sum: str = ANY) -> str | None:
+    """Whether a publisher's reply may be believed: an error text, or ``None``.
+
+    rospy and roscpp only look whether the fields are there and then deliver what comes; we compare.
+
+    Args:
+        fields: The reply header.
+        type_name: The type that we asked for, or ``*``; it is compared where the md5 sum is not.
+        md5sum: The md5 sum that we asked for, or ``*``.
+    """
+    if "error" in fields:
+        return printable(fields["error"])
+    for required in ("type", "md5sum"):
+        if not fields.get(required):
+            return f"required field '{required}' is missing in the publisher's reply"
+    if ANY in (fields["type"], fields["md5sum"]):
+        return "the publisher's reply has '*' where a type or md5 sum must be"
+    another = type_name not in (ANY, fields["type"]) if md5sum == ANY else md5sum != fields["md5sum"]
+    if another:
+        return (
+            f"the publisher has [{printable(fields['type'])}/{printable(fields['md5sum'])}], "
+            f"not [{type_name}/{md5sum}]"
+        )
+    return None

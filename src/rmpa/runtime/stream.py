@@ -1,0 +1,553 @@
+"""A connected TCP socket on the data path: one growing read buffer, one ``sendmsg`` a write, a bounded outbox.
+
+asyncio's own transports join or copy what they cannot send at once and have no bound with a policy; this one
+keeps to ``core.outbox`` and costs one system call a message each way. A large message is sent in parts while it
+still arrives: ``open`` and ``extend``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import fcntl
+import logging
+import math
+import socket
+import sys
+import termios
+from collections.abc import Callable, Sequence
+from typing import Final, cast
+
+from rmpa.core import limits
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.outbox import ABORT, FIRST, LAST, URGENT, Framer, Outbox, QueuedMessage
+from rmpa.runtime.segments import SegmentedSocket
+
+_log = logging.getLogger(__name__)
+
+_FIRST_BUFFER: Final = 64 * limits.KIB
+_BUSY_BUFFER: Final = 256 * limits.KIB
+_KEPT_BUFFER: Final = 4 * limits.MIB
+_IOV: Final = 512
+_WRITES: Final = 16
+_CORK_ABOVE: Final = 512
+_CORK_MESSAGES: Final = 128
+_CORK_BYTES: Final = 512 * limits.KIB
+_PART: Final = limits.MIB
+
+Buffer = bytes | bytearray | memoryview
+OnBytes = Callable[[memoryview], tuple[int, int]]
+OnClose = Callable[[Exception | None], None]
+
+_corked: list[Stream] | None = None
+"""While a read is dealt with: the streams that keep messages for its end; see ``Stream.send``."""
+
+
+class Stream:
+    """Reads and writes one socket by the loop's readiness callbacks.
+
+    Args:
+        sock: Connected, non-blocking; owned by the stream from here on.
+        on_bytes: Called with all bytes not yet consumed; returns ``(consumed, wanted)``: how many it took, and
+            how many there must be in all behind those before it can take more (0 if it cannot say). The view is
+            only valid during the call. A ``RemoteProtocolError`` raised here closes the stream with it; any other
+            exception is a bug, is logged, and closes the stream too.
+        on_close: Called once, from the loop and never from within a method, when the socket is gone: with
+            ``None`` after an orderly end, with the error otherwise. Not called after ``close()``.
+        outbox: The bounds for what waits; what waits in it already is sent first.
+        frame: Makes the header of each fragment of an opened message; without it its bytes go out as they are.
+            The outbox has the same one.
+        keep: What waits when the socket is gone stays in the outbox, for the next one.
+        segment: Bytes that one packet may carry, ``None`` for as many as the kernel likes; see ``segments``.
+    """
+
+    def __init__(
+        self,
+        sock: socket.socket,
+        *,
+        on_bytes: OnBytes,
+        on_close: OnClose,
+        outbox: Outbox,
+        frame: Framer | None = None,
+        keep: bool = False,
+        segment: int | None = None,
+    ) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._sock: socket.socket | SegmentedSocket = sock if segment is None else SegmentedSocket(sock, segment)
+        self._on_bytes = on_bytes
+        self._on_close = on_close
+        self._outbox = outbox
+        self._frame = frame
+        self._keep = keep
+        self._buffer = bytearray(_FIRST_BUFFER)
+        self._view = memoryview(self._buffer)
+        self._filled = 0
+        self._wanted = 0
+        self._writing = False
+        self._finishing = False
+        self._kept: list[tuple[Sequence[Buffer], int, bool]] = []
+        self._kept_bytes = 0
+        self._closed = False
+        self._drained: asyncio.Future[None] | None = None
+        self._report: asyncio.Handle | None = None
+        self.bytes_in = 0
+        self.bytes_out = 0
+        self.last_in = self._loop.time()
+        """When bytes last came (``loop.time()``), whether or not ``on_bytes`` was called for them."""
+        self.resumed_at = -math.inf
+        """When this process last looked, and found nothing, before bytes ended a silence of more than
+        ``limits.STALE_AGE`` (``loop.time()``): what was on its way then was held up, what is younger may have been
+        kept waiting by ourselves."""
+        self._fd = sock.fileno()
+        # An agent's loop has a short way for the data path; elsewhere (tools, tests) the usual one does.
+        add_reader = getattr(self._loop, "add_direct_reader", self._loop.add_reader)
+        add_reader(self._fd, self._readable)
+        if outbox:
+            self._wait_for_room()
+
+    @property
+    def closed(self) -> bool:
+        """Whether the socket is gone."""
+        return self._closed
+
+    @property
+    def pending_bytes(self) -> int:
+        """Bytes that wait for the socket."""
+        return self._outbox.pending_bytes
+
+    @property
+    def unacknowledged(self) -> int:
+        """Bytes in the kernel that the other side has not acknowledged, those that have not left included."""
+        if self._closed:
+            return 0
+        return int.from_bytes(fcntl.ioctl(self._fd, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
+
+    @property
+    def outbox(self) -> Outbox:
+        """What waits, and what was dropped."""
+        return self._outbox
+
+    def segment(self, size: int) -> None:
+        """Send in packets of at most ``size`` bytes from now on."""
+        if isinstance(self._sock, SegmentedSocket):
+            self._sock.size = size
+        else:
+            self._sock = SegmentedSocket(self._sock, size)
+
+    def feed(self, data: Buffer) -> None:
+        """Take bytes that somebody else read from the socket before the stream had it."""
+        if self._closed:
+            return
+        self._reserve(self._filled + len(data))
+        self._view[self._filled : self._filled + len(data)] = data
+        self._filled += len(data)
+        self.bytes_in += len(data)
+        self._deliver()
+
+    def send(self, parts: Sequence[Buffer], key: int) -> int:
+        """Send one message made of ``parts``, or queue what the socket does not take.
+
+        Args:
+            parts: In order, views of single bytes. From within ``on_bytes`` they may be views of what was read:
+                messages that one read brings for one stream are sent in one call when it is done with. Elsewhere
+                they are not kept after the call.
+            key: Which flow it belongs to, for the overflow policy; ``URGENT`` is never dropped.
+
+        Returns:
+            How many older messages, of any key, were dropped to make room.
+        """
+        if self._closed or self._finishing:
+            return 0
+        if self._writing:
+            return self._queue(b"".join(parts), key)
+        if _corked is not None:
+            self._cork(parts, key)
+            return 0
+        return self._send_now(parts, key)
+
+    def send_mark(self, data: bytes, key: int) -> None:
+        """Send a mark behind the messages of a key; unlike those it is never dropped."""
+        if self._closed or self._finishing:
+            return
+        if self._kept:
+            self._uncork()
+        if self._writing:
+            self._outbox.push(data, key, self._loop.time(), pinned=True)
+        else:
+            self._send_now((data,), key)
+
+    def adopt(self, outbox: Outbox, frame: Framer | None) -> None:
+        """Send from another outbox from now on, first what waits in it already; it outlives the stream."""
+        self._uncork()
+        rest = b"".join(self._outbox.head(1 << 20))
+        self._outbox.clear()
+        outbox.prepend(rest)
+        self._outbox = outbox
+        self._frame = frame
+        self._keep = True
+        self.pump()
+
+    def _send_now(self, parts: Sequence[Buffer], key: int, part: bool = False) -> int:
+        try:
+            sent = self._sock.sendmsg(parts)
+        except (BlockingIOError, InterruptedError):
+            sent = 0
+        except OSError as error:
+            self._lost(error)
+            return 0
+        self.bytes_out += sent
+        size = 0
+        for buffer in parts:
+            size += len(buffer)
+        if sent == size:
+            return 0
+        if sent:
+            sent = self._press(parts, sent, size)
+            if sent == size or self._closed:
+                return 0
+        self._wait_for_room()
+        if not sent and not part:
+            return self._queue(b"".join(parts), key)
+        self._outbox.push_rest(_behind(parts, sent), key)
+        return 0
+
+    def _press(self, parts: Sequence[Buffer], sent: int, size: int) -> int:
+        """Go on with what the socket took in part: it often has room again at once, and to queue is to copy.
+
+        Returns:
+            How many bytes have gone in all.
+        """
+        while sent < size:
+            try:
+                more = self._sock.sendmsg(_rest(parts, sent))
+            except (BlockingIOError, InterruptedError):
+                break
+            except OSError as error:
+                self._lost(error)
+                break
+            sent += more
+            self.bytes_out += more
+        return sent
+
+    def _wait_for_room(self) -> None:
+        self._writing = True
+        self._loop.add_writer(self._fd, self._writable)
+
+    # --- messages in parts ----------------------------------------------------------------------------------
+
+    def open(self, key: int, size: int, sequence: int = 0, stamp_ns: int = 0) -> QueuedMessage:
+        """Begin a message of ``size`` bytes whose bytes follow by ``extend``, before the next one of its key."""
+        return QueuedMessage(key, size, sequence, stamp_ns, self._loop.time())
+
+    def extend(self, parcel: QueuedMessage, data: Buffer) -> int:
+        """Send further bytes of a message, or queue what the socket does not take; return as for ``send``.
+
+        ``data`` is not kept after the call. Bytes of a message that was dropped are ignored.
+        """
+        if self._closed or self._finishing or parcel.dropped:
+            return 0
+        view = memoryview(data)
+        dropped = 0
+        while len(view) > _PART:
+            dropped += self._extend(parcel, view[:_PART])
+            view = view[_PART:]
+        return dropped + self._extend(parcel, view)
+
+    def _extend(self, parcel: QueuedMessage, view: memoryview) -> int:
+        if self._writing:
+            return self._outbox.extend(parcel, bytes(view))
+        if self._outbox.waiting(parcel.key):
+            # Its first bytes had to wait, and the outbox counts them.
+            if self._kept:
+                self._uncork()
+            dropped = self._outbox.extend(parcel, bytes(view))
+            self._wait_for_room()
+            self._writable()
+            return dropped
+        parts: list[Buffer] = self._framed(parcel, view) if self._frame is not None else [view]
+        parcel.sent += len(view)
+        if _corked is not None:
+            self._cork(parts, parcel.key, part=True)
+            return 0
+        return self._send_now(parts, parcel.key, part=True)
+
+    def abandon(self, parcel: QueuedMessage) -> bool:
+        """The rest of a message will never come.
+
+        Returns:
+            Whether the other side holds half of it and cannot be told: the connection must be closed.
+        """
+        if self._closed or parcel.sent == parcel.size:
+            return False
+        if self._kept:
+            self._uncork()
+        waits = self._writing or self._outbox.waiting(parcel.key)
+        if not waits and parcel.sent and not parcel.dropped and self._frame is not None:
+            parcel.dropped = True
+            self._send_now([self._frame(parcel, 0, LAST | ABORT)], parcel.key)
+            return False
+        torn = self._outbox.abandon(parcel)
+        self.pump()
+        return torn
+
+    def pump(self) -> None:
+        """Send what was put into the outbox from elsewhere."""
+        if self._kept:
+            self._uncork()
+        if self._outbox and not self._writing and not self._closed:
+            self._wait_for_room()
+
+    def _framed(self, parcel: QueuedMessage, view: memoryview) -> list[Buffer]:
+        """The bytes with a header in front of each fragment."""
+        frame = cast("Framer", self._frame)
+        parts: list[Buffer] = []
+        size = len(view)
+        for start in range(0, size, limits.FRAGMENT_BYTES):
+            part = view[start : start + limits.FRAGMENT_BYTES]
+            first = FIRST if parcel.sent + start == 0 else 0
+            last = LAST if parcel.sent + start + len(part) == parcel.size else 0
+            parts += (frame(parcel, len(part), first | last), part)
+        return parts
+
+    # --- the end --------------------------------------------------------------------------------------------
+
+    def _cork(self, parts: Sequence[Buffer], key: int, *, part: bool = False) -> None:
+        """Keep a message until the read that it came from is done with; what is kept is sent in one call."""
+        cast("list[Stream]", _corked).append(self)
+        self._kept.append((parts, key, part))
+        for buffer in parts:
+            self._kept_bytes += len(buffer)
+        if len(self._kept) >= _CORK_MESSAGES or self._kept_bytes >= _CORK_BYTES:
+            self._uncork()
+
+    def _uncork(self) -> None:
+        kept, self._kept = self._kept, []
+        size, self._kept_bytes = self._kept_bytes, 0
+        if self._closed or not kept:
+            return
+        if self._writing or self._outbox:
+            self._keep_rest(kept, 0)  # it must not get into the middle of what the outbox sends
+            return
+        if len(kept) == 1:
+            self._send_now(*kept[0])
+            return
+        try:
+            sent = self._sock.sendmsg([buffer for parts, _, _ in kept for buffer in parts])
+        except (BlockingIOError, InterruptedError):
+            sent = 0
+        except OSError as error:
+            self._lost(error)
+            return
+        self.bytes_out += sent
+        if 0 < sent < size:
+            sent = self._press([buffer for parts, _, _ in kept for buffer in parts], sent, size)
+        if sent < size and not self._closed:
+            self._keep_rest(kept, sent)
+
+    def _keep_rest(self, kept: list[tuple[Sequence[Buffer], int, bool]], sent: int) -> None:
+        """Queue what a batch's ``sendmsg`` did not take: the rest of one message perhaps, then whole ones.
+
+        What is in front of a part of a message stays in front of it: a part has its header and no other turn.
+        """
+        self._wait_for_room()
+        last_part = max((index for index, (_, _, part) in enumerate(kept) if part), default=-1)
+        for index, (parts, key, _) in enumerate(kept):
+            length = sum(map(len, parts))
+            if sent >= length:
+                sent -= length
+            elif sent > 0:
+                self._outbox.push_rest(_behind(parts, sent), key)
+                sent = 0
+            elif index <= last_part:
+                self._outbox.commit(b"".join(parts))
+            else:
+                self._queue(b"".join(parts), key)
+
+    def close(self) -> None:
+        """Close at once; what still waits is lost. ``on_close`` is not called."""
+        self._uncork()
+        if self._report is not None:
+            self._report.cancel()
+            self._report = None
+        self._shut()
+
+    def finish(self) -> None:
+        """Send no more: when all that waits has left, the other side reads an end; ours goes on reading.
+
+        Not for ROS connections: rospy and roscpp take a half-closed socket for dead.
+        """
+        if not self._finishing:
+            self._uncork()
+            self._finishing = True
+            if not self._writing:
+                self._shut_write()
+
+    async def drained(self, within: float = limits.DRAIN_TIMEOUT) -> None:
+        """Wait until all that was sent has left, the stream is closed, or ``within`` seconds are over."""
+        if self._closed or not self._writing:
+            return
+        if self._drained is None or self._drained.done():
+            self._drained = self._loop.create_future()
+        await asyncio.wait([self._drained], timeout=within)
+
+    def _queue(self, message: bytes, key: int) -> int:
+        if key == URGENT:
+            self._outbox.push_urgent(message)
+            return 0
+        return self._outbox.push(message, key, self._loop.time())
+
+    def _shut(self) -> None:
+        if self._closed:
+            return
+        self._closed = True
+        self._loop.remove_reader(self._fd)
+        if self._writing:
+            self._loop.remove_writer(self._fd)
+        self._sock.close()
+        # Nobody is called any more: who holds the stream would stay with it as a cycle until the collector looks.
+        self._on_bytes, self._on_close = _no_bytes, _no_close
+        self._view = memoryview(b"")
+        self._buffer = bytearray()
+        if not self._keep:
+            self._outbox.clear()
+        self._done_draining()
+
+    def _shut_write(self) -> None:
+        if not self._closed:
+            with contextlib.suppress(OSError):  # the other side may be gone; the reader will notice
+                self._sock.shutdown(socket.SHUT_WR)
+
+    def _done_draining(self) -> None:
+        if self._drained is not None and not self._drained.done():
+            self._drained.set_result(None)
+
+    def _lost(self, error: Exception | None) -> None:
+        if not self._closed:
+            on_close = self._on_close
+            self._shut()
+            # Not from here: this may be a ``send`` in the middle of the owner's loop over its streams.
+            self._report = self._loop.call_soon(self._report_end, on_close, error)
+
+    def _report_end(self, on_close: OnClose, error: Exception | None) -> None:
+        self._report = None
+        on_close(error)
+
+    def _reserve(self, size: int) -> None:
+        if size > len(self._buffer):
+            buffer = bytearray(size)
+            buffer[: self._filled] = self._view[: self._filled]
+            self._buffer = buffer
+            self._view = memoryview(buffer)
+
+    def _readable(self) -> None:
+        try:
+            count = self._sock.recv_into(self._view[self._filled :])
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError as error:
+            self._lost(error)
+            return
+        if count == 0:
+            self._lost(None)
+            return
+        now = self._loop.time()
+        if now - self.last_in > limits.STALE_AGE:
+            # Only a silence in which we looked counts: not that this process got no CPU.
+            looked = getattr(self._loop, "looked_before", now)
+            if looked - self.last_in > limits.STALE_AGE:
+                self.resumed_at = looked
+        self.last_in = now
+        self.bytes_in += count
+        self._filled += count
+        if self._filled == _FIRST_BUFFER == len(self._buffer):
+            self._reserve(_BUSY_BUFFER)  # more is waiting: large messages, in fewer reads from now on
+        if self._filled >= self._wanted or self._filled == len(self._buffer):
+            self._deliver()
+
+    def _deliver(self) -> None:
+        global _corked  # noqa: PLW0603 - one loop, one thread: whoever reads holds the cork
+        outer = _corked
+        # A few bytes are one message, or two, and are handed on at once; not past what an outer read keeps.
+        corked: list[Stream] = []
+        _corked = corked if self._filled > _CORK_ABOVE or outer is not None else None
+        try:
+            consumed, wanted = self._on_bytes(self._view[: self._filled])
+        except RemoteProtocolError as error:
+            self._lost(error)
+            return
+        except Exception as error:  # noqa: BLE001 - a callback's top: the same bytes must not be offered for ever
+            _log.error("! a reader of bytes failed; its connection is closed", exc_info=error)
+            self._lost(error)
+            return
+        finally:
+            # Before anything moves in the buffer that the messages are views of.
+            for stream in corked:
+                stream._uncork()  # noqa: SLF001 - its own class
+            _corked = outer
+        if self._closed:
+            return
+        rest = self._filled - consumed
+        if consumed and rest:
+            # Forwards within one buffer: memoryview assignment is a memmove, so an overlap is safe.
+            self._view[:rest] = self._view[consumed : self._filled]
+        self._filled = rest
+        self._wanted = wanted
+        if rest == len(self._buffer) or wanted > len(self._buffer):
+            # What a peer only claims is not allocated: the buffer grows with what has really come.
+            self._reserve(min(max(wanted, 2 * rest), max(4 * rest, _FIRST_BUFFER)))
+        elif rest <= _FIRST_BUFFER // 2 and wanted <= _FIRST_BUFFER and len(self._buffer) > _KEPT_BUFFER:
+            view = self._view
+            self._buffer = bytearray(_FIRST_BUFFER)
+            self._view = memoryview(self._buffer)
+            self._view[:rest] = view[:rest]
+
+    def _writable(self) -> None:
+        """Send what waits until the socket takes no more; but let others have their turn too."""
+        for _ in range(_WRITES):
+            # All that waited may have been too old; then there are no parts.
+            parts = self._outbox.head(_IOV, self._loop.time())
+            try:
+                sent = self._sock.sendmsg(parts) if parts else 0
+            except (BlockingIOError, InterruptedError):
+                return
+            except OSError as error:
+                self._lost(error)
+                return
+            self.bytes_out += sent
+            self._outbox.consumed(sent)
+            if not self._outbox:
+                self._all_sent()
+                return
+            if sent < sum(map(len, parts)):
+                return
+
+    def _all_sent(self) -> None:
+        self._writing = False
+        self._loop.remove_writer(self._fd)
+        if self._finishing:
+            self._shut_write()
+        self._done_draining()
+
+
+def _rest(parts: Sequence[Buffer], sent: int) -> list[memoryview]:
+    """What is left of ``parts`` behind the first ``sent`` bytes."""
+    left: list[memoryview] = []
+    for part in parts:
+        if sent < len(part):
+            left.append(memoryview(part)[sent:])
+        sent = max(0, sent - len(part))
+    return left
+
+
+def _no_bytes(view: memoryview) -> tuple[int, int]:
+    """Of a closed stream."""
+    return len(view), 0
+
+
+def _no_close(_error: Exception | None) -> None:
+    """The same."""
+
+
+def _behind(parts: Sequence[Buffer], sent: int) -> bytes:
+    """The same, copied once."""
+    return b"".join(_rest(parts, sent))

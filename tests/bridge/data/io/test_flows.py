@@ -1,0 +1,829 @@
+"""What happens to each message on its way through the bridge, with a clock that is told the time."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rmpa.bridge.data.io.flows import ExportFlow, ImportFlow
+from rmpa.bridge.data.io.link_time import LinkTime
+from rmpa.bridge.data.qos_events import QosEventKind
+from rmpa.core import limits
+from rmpa.core.contract import Contract, Durability, Priority, Reliability
+from rmpa.core.counters import Counters
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.core.outbox import ABORT, FIRST, LAST
+from tests.bridge.io.doubles import WALL, Clock, Link, Outlet, running
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+BEST = Contract()
+BULKY = Contract(priority=Priority.HIGH)
+"""Large messages need no change of the lane."""
+RELIABLE = Contract(reliability=Reliability.RELIABLE)
+KEPT = Contract(durability=Durability.TRANSIENT_LOCAL)
+BIG = 200_000
+WRAP = 1 << 32
+
+
+@pytest.fixture(autouse=True)
+def clock() -> Iterator[Clock]:
+    with running(Clock()) as made:
+        yield made
+
+
+def framed(payload: bytes) -> bytes:
+    """A message with its length in front."""
+    return len(payload).to_bytes(4, "little") + payload
+
+
+def give(flow: ExportFlow, payload: bytes, *, cut: int = 70_000) -> None:
+    """A large message from a publisher, as it arrives."""
+    flow.begin(len(payload))
+    for start in range(0, len(payload), cut):
+        buffer = bytearray(payload[start : start + cut])
+        flow.part(memoryview(buffer))
+        buffer[:] = b"x" * len(buffer)  # the stream's buffer is used again
+
+
+def got(link: Link) -> list[tuple[int, bytes]]:
+    return [(sequence, payload) for _, sequence, payload in link.sent]
+
+
+# --- out ------------------------------------------------------------------------------------------------------
+
+
+def test_each_peer_gets_one_copy_numbered_for_itself(clock: Clock) -> None:
+    flow, one, two = ExportFlow(), Link(), Link()
+    flow.add(1, one, 7, BEST, 0)
+    flow.message(memoryview(b"a"))
+    flow.add(2, two, 9, BEST, 0)
+    clock.advance(1.0)
+    flow.message(memoryview(b"b"))
+    assert got(one) == [(1, b"a"), (2, b"b")]
+    assert got(two) == [(1, b"b")]
+    assert (set(one.routes), set(two.routes)) == ({7}, {9})
+    assert one.stamps[1] == two.stamps[0] == WALL + 1001 * 10**9
+    assert (flow.messages, flow.bytes) == (2, 2)
+
+
+def test_a_peer_has_one_leg_and_the_newer_one_counts() -> None:
+    flow, link = ExportFlow(), Link()
+    old = flow.add(1, link, 7, BEST, 0)
+    flow.add(1, link, 8, BEST, 0)
+    flow.message(memoryview(b"a"))
+    assert link.routes == [8]
+    assert old.link is None
+    flow.remove(1)
+    flow.remove(1)
+    flow.message(memoryview(b"b"))
+    assert link.routes == [8]
+    assert flow.by_peer == {}
+
+
+def test_a_late_peer_gets_the_latched_message_once_and_before_later_ones() -> None:
+    flow, one, two = ExportFlow(), Link(), Link()
+    flow.latch()
+    flow.add(1, one, 7, BEST, 0)
+    buffer = bytearray(b"map")
+    flow.message(memoryview(buffer))
+    buffer[:] = b"xxx"  # the stream's buffer is used again
+    flow.add(2, two, 9, BEST, 0)
+    flow.message(memoryview(b"new"))
+    assert got(two) == [(1, b"map"), (2, b"new")]
+    assert got(one) == [(1, b"map"), (2, b"new")]
+    assert two.stamps[0] == one.stamps[0], "as old as it is"
+
+
+def test_a_source_that_is_left_keeps_nothing() -> None:
+    flow, one, late = ExportFlow(), Link(), Link()
+    flow.latch()
+    flow.add(1, one, 7, BEST, 0)
+    flow.message(memoryview(b"map"))
+    flow.close()
+    flow.message(memoryview(b"new"))
+    assert got(one) == [(1, b"map")]
+    assert flow.by_peer == {}
+    flow = ExportFlow()
+    flow.latch()
+    flow.message(memoryview(b"map"))
+    flow.close()
+    flow.add(2, late, 9, BEST, 0)
+    assert late.sent == []
+
+
+def test_what_is_not_latched_is_not_replayed() -> None:
+    flow, link = ExportFlow(), Link()
+    flow.add(9, Link(), 7, BEST, 0)
+    flow.message(memoryview(b"old"))
+    flow.add(1, link, 7, BEST, 0)
+    assert link.sent == []
+
+
+def test_each_peer_gets_as_many_kept_messages_as_its_contract_says() -> None:
+    flow = ExportFlow()
+    flow.add(1, Link(), 7, KEPT, 0)
+    for n in range(3):
+        flow.message(memoryview(bytes([n])))
+    deep, deeper, plain = Link(), Link(), Link()
+    flow.add(2, deep, 7, Contract(durability=Durability.TRANSIENT_LOCAL, depth=3), 0)
+    assert got(deep) == [(1, b"\2")], "nobody had asked for more in time"
+    for n in range(3, 6):
+        flow.message(memoryview(bytes([n])))
+    flow.add(3, deeper, 7, Contract(durability=Durability.TRANSIENT_LOCAL, depth=2), 0)
+    assert got(deeper) == [(1, b"\4"), (2, b"\5")]
+    flow.add(4, deep, 8, Contract(durability=Durability.TRANSIENT_LOCAL, depth=3), 0)
+    assert [payload for _, _, payload in deep.sent[-3:]] == [b"\3", b"\4", b"\5"]
+    flow.add(5, plain, 7, BEST, 0)
+    assert plain.sent == [], "an old command is not for who asked for no history"
+    flow.latch()
+    flow.add(5, plain, 7, BEST, 0)
+    assert got(plain) == [(1, b"\5")], "but a latching publisher's is for everybody"
+
+
+def test_no_contract_keeps_more_than_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "LATCHED_MAX", 5)
+    flow, late = ExportFlow(), Link()
+    deep = Contract(durability=Durability.TRANSIENT_LOCAL, depth=100)
+    flow.add(1, Link(), 7, deep, 0)
+    for n in range(20):
+        flow.message(memoryview(bytes([n])))
+    flow.add(2, late, 7, deep, 0)
+    assert [payload[0] for _, _, payload in late.sent] == [15, 16, 17, 18, 19]
+
+
+def test_drops_are_counted() -> None:
+    flow, link = ExportFlow(), Link()
+    flow.add(1, link, 7, BULKY, 0)
+    link.drops.extend([3, 0, 1, 1])
+    flow.message(memoryview(b"a"))
+    flow.message(memoryview(b"b"))
+    give(flow, bytes(BIG), cut=150_000)
+    assert flow.dropped == 5
+
+
+def test_parts_go_to_whom_can_take_them_and_the_whole_to_the_others() -> None:
+    flow, streams, whole, slow = ExportFlow(), Link(), Link(), Link()
+    flow.add(1, streams, 7, BULKY, 0)
+    flow.add(2, whole, 7, RELIABLE, 4)
+    flow.add(3, slow, 7, Contract(max_rate=1.0), 0)
+    flow.message(memoryview(b"small"))
+    payload = bytes(range(256)) * 1000
+    flow.begin(len(payload))
+    flow.part(memoryview(payload)[:100])
+    assert streams.parcels[-1].sent == 100, "at once"
+    flow.part(memoryview(payload)[100:])
+    assert got(streams) == [(1, b"small"), (2, payload)]
+    assert got(whole) == [(1, b"small")]
+    leg = flow.by_peer[2]
+    leg.fenced(whole.fences.popleft()[1])
+    assert got(whole) == [(1, b"small"), (2, payload)]
+    assert got(slow) == [(1, b"small")]
+    assert (flow.messages, flow.bytes) == (2, len(payload) + 5)
+    assert flow.large
+
+
+def test_where_all_take_parts_nothing_is_copied_together() -> None:
+    flow = ExportFlow()
+    flow.add(1, Link(), 7, BULKY, 0)
+    flow.begin(BIG)
+    flow.part(memoryview(bytes(1000)))
+    assert flow._whole is None
+
+
+@pytest.mark.parametrize("latching", [False, True])
+def test_a_peer_that_comes_in_the_middle_gets_the_whole_of_what_is_kept_and_half_of_nothing(latching: bool) -> None:
+    flow, early, late = ExportFlow(), Link(), Link()
+    if latching:
+        flow.latch()
+    flow.add(1, early, 7, BULKY, 0)
+    flow.begin(BIG)
+    flow.part(memoryview(bytes(1000)))
+    flow.add(2, late, 7, BULKY, 0)
+    flow.part(memoryview(bytes(BIG - 1000)))
+    assert got(early) == [(1, bytes(BIG))]
+    assert got(late) == ([(1, bytes(BIG))] if latching else [])
+    give(flow, b"n" * BIG)
+    assert got(late)[-1][1] == b"n" * BIG
+
+
+def test_a_peer_that_leaves_in_the_middle_gets_no_more_of_it() -> None:
+    flow, stays, leaves, whole = ExportFlow(), Link(), Link(), Link()
+    flow.add(1, stays, 7, BULKY, 0)
+    flow.add(2, leaves, 7, BULKY, 0)
+    flow.add(3, whole, 7, RELIABLE, 1)
+    flow.begin(BIG)
+    flow.part(memoryview(bytes(1000)))
+    flow.remove(2)
+    flow.remove(3)
+    flow.part(memoryview(bytes(BIG - 1000)))
+    assert got(stays) == [(1, bytes(BIG))]
+    assert leaves.parcels[0].sent == 1000
+    assert whole.sent == []
+
+
+@pytest.mark.parametrize("latching", [False, True])
+def test_a_publisher_that_dies_in_the_middle_leaves_nothing_whole_behind(latching: bool) -> None:
+    flow, streams, whole, late = ExportFlow(), Link(), Link(), Link()
+    if latching:
+        flow.latch()
+    flow.add(1, streams, 7, BULKY, 0)
+    flow.add(2, whole, 7, RELIABLE, 1)
+    flow.begin(BIG)
+    flow.part(memoryview(bytes(1000)))
+    flow.abort()
+    assert streams.log[-1] == ("express", "abandon", 7, 1)
+    assert flow._whole is None
+    flow.add(3, late, 7, BULKY, 0)
+    assert (whole.sent, late.sent, flow.messages) == ([], [], 0)
+    give(flow, b"n" * BIG)
+    assert got(streams) == [(2, b"n" * BIG)]
+    assert got(late) == [(1, b"n" * BIG)]
+
+
+def test_a_suspended_peer_misses_nothing_and_only_a_reliable_one_can_be() -> None:
+    flow, old, new, other = ExportFlow(), Link(), Link(), Link()
+    leg = flow.add(1, old, 7, RELIABLE, 3)
+    flow.add(2, other, 7, BEST, 0)
+    flow.message(memoryview(b"a"))
+    for peer in (1, 2, 3):
+        flow.suspend(peer)
+    flow.message(memoryview(b"b"))
+    give(flow, bytes(BIG))
+    assert leg.reliable
+    leg.resume(new, 8, 1)  # type: ignore[attr-defined]
+    assert got(old) == [(1, b"a")]
+    assert got(new) == [(2, b"b")]
+    leg.fenced(new.fences.popleft()[1])
+    assert got(new) == [(2, b"b"), (3, bytes(BIG))]
+    assert [payload for _, _, payload in other.sent] == [b"a", b"b"]
+
+
+# --- in: best effort ------------------------------------------------------------------------------------------
+
+
+class Inlet:
+    """A flow from a peer, and what came of it.
+
+    Args:
+        contract: Of the route.
+        error: ± bound of what is known of the peer's clock, seconds; ``None``: nothing is.
+        ahead: How much that clock is ahead of ours.
+        first: The first number that is not missing.
+    """
+
+    def __init__(
+        self, contract: Contract = BEST, *, error: float | None = None, ahead: float = 0.0, first: int = 1
+    ) -> None:
+        self.outlet = Outlet()
+        self.acks: list[int] = []
+        self.called_back = 0
+        self.time = LinkTime()
+        self.time.set(ahead, error)
+        self.resumed = math.inf
+        """When the link's last silence ended: nothing came since."""
+        self.time.resumed_at = lambda: self.resumed
+        self.counters = Counters()
+        self.flow = ImportFlow(
+            self.outlet,
+            contract,
+            self.time,
+            on_ack=self.acks.append,
+            on_torn=self.torn,
+            counters=self.counters,
+        )
+        self.flow._next = first
+
+    def torn(self) -> None:
+        self.called_back += 1
+
+    def message(self, sequence: int, payload: bytes = b"", stamp_ns: int = 0) -> None:
+        self.flow.message(sequence, stamp_ns, memoryview(framed(payload)))
+
+    def parts(self, sequence: int, payload: bytes, *cuts: int, stamp_ns: int = 0, end: int | None = None) -> None:
+        """A message in parts, cut there, all but those behind ``end``."""
+        wire = framed(payload)
+        places = [0, *cuts, len(wire)]
+        for start, stop in list(pairwise(places))[:end]:
+            flags = FIRST * (start == 0) | LAST * (stop == len(wire))
+            self.flow.part(sequence, stamp_ns, flags, memoryview(bytearray(wire[start:stop])))
+
+    @property
+    def got(self) -> list[bytes]:
+        return [message[4:] for message in self.outlet.got]
+
+    @property
+    def counts(self) -> tuple[int, int, int, int]:
+        """Lost, late, stale, expired; the agent's own counts, which outlive the flow, say the same."""
+        kept = {name: count for name in ("lost", "late", "stale", "expired") if (count := getattr(self.flow, name))}
+        assert self.counters.as_dict() == {f"message.{name}": count for name, count in sorted(kept.items())}
+        return self.flow.lost, self.flow.late, self.flow.stale, self.flow.expired
+
+
+def test_an_import_counts_what_came_and_what_is_missing(clock: Clock) -> None:
+    inlet = Inlet()
+    for sequence, payload in [(1, b"a"), (2, b"b"), (5, b"e"), (6, b"f")]:
+        clock.advance(1.0)
+        inlet.message(sequence, payload, stamp_ns=1000 + sequence)
+    flow = inlet.flow
+    assert inlet.got == [b"a", b"b", b"e", b"f"]
+    assert (flow.quality.messages, flow.quality.bytes) == (4, 20)
+    assert (flow.quality.last, flow.watch.last) == (clock.now, clock.now)
+    assert inlet.counts == (2, 0, 0, 0)
+    assert flow.watch.counts == {QosEventKind.MESSAGES_LOST: 2}
+    assert flow.position is None
+
+
+def test_what_is_missing_before_the_first_is_known_too() -> None:
+    inlet = Inlet()
+    inlet.message(4)
+    assert inlet.counts == (3, 0, 0, 0)
+
+
+def test_a_sequence_that_wraps_loses_nothing() -> None:
+    inlet = Inlet()
+    inlet.message(1)
+    inlet.flow._expected = WRAP - 1
+    for sequence in (WRAP - 1, 0, 1):
+        inlet.message(sequence)
+    assert inlet.counts == (0, 0, 0, 0)
+    inlet.parts(2, bytes(BIG), 5)
+    inlet.message(4)
+    assert inlet.counts == (1, 0, 0, 0)
+
+
+def test_what_comes_behind_newer_ones_or_again_is_left_out() -> None:
+    inlet = Inlet()
+    for sequence in (1, 2, 5, 3, 5, 4, 1, 6):
+        inlet.message(sequence, bytes([sequence]))
+    inlet.parts(4, bytes(BIG), 100)
+    assert inlet.got == [b"\1", b"\2", b"\5", b"\6"]
+    assert inlet.counts == (2, 5, 0, 0)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.lists(st.tuples(st.sampled_from([5, 5000, BIG]), st.sets(st.integers(4, 2 * BIG), max_size=4)), max_size=12)
+)
+def test_messages_whole_and_in_any_parts_come_out_as_they_were(run: list[tuple[int, set[int]]]) -> None:
+    with running(Clock()):
+        inlet, sent = Inlet(), []
+        for sequence, (size, cuts) in enumerate(run, 1):
+            payload = bytes([sequence]) * size
+            inlet.parts(sequence, payload, *sorted(cut for cut in cuts if cut < size + 4))
+            sent.append(payload)
+        assert inlet.got == sent
+        assert inlet.counts == (0, 0, 0, 0)
+        assert inlet.flow.quality.messages == len(run)
+        assert inlet.flow.quality.bytes == sum(size + 4 for size, _ in run)
+        assert inlet.outlet.torn == 0
+
+
+def test_parts_are_handed_on_before_the_last_one_came() -> None:
+    inlet = Inlet()
+    inlet.parts(1, bytes(BIG), 100, 5000, end=2)
+    assert inlet.outlet.parts == 2
+    assert inlet.flow.quality.messages == 0
+    assert inlet.flow.lane == "express"
+    inlet.flow.part(1, 0, LAST, memoryview(bytes(BIG + 4 - 5000)))
+    assert inlet.got == [bytes(BIG)]
+    assert inlet.flow.lane == "bulk"
+
+
+@pytest.mark.parametrize(
+    ("first", "then"),
+    [
+        (b"", None),
+        (b"\1\0\0", None),
+        (b"\xff\xff\xff\xff", None),
+        ((limits.MESSAGE_MAX - 3).to_bytes(4, "little"), None),
+        (b"\3\0\0\0abcd", None),
+        (b"\3\0\0\0ab", (2, 0, b"cd")),
+        (b"\3\0\0\0ab", (2, LAST, b"")),
+        (b"\3\0\0\0ab", (2, 0, b"c")),
+        (b"\3\0\0\0ab", (3, LAST, b"c")),
+        (b"\3\0\0\0ab", (4, 0, b"c")),
+        (b"\3\0\0\0ab", (3, LAST | ABORT, b"")),
+    ],
+)
+@pytest.mark.parametrize("contract", [BEST, RELIABLE], ids=["best_effort", "reliable"])
+def test_parts_that_make_no_message_are_the_peers_error(
+    first: bytes, then: tuple[int, int, bytes] | None, contract: Contract
+) -> None:
+    inlet = Inlet(contract)
+    inlet.flow.begin_epoch(1, 2)
+    parts = [(2, FIRST, first)] if then is None else [(2, FIRST, first), then]
+    for sequence, flags, part in parts[:-1]:
+        inlet.flow.part(sequence, 0, flags, memoryview(part))
+    sequence, flags, part = parts[-1]
+    with pytest.raises(RemoteProtocolError):
+        inlet.flow.part(sequence, 0, flags, memoryview(part))
+    assert inlet.got == []
+    inlet.flow.torn()
+    assert not inlet.outlet.in_the_middle
+
+
+def test_a_claimed_size_is_not_stored() -> None:
+    inlet = Inlet(RELIABLE)
+    inlet.flow.begin_epoch(1, 1)
+    with pytest.raises(LimitExceeded):
+        inlet.flow.part(1, 0, FIRST, memoryview(b"\xff\xff\xff\xff"))
+
+
+def test_the_rest_of_what_is_left_out_is_left_out_too() -> None:
+    inlet = Inlet()
+    inlet.flow.part(1, 0, LAST, memoryview(b"c"))
+    inlet.flow.part(1, 0, ABORT | LAST, memoryview(b""))
+    inlet.message(5)
+    inlet.parts(3, bytes(BIG), 100, 200)
+    assert inlet.outlet.parts == 0
+    assert inlet.got == [b""]
+
+
+@pytest.mark.parametrize("cut", [4, 100])
+def test_a_publisher_that_dies_in_the_middle_hangs_up_on_who_has_half_and_nothing_is_lost(cut: int) -> None:
+    inlet = Inlet()
+    inlet.parts(1, bytes(BIG), cut, end=1)
+    inlet.flow.part(1, 0, LAST | ABORT, memoryview(b""))
+    assert (inlet.outlet.torn, inlet.called_back, inlet.flow.quality.messages) == (1, 1, 0)
+    inlet.flow.torn()
+    assert inlet.called_back == 1
+    inlet.parts(2, bytes(BIG), cut)
+    assert inlet.counts == (0, 0, 0, 0)
+
+
+def test_a_lane_that_falls_in_the_middle_has_lost_that_message() -> None:
+    inlet = Inlet()
+    inlet.parts(1, bytes(BIG), 50, end=1)
+    inlet.flow.torn()
+    assert (inlet.outlet.torn, inlet.called_back) == (1, 1)
+    inlet.message(2, b"after")
+    assert inlet.got == [b"after"]
+    assert inlet.counts == (1, 0, 0, 0)
+
+
+@pytest.mark.parametrize("small", [False, True])
+def test_what_comes_in_the_middle_of_another_ends_that_and_is_whole(small: bool) -> None:
+    """The sender knows sooner than we do that a lane has gone, and goes on by the other one."""
+    inlet = Inlet()
+    inlet.message(1, b"one")
+    inlet.parts(2, bytes(BIG), 50, end=1)
+    if small:
+        inlet.message(3, b"three")
+    else:
+        inlet.parts(3, b"three", 5)
+    inlet.flow.part(2, 0, LAST, memoryview(bytes(BIG + 4 - 50)))  # what the old lane still brought
+    inlet.message(4, b"four")
+    assert inlet.got == [b"one", b"three", b"four"]
+    assert (inlet.outlet.torn, inlet.called_back) == (1, 1)
+    assert inlet.counts == (1, 0, 0, 0)
+
+
+@pytest.mark.parametrize("contract", [BEST, RELIABLE], ids=["best_effort", "reliable"])
+def test_what_comes_late_in_the_middle_of_another_does_not_disturb_it(contract: Contract) -> None:
+    inlet = Inlet(contract)
+    inlet.flow.begin_epoch(1, 1)
+    for sequence in (1, 2, 3):
+        inlet.message(sequence, bytes([sequence]))
+    inlet.parts(4, bytes(BIG), 50, end=1)
+    inlet.message(3, b"again")
+    inlet.parts(2, bytes(BIG), 100, 200)
+    inlet.flow.part(1, 0, LAST | ABORT, memoryview(b""))
+    inlet.flow.part(4, 0, LAST, memoryview(bytes(BIG + 4 - 50)))
+    inlet.message(5, b"\5")
+    assert inlet.got == [b"\1", b"\2", b"\3", bytes(BIG), b"\5"]
+    assert inlet.counts == (0, 2, 0, 0)
+    assert inlet.called_back == 0
+
+
+def test_the_same_number_again_in_the_middle_is_no_mixture() -> None:
+    inlet = Inlet()
+    inlet.parts(1, bytes(BIG), 50, end=1)
+    inlet.message(1, b"one")
+    inlet.parts(2, bytes(BIG), 50, end=1)
+    inlet.parts(2, b"two", 5)
+    inlet.message(3, b"three")
+    assert inlet.got == [b"one", b"two", b"three"]
+    assert inlet.outlet.torn == 2
+
+
+# --- in: what is old ------------------------------------------------------------------------------------------
+
+OLD = limits.STALE_AGE + 0.01
+HOLD = limits.STALE_HOLD
+
+
+def burst(inlet: Inlet, clock: Clock, ages: list[float], first: int = 2) -> None:
+    """Messages of these ages, all at once, numbered from ``first`` on."""
+    for sequence, age in enumerate(ages, first):
+        inlet.message(sequence, bytes([sequence]), stamp_ns=clock.wall_ns() - round(age * 1e9))
+
+
+def test_of_what_an_outage_held_up_the_newest_counts(clock: Clock) -> None:
+    inlet = Inlet(error=0.001, first=2)
+    burst(inlet, clock, [9.0, 8.0, 7.0, 0.01, 0.0])
+    assert inlet.got == [b"\5", b"\6"]
+    clock.advance(1.0)
+    assert inlet.got == [b"\5", b"\6"]
+    assert inlet.counts == (0, 0, 3, 0)
+    assert inlet.flow.quality.messages == 2
+
+
+def test_the_last_command_before_the_cable_was_pulled_still_counts(clock: Clock) -> None:
+    inlet = Inlet(error=0.001, first=2)
+    burst(inlet, clock, [9.0, 8.0, 7.0])
+    assert inlet.got == []
+    clock.advance(HOLD + 0.001)
+    assert inlet.got == [b"\4"]
+    assert inlet.counts == (0, 0, 2, 0)
+    assert inlet.flow.quality.messages == 1
+    burst(inlet, clock, [5.0], first=5)
+    clock.advance(HOLD + 0.001)
+    assert inlet.got == [b"\4", b"\5"]
+    assert clock.due == []
+
+
+def test_the_hold_is_counted_from_the_first_of_the_burst(clock: Clock) -> None:
+    """A source that stays late for ever must not be held for ever."""
+    inlet = Inlet(error=0.001, first=2)
+    for sequence in range(2, 60):
+        burst(inlet, clock, [2.0], first=sequence)
+        clock.advance(HOLD / 3)
+    assert len(inlet.got) >= 58 / 4 - 1
+    clock.advance(HOLD)
+    assert inlet.counts[2] + len(inlet.got) == 58
+
+
+@pytest.mark.parametrize(("error", "age"), [(None, 60.0), (1.0, 1.0), (0.001, 0.1), (0.001, -5.0)])
+def test_what_is_not_surely_old_is_not_held(clock: Clock, error: float | None, age: float) -> None:
+    inlet = Inlet(error=error, first=2)
+    burst(inlet, clock, [age])
+    assert inlet.got == [b"\2"]
+    assert inlet.counts == (0, 0, 0, 0)
+
+
+@pytest.mark.parametrize("ahead", [-3600.0, 3600.0])
+def test_the_peers_clock_is_what_dates_its_messages(clock: Clock, ahead: float) -> None:
+    inlet = Inlet(error=0.001, ahead=ahead, first=2)
+    inlet.message(2, b"new", stamp_ns=clock.wall_ns() + round(ahead * 1e9))
+    assert inlet.got == [b"new"]
+    inlet.message(3, b"old", stamp_ns=clock.wall_ns() + round((ahead - OLD) * 1e9))
+    assert inlet.got == [b"new"]
+    inlet.message(4, b"newer", stamp_ns=clock.wall_ns() + round(ahead * 1e9))
+    assert inlet.got == [b"new", b"newer"]
+
+
+@pytest.mark.parametrize("resumed", [-math.inf, -5.0])
+def test_what_no_silence_held_up_is_not_thrown_away(clock: Clock, resumed: float) -> None:
+    """A slow link, a full buffer, a process that got no CPU: late, but all that there is."""
+    inlet = Inlet(error=0.001, first=2)
+    inlet.resumed = clock.now + resumed
+    burst(inlet, clock, [3.0, 0.9, 0.5])
+    assert inlet.got == [b"\2", b"\3", b"\4"]
+    assert inlet.counts == (0, 0, 0, 0)
+
+
+def test_what_was_sent_before_a_silence_ended_gives_way_and_what_was_sent_since_does_not(clock: Clock) -> None:
+    inlet = Inlet(error=0.001, first=2)
+    inlet.resumed = clock.now - 0.5
+    burst(inlet, clock, [0.9, 0.7, 0.55, 0.3])  # the third was held up for 50 ms, and by us for the rest
+    assert inlet.got == [b"\4", b"\5"]
+    assert inlet.counts == (0, 0, 2, 0)
+
+
+@pytest.mark.parametrize(
+    ("contract", "kept"), [(BEST, 1), (KEPT, 1), (Contract(durability=Durability.TRANSIENT_LOCAL, depth=3), 3)]
+)
+def test_kept_messages_are_as_old_as_they_are(clock: Clock, contract: Contract, kept: int) -> None:
+    inlet = Inlet(contract, error=0.001)
+    burst(inlet, clock, [60.0] * (kept + 2), first=1)
+    assert inlet.got == [bytes([n + 1]) for n in range(kept)]
+
+
+def test_a_large_message_takes_the_place_of_what_was_held_and_is_not_disturbed_by_it(clock: Clock) -> None:
+    inlet = Inlet(error=0.001, first=2)
+    burst(inlet, clock, [9.0])
+    inlet.parts(3, bytes(BIG), 50, end=1, stamp_ns=clock.wall_ns())
+    clock.advance(1.0)
+    inlet.flow.part(3, clock.wall_ns(), LAST, memoryview(bytes(BIG + 4 - 50)))
+    assert inlet.got == [bytes(BIG)]
+    assert inlet.counts == (0, 0, 1, 0)
+
+
+def test_beyond_its_lifespan_a_message_is_worth_nothing(clock: Clock) -> None:
+    inlet = Inlet(Contract(lifespan=0.5), error=0.01)
+    burst(inlet, clock, [0.4, 0.505, 0.52, 60.0], first=1)
+    assert inlet.got == [b"\1", b"\2"]
+    old = clock.wall_ns() - 10**9
+    inlet.parts(5, bytes(BIG), 50, 60, stamp_ns=old)
+    assert inlet.outlet.parts == 0
+    inlet.parts(6, bytes(BIG), 50, 60, stamp_ns=clock.wall_ns())
+    inlet.message(7, b"", stamp_ns=old)
+    clock.advance(1.0)
+    assert inlet.got == [b"\1", b"\2", bytes(BIG)]
+    assert inlet.counts == (0, 0, 0, 4)
+    assert inlet.flow.watch.counts == {QosEventKind.LIFESPAN_EXPIRED: 4}
+
+
+def test_a_lifespan_counts_whatever_held_the_message_up(clock: Clock) -> None:
+    inlet = Inlet(Contract(lifespan=0.5), error=0.001, first=2)
+    inlet.resumed = -math.inf
+    burst(inlet, clock, [0.9])
+    assert inlet.counts == (0, 0, 0, 1)
+
+
+def test_without_a_clock_nothing_expires(clock: Clock) -> None:
+    inlet = Inlet(Contract(lifespan=0.5))
+    burst(inlet, clock, [60.0])
+    inlet.parts(3, bytes(BIG), 50, stamp_ns=0)
+    assert inlet.got == [b"\2", bytes(BIG)]
+
+
+def test_closed_nothing_happens_any_more(clock: Clock) -> None:
+    inlet = Inlet(error=0.001, first=2)
+    burst(inlet, clock, [9.0])
+    inlet.parts(3, bytes(BIG), 50, end=1)
+    burst(inlet, clock, [9.0, 8.0], first=4)
+    inlet.flow.close()
+    assert clock.due == []
+    clock.advance(1.0)
+    assert inlet.got == []
+    owes = Inlet(RELIABLE)
+    owes.message(1)
+    owes.flow.close()
+    clock.advance(1.0)
+    assert owes.acks == []
+
+
+# --- in: what the subscribers have already ----------------------------------------------------------------------
+
+
+def replayed(kept: list[bytes], sent: list[bytes], contract: Contract = BEST, *, cut: bool = False) -> list[bytes]:
+    """What subscribers that have ``kept`` get of ``sent``."""
+    inlet = Inlet(contract)
+    inlet.flow.begin_epoch(1, 1)
+    inlet.flow.expect_replay(framed(payload) for payload in kept)
+    for sequence, payload in enumerate(sent, 1):
+        if cut:
+            inlet.parts(sequence, payload, 6)
+        else:
+            inlet.message(sequence, payload)
+    assert inlet.flow.quality.messages == len(inlet.got)
+    assert inlet.counts == (0, 0, 0, 0)
+    assert inlet.outlet.torn == 0
+    return inlet.got
+
+
+@pytest.mark.parametrize("cut", [False, True], ids=["whole", "in_parts"])
+@pytest.mark.parametrize("contract", [BEST, RELIABLE], ids=["best_effort", "reliable"])
+@pytest.mark.parametrize(
+    ("kept", "sent", "new"),
+    [
+        ("", "abc", "abc"),
+        ("a", "a", ""),
+        ("a", "ab", "b"),
+        ("a", "aa", "a"),
+        ("a", "ba", "ba"),
+        ("abc", "abc", ""),
+        ("abc", "bcd", "d"),
+        ("abc", "cde", "de"),
+        ("abc", "def", "def"),
+        ("abc", "dabc", "dabc"),
+        ("aaa", "aaaa", "a"),
+    ],
+)
+def test_a_new_route_brings_nothing_again(kept: str, sent: str, new: str, contract: Contract, cut: bool) -> None:
+    def messages(letters: str) -> list[bytes]:
+        return [letter.encode() * 100 for letter in letters]
+
+    assert replayed(messages(kept), messages(sent), contract, cut=cut) == messages(new)
+
+
+def test_a_large_message_of_another_size_is_streamed_and_ends_the_replay() -> None:
+    inlet = Inlet()
+    inlet.flow.expect_replay([framed(bytes(BIG)), framed(b"b")])
+    inlet.parts(1, bytes(BIG - 1), 50, end=1)
+    assert inlet.outlet.parts == 1
+    inlet.flow.part(1, 0, LAST, memoryview(bytes(BIG + 3 - 50)))
+    inlet.message(2, b"b")
+    assert inlet.got == [bytes(BIG - 1), b"b"]
+
+
+# --- in: reliable ---------------------------------------------------------------------------------------------
+
+
+def test_acknowledged_are_many_at_once_or_a_few_soon(clock: Clock) -> None:
+    inlet = Inlet(RELIABLE)
+    inlet.flow.begin_epoch(1, 1)
+    for sequence in range(1, limits.ACK_MESSAGES):
+        inlet.message(sequence)
+    assert inlet.acks == []
+    inlet.message(limits.ACK_MESSAGES)
+    assert inlet.acks == [limits.ACK_MESSAGES], "a full batch"
+    assert clock.due == []
+    inlet.message(limits.ACK_MESSAGES + 1)
+    clock.advance(limits.ACK_DELAY / 2)
+    inlet.message(limits.ACK_MESSAGES + 2)
+    assert len(inlet.acks) == 1
+    clock.advance(limits.ACK_DELAY / 2)
+    assert inlet.acks[1:] == [limits.ACK_MESSAGES + 2]
+    clock.advance(1.0)
+    assert len(inlet.acks) == 2, "once"
+
+
+def test_a_few_large_ones_are_acknowledged_at_once(clock: Clock) -> None:
+    inlet = Inlet(RELIABLE)
+    inlet.flow.begin_epoch(1, 1)
+    size = limits.ACK_BYTES // 2
+    inlet.parts(1, bytes(size), 50)
+    assert inlet.acks == []
+    inlet.parts(2, bytes(size), 50)
+    assert inlet.acks == [2]
+    assert clock.due == []
+
+
+def test_a_torn_reliable_message_reaches_nobody_by_half_and_comes_again_whole(clock: Clock) -> None:
+    inlet = Inlet(RELIABLE)
+    inlet.flow.begin_epoch(1, 1)
+    inlet.message(1, b"one")
+    inlet.parts(2, b"2" * BIG, 50, 100, end=2)
+    assert inlet.outlet.parts == 0
+    inlet.flow.torn()
+    assert (inlet.got, inlet.outlet.torn, inlet.called_back) == ([b"one"], 0, 0)
+    assert inlet.flow.position == (1, 1)
+    inlet.parts(1, b"one", 5)
+    inlet.parts(2, b"2" * BIG, 70)
+    inlet.message(3, b"three")
+    assert inlet.got == [b"one", b"2" * BIG, b"three"]
+    assert inlet.counts == (0, 1, 0, 0)
+    clock.advance(limits.ACK_DELAY)
+    assert inlet.acks == [3]
+
+
+def test_over_a_new_link_it_goes_on_and_what_overflowed_is_the_exact_gap(clock: Clock) -> None:
+    inlet = Inlet(RELIABLE)
+    assert inlet.flow.begin_epoch(5, 1)
+    inlet.message(1, b"1")
+    inlet.message(2, b"2")
+    inlet.flow.torn()
+    assert inlet.flow.position == (5, 2)
+    acks: list[int] = []
+    inlet.flow.rebind(acks.append)
+    assert inlet.flow.begin_epoch(5, 1)
+    inlet.message(2, b"2")
+    inlet.message(3, b"3")
+    inlet.parts(9, b"9" * BIG, 50)
+    clock.advance(1.0)
+    assert inlet.got == [b"1", b"2", b"3", b"9" * BIG]
+    assert inlet.counts == (5, 1, 0, 0)
+    assert inlet.flow.watch.counts == {QosEventKind.MESSAGES_LOST: 5}
+    assert (inlet.acks, acks) == ([], [9])
+    assert inlet.flow.position == (5, 9)
+
+
+def test_a_sender_that_gave_up_begins_anew_and_it_is_known_that_something_is_missing(clock: Clock) -> None:
+    inlet = Inlet(RELIABLE)
+    inlet.flow.begin_epoch(5, 1)
+    inlet.message(1)
+    inlet.message(2)
+    assert not inlet.flow.begin_epoch(6, 1)
+    assert inlet.flow.position == (6, 0)
+    inlet.message(1, b"new")
+    clock.advance(1.0)
+    assert inlet.got[-1] == b"new"
+    assert inlet.acks == [1]
+    assert inlet.counts == (0, 0, 0, 0)
+
+
+def test_what_an_outage_held_up_is_delivered_when_it_is_reliable_unless_it_has_a_lifespan(clock: Clock) -> None:
+    for contract, delivered in ((RELIABLE, 4), (Contract(reliability=Reliability.RELIABLE, lifespan=1.0), 1)):
+        inlet = Inlet(contract, error=0.001)
+        inlet.flow.begin_epoch(1, 1)
+        burst(inlet, clock, [9.0, 8.0, 0.0], first=1)
+        inlet.parts(4, bytes(BIG), 50, stamp_ns=clock.wall_ns() - 7 * 10**9)
+        assert len(inlet.got) == delivered
+        assert inlet.counts == (0, 0, 0, 4 - delivered)
+        clock.advance(limits.ACK_DELAY)
+        assert inlet.acks == [4], "what is too old has arrived all the same"
+        inlet.flow.close()
+
+
+@pytest.mark.parametrize(
+    ("priority", "size", "lane"),
+    [
+        (Priority.HIGH, BIG, "express"),
+        (Priority.LOW, 1, "bulk"),
+        (Priority.NORMAL, 1, "express"),
+        (Priority.NORMAL, BIG, "bulk"),
+    ],
+)
+def test_the_lane_as_the_monitor_shows_it(priority: Priority, size: int, lane: str) -> None:
+    inlet = Inlet(Contract(priority=priority))
+    inlet.parts(1, bytes(size), 4)
+    assert inlet.flow.lane == lane

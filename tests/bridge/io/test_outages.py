@@ -1,0 +1,464 @@
+"""Reliable topics over outages of any length: each message is delivered, or counted as lost at both ends."""
+
+from __future__ import annotations
+
+import asyncio
+import tracemalloc
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.bridge.data.qos_events import QosEventKind
+from rmpa.bridge.messages import Source
+from rmpa.core import limits
+from rmpa.core.contract import ContractRule, History, Reliability
+from tests.bridge.io.two_bridges import World, made_up
+from tests.bridge.io.virtual import VirtualLoop, run
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
+
+    from rmpa.bridge.messages import TopicOffer
+    from tests.bridge.io.nodes import Listener, Speaker
+    from tests.bridge.io.two_bridges import Side
+
+SURE = Source("/sure", "/one")
+PERIOD = 0.05
+
+
+def play(seed: int, scene: Callable[[World], Coroutine[object, object, None]], **values: object) -> None:
+    """Play one scene of a world whose topic /sure is reliable."""
+    loop = VirtualLoop()
+    rule = ContractRule(("/sure",), (), {"reliability": Reliability.RELIABLE, **values})
+
+    async def main() -> None:
+        async with World(seed, (rule,)) as world:
+            await scene(world)
+
+    with made_up(loop):
+        run(main(), loop)
+
+
+def lost_at_receiver(side: Side) -> int:
+    """What the receiving module says is lost."""
+    (attached,) = side.attached
+    entry = side.bridge.imports.get(attached.peer, SURE)
+    flow = attached.inbound.flow(SURE, entry.route if entry is not None else 0)
+    past = attached.inbound.past(SURE)
+    return flow.lost if flow is not None else past.lost if past is not None else 0
+
+
+def unknown_at_receiver(side: Side) -> int:
+    """How often it says that nobody knows how many."""
+    (attached,) = side.attached
+    flow = attached.inbound.flow(SURE, 0)
+    return flow.watch.counts[QosEventKind.LOSS_UNKNOWN] if flow is not None else 0
+
+
+def lost_at_sender(side: Side) -> int:
+    """What the sending module says is lost to its peer."""
+    (attached,) = side.attached
+    return side.bridge.outbound.lost(SURE, attached.peer)
+
+
+async def talk(world: World, speaker: Speaker, seconds: float, *, linked: bool = True) -> None:
+    """Publish at an even rate for some time."""
+    for _ in range(round(seconds / PERIOD)):
+        speaker.say(10)
+        await world.rest(PERIOD, step=PERIOD) if linked else await asyncio.sleep(PERIOD)
+
+
+async def begin(world: World) -> tuple[Speaker, Listener]:
+    """Both ends, and the first messages."""
+    a, b = world.sides
+    speaker, listener = world.speak(a, "/sure", "/one"), world.listen(b, "/sure")
+    world.link()
+    await world.rest(1.0)
+    await talk(world, speaker, 0.5)
+    return speaker, listener
+
+
+def told(side: Side) -> list[TopicOffer]:
+    """What the other side was told since its link is up."""
+    (attached,) = side.attached
+    exports = side.bridge.exports
+    return [offer for source in exports.offered if (offer := exports.offer(attached.peer, source)) is not None]
+
+
+async def settled(world: World) -> None:
+    """Let all come that is kept: a few messages for each acknowledgement."""
+    await world.rest(5.0)
+    for side in world.sides:
+        while any(leg.reliable and leg.sender.pending for leg in side.bridge.outbound._legs.values()):  # type: ignore[attr-defined] # reliable
+            await world.rest(1.0)
+
+
+async def outage(world: World, speaker: Speaker, seconds: float) -> None:
+    """The cable is out, the publisher goes on; each side notices by its lease, or a little before."""
+    world.cut()
+    noticed = [min(seconds / 2, limits.LINK_LEASE * world.rng.uniform(0.3, 1.0)) for _ in world.sides]
+    for index, when in enumerate(noticed):
+        silent = world.rng.random() < 0.7
+        asyncio.get_running_loop().call_later(when, lambda i=index, s=silent: world.notice(i, silent=s))  # type: ignore[misc] # bound here
+    await talk(world, speaker, seconds, linked=False)
+    world.link()
+
+
+def accounted(world: World, speaker: Speaker, listener: Listener) -> int:
+    """Each message has come, in order and once, or is counted as lost at both ends; return how many were lost."""
+    a, b = world.sides
+    heard = [number for _, number in listener.got[speaker.number]]
+    assert heard == sorted(set(heard)), "doubled or out of order"
+    missing = speaker.said - len(heard)
+    assert lost_at_receiver(b) == missing, f"{missing} of {speaker.said} did not come"
+    assert lost_at_sender(a) == missing
+    assert unknown_at_receiver(b) == 0
+    return missing
+
+
+# --- one outage ---------------------------------------------------------------------------------------------
+
+
+async def one_outage(world: World, seconds: float) -> int:
+    speaker, listener = await begin(world)
+    await outage(world, speaker, seconds)
+    await settled(world)
+    await talk(world, speaker, 1.0)
+    await settled(world)
+    return accounted(world, speaker, listener)
+
+
+@pytest.mark.parametrize(("window", "seconds"), [(2.0, 1.5), (30.0, 29.0), (300.0, 299.0)])
+def test_within_the_window_nothing_is_lost(window: float, seconds: float) -> None:
+    async def scene(world: World) -> None:
+        assert await one_outage(world, seconds) == 0
+
+    play(1, scene, outage=window, depth=100_000)
+
+
+@pytest.mark.parametrize(("window", "seconds"), [(1.0, 4.0), (2.0, 35.0), (30.0, 35.0), (30.0, 600.0), (5.0, 7200.0)])
+def test_beyond_it_all_that_was_kept_is_lost_and_all_of_it_is_counted(window: float, seconds: float) -> None:
+    async def scene(world: World) -> None:
+        lost = await one_outage(world, seconds)
+        assert round(seconds / PERIOD) - 5 <= lost <= round(seconds / PERIOD) + 25
+
+    play(2, scene, outage=window, depth=100_000)
+
+
+@pytest.mark.parametrize("seconds", [20.0, 100.0])
+def test_beyond_the_depth_the_oldest_are_lost_and_counted(seconds: float) -> None:
+    async def scene(world: World) -> None:
+        lost = await one_outage(world, seconds)
+        assert round(seconds / PERIOD) - 105 <= lost <= round(seconds / PERIOD) - 75
+
+    play(3, scene, outage=600.0, depth=100)
+
+
+def test_beyond_the_bytes_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "REPLAY_BYTES", 50 * 14)
+
+    async def scene(world: World) -> None:
+        assert 20 / PERIOD - 55 <= await one_outage(world, 20.0) <= 20 / PERIOD - 25
+
+    play(4, scene, outage=600.0, history=History.KEEP_ALL)
+
+
+def test_beyond_the_bytes_of_all_routes_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "RESUME_BYTES_MAX", 50 * 14)
+
+    async def scene(world: World) -> None:
+        lost = await one_outage(world, 20.0)
+        assert lost >= 20 / PERIOD - 5, "all of the route was let go of"
+
+    play(5, scene, outage=600.0, depth=100_000)
+
+
+def test_an_outage_is_told_when_it_ends_though_nothing_is_published_any_more() -> None:
+    async def scene(world: World) -> None:
+        speaker, listener = await begin(world)
+        await outage(world, speaker, 60.0)
+        await world.rest(10.0)
+        assert accounted(world, speaker, listener) > 1000
+
+    play(6, scene, outage=2.0)
+
+
+@pytest.mark.parametrize("block", range(10))
+def test_many_outages_of_all_lengths(block: int) -> None:
+    async def scene(world: World) -> None:
+        speaker, listener = await begin(world)
+        for _ in range(world.rng.randint(1, 4)):
+            await outage(world, speaker, 10 ** world.rng.uniform(0.0, 2.78))
+            if world.rng.random() < 0.7:
+                await world.rest(world.rng.choice([0.05, 0.3, 3.0, 30.0]))
+                await talk(world, speaker, world.rng.choice([0.0, 0.1, 2.0]))
+        await settled(world)
+        await talk(world, speaker, 1.0)
+        await settled(world)
+        accounted(world, speaker, listener)
+
+    for seed in range(block * 5, block * 5 + 5):
+        window = (1.0, 5.0, 30.0, 120.0)[seed % 4]
+        play(seed, scene, outage=window, depth=(20, 1000, 100_000)[seed % 3])
+
+
+# --- agents that end meanwhile --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("window", "seconds"), [(30.0, 10.0), (2.0, 10.0), (30.0, 300.0)])
+@pytest.mark.parametrize("early", [True, False])
+def test_a_receivers_agent_that_was_restarted_meanwhile_is_told(window: float, seconds: float, early: bool) -> None:
+    async def scene(world: World) -> None:
+        a, b = world.sides
+        speaker, listener = await begin(world)
+        world.cut()
+        for index in (0, 1):
+            world.notice(index, silent=True)
+        await talk(world, speaker, seconds * (0.1 if early else 0.9), linked=False)
+        await world.restart(b)
+        await talk(world, speaker, seconds * (0.9 if early else 0.1), linked=False)
+        world.link()
+        await settled(world)
+        await talk(world, speaker, 1.0)
+        await settled(world)
+        heard = [number for _, number in listener.got[speaker.number]]
+        missing = speaker.said - len(heard)
+        assert missing > 100
+        # What the receiver had and did not come to acknowledge counts as lost: ten milliseconds of it at the most.
+        assert missing <= lost_at_receiver(b) == lost_at_sender(a) <= missing + 1
+        assert unknown_at_receiver(b) == 0
+
+    play(7, scene, outage=window, depth=100_000)
+
+
+@pytest.mark.parametrize("seconds", [10.0, 300.0])
+def test_where_the_senders_agent_was_restarted_it_is_said_that_nobody_knows(seconds: float) -> None:
+    async def scene(world: World) -> None:
+        a, b = world.sides
+        speaker, _ = await begin(world)
+        world.cut()
+        for index in (0, 1):
+            world.notice(index, silent=True)
+        await talk(world, speaker, seconds / 2, linked=False)
+        await world.restart(a)
+        await talk(world, speaker, seconds / 2, linked=False)
+        world.link()
+        await settled(world)
+        await talk(world, speaker, 1.0)
+        await settled(world)
+        assert unknown_at_receiver(b) == 1
+        assert lost_at_receiver(b) == 0
+
+    play(8, scene, outage=30.0, depth=100_000)
+
+
+# --- a graph that takes long to tell ----------------------------------------------------------------------------
+
+
+async def begin_at_the_end(world: World, seconds: float) -> tuple[Speaker, Listener]:
+    """Both ends, behind so many other topics that a busy lane is told of them for some seconds."""
+    for number in range(round(seconds / limits.TELL_PATIENCE) * limits.ADVERTISED_AT_ONCE):
+        world.speak(world.sides[0], f"/other_{number}", "/many")
+    return await begin(world)
+
+
+async def back_on_a_busy_lane(world: World, speaker: Speaker) -> None:
+    """After a short outage the link is back, and never without something under way."""
+    world.cut()
+    for index in (0, 1):
+        world.notice(index, silent=True)
+    await talk(world, speaker, 5.0, linked=False)
+    world.link()
+    for side in world.sides:
+        assert side.link is not None
+        side.link.busy = True
+
+
+def waits(side: Side) -> bool:
+    """Whether a reliable route waits for the other side to ask for it again."""
+    (attached,) = side.attached
+    return side.bridge.exports.waits_for(attached.peer)
+
+
+def test_what_is_kept_waits_until_the_peer_was_told_of_its_topic() -> None:
+    async def scene(world: World) -> None:
+        a, b = world.sides
+        speaker, listener = await begin_at_the_end(world, 1.5 * limits.RESUME_CLAIM)
+        await back_on_a_busy_lane(world, speaker)
+        await world.rest(1.2 * limits.RESUME_CLAIM)
+        assert waits(a)
+        assert SURE not in [offer.source for offer in told(a)]
+        await world.rest(0.5 * limits.RESUME_CLAIM)
+        await settled(world)
+        assert accounted(world, speaker, listener) == 0
+        assert not waits(a)
+        assert lost_at_receiver(b) == 0
+
+    play(11, scene, outage=600.0, depth=100_000)
+
+
+def test_what_nobody_asks_for_after_it_was_told_goes_the_usual_time_later() -> None:
+    async def scene(world: World) -> None:
+        a, _ = world.sides
+        speaker, listener = await begin_at_the_end(world, 1.5 * limits.RESUME_CLAIM)
+        world.cut()
+        world.leave(listener)
+        await back_on_a_busy_lane(world, speaker)
+        await world.rest(2.4 * limits.RESUME_CLAIM, step=0.1)
+        assert waits(a), "it was told a while ago only"
+        await world.rest(0.3 * limits.RESUME_CLAIM, step=0.1)
+        assert not waits(a)
+
+    play(12, scene, outage=600.0, depth=100_000)
+
+
+def test_a_peer_that_is_never_told_everything_is_not_waited_for_without_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def scene(world: World) -> None:
+        a, _ = world.sides
+        speaker, _ = await begin_at_the_end(world, 1.0)
+        monkeypatch.setattr(limits, "TELL_PATIENCE", 1e9)
+        await back_on_a_busy_lane(world, speaker)
+        await world.rest(limits.RESUME_CLAIM_MAX - 1.0, step=0.1)
+        assert waits(a)
+        await world.rest(2.0, step=0.1)
+        assert not waits(a)
+
+    play(13, scene, outage=6000.0, depth=100_000)
+
+
+def test_the_links_end_ends_the_waiting_for_its_claims(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def scene(world: World) -> None:
+        a, _ = world.sides
+        speaker, _ = await begin_at_the_end(world, 1.0)
+        monkeypatch.setattr(limits, "TELL_PATIENCE", 1e9)
+        await back_on_a_busy_lane(world, speaker)
+        (attached,) = a.attached
+        timer = attached.back
+        assert timer is not None
+        for index in (0, 1):
+            world.notice(index, silent=True)
+        assert timer.cancelled()
+        await asyncio.sleep(2 * limits.RESUME_CLAIM_MAX)
+        assert waits(a), "its outage goes on"
+
+    play(14, scene, outage=6000.0, depth=100_000)
+
+
+# --- who does not listen any more misses nothing ----------------------------------------------------------------
+
+
+def test_a_subscriber_that_left_meanwhile_misses_nothing() -> None:
+    async def scene(world: World) -> None:
+        b = world.sides[1]
+        speaker, listener = await begin(world)
+        world.cut()
+        for index in (0, 1):
+            world.notice(index, silent=True)
+        await talk(world, speaker, 60.0, linked=False)
+        world.leave(listener)
+        await talk(world, speaker, 2 * limits.RECONCILE_INTERVAL, linked=False)
+        late = world.listen(b, "/sure")
+        world.link()
+        await settled(world)
+        await talk(world, speaker, 1.0)
+        await settled(world)
+        assert len(late.got[speaker.number]) == round(1.0 / PERIOD)
+        assert lost_at_receiver(b) == 0
+        assert unknown_at_receiver(b) == 0
+        world.leave(late)
+        await world.rest(2 * limits.RESUME_CLAIM, step=0.1)
+        world.check_nothing_is_left()
+
+    play(9, scene, outage=5.0)
+
+
+def test_the_count_outlives_the_route() -> None:
+    async def scene(world: World) -> None:
+        a, b = world.sides
+        speaker, listener = await begin(world)
+        await outage(world, speaker, 20.0)
+        await world.rest(5.0)
+        lost = accounted(world, speaker, listener)
+        assert lost > 300
+        world.leave(listener)
+        await world.rest(5.0, step=0.1)
+        assert (lost_at_receiver(b), lost_at_sender(a)) == (lost, lost)
+        late = world.listen(b, "/sure")
+        await world.rest(2.0)
+        await talk(world, speaker, 1.0)
+        assert (lost_at_receiver(b), lost_at_sender(a)) == (lost, lost)
+        assert late.got[speaker.number]
+
+    play(10, scene, outage=2.0)
+
+
+def test_a_publisher_that_restarts_takes_what_was_not_received_along_and_that_is_counted() -> None:
+    async def scene(world: World) -> None:
+        a, b = world.sides
+        speaker, listener = await begin(world)
+        world.cut()
+        for index in (0, 1):
+            world.notice(index, silent=True)
+        await talk(world, speaker, 3.0, linked=False)
+        again = world.speak(a, "/sure", "/one")
+        await asyncio.sleep(1.0)
+        world.link()
+        await world.rest(5.0)
+        await talk(world, again, 1.0)
+        await world.rest(1.0)
+        missing = speaker.said - len(listener.got[speaker.number])
+        assert missing == round(3.0 / PERIOD)
+        assert (lost_at_receiver(b), lost_at_sender(a)) == (missing, missing)
+        assert len(listener.got[again.number]) == again.said
+
+    play(11, scene, outage=30.0)
+
+
+# --- bounds -------------------------------------------------------------------------------------------------
+
+
+def test_what_is_only_counted_takes_no_memory_and_ends_after_a_day(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "OUTAGE_COUNTED", 3600.0)
+
+    async def scene(world: World) -> None:
+        a, b = world.sides
+        speaker, _ = await begin(world)
+        world.cut()
+        for index in (0, 1):
+            world.notice(index, silent=True)
+        await talk(world, speaker, 100.0, linked=False)
+        tracemalloc.start()
+        before, _ = tracemalloc.get_traced_memory()
+        await talk(world, speaker, 1000.0, linked=False)
+        after, _ = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert after - before < 100_000
+        assert speaker.connections, "it is counted"
+        await asyncio.sleep(3600.0)
+        assert not speaker.connections, "it is not counted any more"
+        world.link()
+        await world.rest(5.0)
+        await talk(world, speaker, 1.0)
+        assert lost_at_receiver(b) == lost_at_sender(a) >= 1100 / PERIOD
+        assert unknown_at_receiver(b) == 1
+
+    play(12, scene, outage=5.0)
+
+
+def test_peers_that_never_come_back_are_forgotten_beyond_their_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "ABSENT_PEERS_MAX", 0)
+
+    async def scene(world: World) -> None:
+        a, b = world.sides
+        speaker, _ = await begin(world)
+        world.cut()
+        for index in (0, 1):
+            world.notice(index, silent=True)
+        await talk(world, speaker, 20.0, linked=False)
+        assert not speaker.connections
+        assert not a.bridge.outbound.losses
+        world.link()
+        await world.rest(5.0)
+        assert (lost_at_receiver(b), lost_at_sender(a)) == (0, 0)
+
+    play(13, scene, outage=5.0)

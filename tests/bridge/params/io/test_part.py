@@ -1,0 +1,430 @@
+"""Two modules' parameters, joined by their questions: real parameter servers, real parts; the links are doubles."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from datetime import datetime
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
+
+import pytest
+
+from rmpa.bridge.messages import decode
+from rmpa.bridge.params import transfer
+from rmpa.bridge.params.io.core import read_text, write_text
+from rmpa.bridge.params.io.part import Params
+from rmpa.bridge.session.peer_rpc import PeerRpc
+from rmpa.config.settings import FollowRule, ParamSettings, Settings, TimeSettings
+from rmpa.core import limits
+from rmpa.core.counters import Counters
+from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.ros.master.api import MasterApi
+from rmpa.ros.master.effects import ParamUpdate
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.ros.core.api import Core
+    from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
+
+OURS = "http://127.0.0.1:1/"
+
+
+class FakeCore:
+    """A parameter server that tells the agent's node at once."""
+
+    def __init__(self) -> None:
+        self.api = MasterApi("http://core/", 1, lambda _: None)
+        self.told: Callable[[str], bool] = lambda _: False
+        self.calls: deque[tuple[str, str]] = deque(maxlen=1000)
+        self.down = False
+        self.call("/core", "setParam", "/run_id", "1")
+
+    def call(self, caller: str, method: str, *params: XmlRpcValue) -> RosReply:
+        reply = self.api.call(method, (caller, *params))
+        for effect in self.api.take()[0]:
+            if isinstance(effect, ParamUpdate) and effect.api == OURS:
+                self.told(effect.key.rstrip("/"))
+        return reply
+
+    async def ask(self, method: str, *params: XmlRpcValue) -> RosReply:
+        if self.down:
+            raise UnreachableError("ROS master", "http://core/")
+        await asyncio.sleep(0)
+        caller, *rest = params
+        self.calls.append((method, str(rest[-1] if method.endswith("Param") and len(rest) == 1 else rest)))
+        return self.call(str(caller), method, *rest)
+
+    def set(self, key: str, value: XmlRpcValue) -> None:
+        assert self.call("/somebody", "setParam", key, value).code == 1
+
+    def get(self, key: str) -> XmlRpcValue:
+        reply = self.api.call("getParam", ("/somebody", key))
+        return reply.value if reply.code == 1 else None
+
+
+class Side:
+    """One module."""
+
+    def __init__(self, name: str, params: ParamSettings | None = None, time: TimeSettings | None = None) -> None:
+        self.name = name
+        self.core = FakeCore()
+        self.counters = Counters()
+        self.asks = PeerRpc(self.counters)
+        self.links: dict[int, PeerSession] = {}
+        bridge = SimpleNamespace(
+            node=SimpleNamespace(uri=OURS), asks=self.asks, counters=self.counters, attached=self.links.values
+        )
+        self.params = Params(
+            cast("Core", self.core), cast("Bridge", bridge), params or ParamSettings(), time or TimeSettings()
+        )
+        self.core.told = self.params.param_update
+
+    def link(self, other: Side, number: int) -> PeerSession:
+        def send(payload: bytes) -> None:
+            assert len(payload) < 2 * limits.PARAM_PORTION + 1000
+            back = other.links.get(number)
+            if back is not None:
+                asyncio.get_running_loop().call_soon(other.asks.message, back, decode(payload))
+
+        attached = cast(
+            "PeerSession", SimpleNamespace(peer=number, link=SimpleNamespace(name=other.name, send_control=send))
+        )
+        self.links[number] = attached
+        return attached
+
+    def up(self, number: int) -> None:
+        self.params.link_up(self.links[number])
+
+    def down(self, number: int) -> None:
+        attached = self.links.pop(number)
+        self.asks.link_down(attached)
+        self.params.link_down(attached)
+
+    def states(self) -> dict[str, str]:
+        return {entry.rule.to: entry.state for entry in self.params.followed}
+
+    async def look(self) -> None:
+        self.params.reconcile()
+        while self.params._looking is not None:
+            await asyncio.sleep(0)
+
+    async def ask(self, what: str, args: dict[str, Any], number: int = 1) -> Any:
+        return await self.asks.ask(self.links[number], what, args)
+
+    async def drive(self, steps: Any) -> Any:
+        try:
+            question = next(steps)
+            while True:
+                question = steps.send(await self.ask(*question))
+        except StopIteration as done:
+            return done.value
+
+    async def close(self) -> None:
+        await self.asks.close()
+        await self.params.close()
+
+
+def join(one: Side, other: Side, number: int = 1) -> None:
+    one.link(other, number)
+    other.link(one, number)
+    one.up(number)
+    other.up(number)
+
+
+async def until(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(20):
+        while not condition():
+            await asyncio.sleep(0.001)
+
+
+def follows(*rules: FollowRule) -> ParamSettings:
+    return ParamSettings(follow=rules)
+
+
+DESCRIPTION = FollowRule("/robot_description", "base", "/base/robot_description")
+ARM = FollowRule("/arm", "base", "/arm")
+
+
+@pytest.fixture
+async def sides(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.setattr(limits, "PARAM_PORTION", 1000)
+    monkeypatch.setattr(limits, "PARAM_SMALL", 4000)
+    monkeypatch.setattr(limits, "PARAM_GATHER", 0.002)
+    made: list[Side] = []
+
+    def make(*sides: Side) -> None:
+        made.extend(sides)
+
+    yield make
+    for side in made:
+        await side.close()
+
+
+DATE = datetime(2020, 1, 2, 3, 4, 5)  # noqa: DTZ001 - XML-RPC's have no zone
+VALUES: list[XmlRpcValue] = [
+    True, 3, -1.5, "", "<x>&\n  é☃ ", b"\x00\xff", DATE, [], [1, [2.0, "x"]], {},
+    {"a": {"b": [True, {"c": b"x"}]}, "d": 0.1},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("value", VALUES, ids=repr)
+async def test_types_survive_as_text(value: XmlRpcValue) -> None:
+    back = await read_text(await write_text("/x", value))
+    assert back == value
+    assert type(back) is type(value)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "nonsense", "<methodResponse>", "\ud800", "<?xml version='1.0'?><methodCall></methodCall>"]
+)
+async def test_a_text_that_does_not_parse(text: str) -> None:
+    with pytest.raises(RmpaError):
+        await read_text(text)
+
+
+async def test_get_set_list_delete(sides: Any) -> None:
+    base = Side("base", ParamSettings(remote_get=("/open/**", "/big"), remote_set=("/open/**",)))
+    pad = Side("pad")
+    sides(base, pad)
+    join(base, pad)
+    base.core.set("/open", {"a": 1, "b": "x" * 5000})
+    base.core.set("/closed", 1)
+    text = await pad.drive(transfer.reading(transfer.GET, {"key": "/open"}))
+    assert await read_text(text) == {"a": 1, "b": "x" * 5000}
+    assert await read_text(await pad.drive(transfer.reading(transfer.NAMES, {}))) == ["/open/a", "/open/b"]
+    large = await write_text("", {"c": "y" * 9000, "d": {"e": True}})
+    assert await pad.drive(transfer.writing("/open", large, 7)) == 2
+    assert base.core.get("/open") == {"a": 1, "b": "x" * 5000, "c": "y" * 9000, "d": {"e": True}}
+    await pad.ask(transfer.DELETE, {"key": "/open/d"})
+    assert base.core.get("/open/d") is None
+    before = base.core.get("/")
+    bad = await write_text("", {"open": {"new": 1}, "closed": 2})
+    nil = (await write_text("", "x")).replace("<string>x</string>", "<nil/>")
+    for what, args, error in (
+        (transfer.GET, {"key": "/closed"}, "no glob of params.remote_get"),
+        (transfer.GET, {"key": "/"}, "may not be read"),
+        (transfer.GET, {"key": "/open/nothing"}, "no parameter /open/nothing"),
+        (transfer.GET, {"key": "relative"}, "not the global name"),
+        (transfer.GET, {}, "not the global name"),
+        (transfer.SET, {"key": "/", "text": bad}, "/closed may not be set"),
+        (transfer.SET, {"key": "/open/x", "text": "<nonsense"}, "malformed XML"),
+        (transfer.SET, {"key": "/open/x", "text": nil}, "nil"),
+        (transfer.SET, {"key": "/open//x", "text": nil}, "not a parameter's name"),
+        (transfer.SET, {"key": "/run_id", "text": "x"}, "malformed XML"),
+        (transfer.SET, {"key": "/open/x", "text": "x" * 2000}, "longer than a portion"),
+        (transfer.SET, {"key": "/open/x", "writing": 99, "size": 1}, "given up"),
+        (transfer.PUT, {"writing": 1, "offset": 5, "text": "x"}, "given up"),
+        (transfer.PUT, {"writing": -1, "offset": 0, "text": "x"}, "not a whole number"),
+        (transfer.MORE, {"reading": 99, "offset": 0}, "given up"),
+        (transfer.DELETE, {"key": "/open/nothing"}, "no parameter /open/nothing"),
+        (transfer.DELETE, {"key": "/"}, "the root holds every parameter"),
+        (transfer.FOLLOW, {"keys": "x"}, "not a list"),
+    ):
+        with pytest.raises(PeerRefused, match=error):
+            await pad.ask(what, args)
+    assert base.core.get("/") == before, "nothing is set in part"
+
+
+async def test_a_followed_parameter_is_as_over_there(sides: Any) -> None:
+    base, pad = Side("base"), Side("pad", follows(DESCRIPTION, ARM))
+    sides(base, pad)
+    base.core.set("/robot_description", "one")
+    join(base, pad)
+    await until(lambda: pad.core.get("/base/robot_description") == "one")
+    assert pad.core.get("/robot_description") is None
+    base.core.set("/robot_description", "two" * 3000)  # in portions
+    await until(lambda: pad.core.get("/base/robot_description") == "two" * 3000)
+    base.core.set("/arm", {"p": 1, "q": {"r": 2.5}})
+    await until(lambda: pad.core.get("/arm") == {"p": 1, "q": {"r": 2.5}})
+    base.core.call("/x", "deleteParam", "/arm/q/r")
+    await until(lambda: pad.core.get("/arm") == {"p": 1, "q": {}})
+    base.core.set("/arm/q/s", True)
+    await until(lambda: pad.core.get("/arm") == {"p": 1, "q": {"s": True}})
+    base.core.call("/x", "deleteParam", "/arm")
+    await until(lambda: pad.core.get("/arm") is None)
+    assert pad.states() == {"/base/robot_description": "followed", "/arm": "followed"}
+    # Who has nothing new to tell sets nothing.
+    pad.core.calls.clear()
+    await base.look()
+    await pad.look()
+    assert "setParam" not in {method for method, _ in pad.core.calls}
+
+
+@pytest.mark.parametrize("size", [10, 9000])
+async def test_what_is_set_here_is_put_back(sides: Any, size: int, caplog: pytest.LogCaptureFixture) -> None:
+    base, pad = Side("base"), Side("pad", follows(DESCRIPTION))
+    sides(base, pad)
+    base.core.set("/robot_description", "x" * size)
+    join(base, pad)
+    await until(lambda: pad.core.get("/base/robot_description") == "x" * size)
+    await until(lambda: not pad.params._follower._working)
+    pad.core.set("/base", {"robot_description": "mine"})
+    await pad.look()
+    assert pad.core.get("/base/robot_description") == "x" * size
+    assert "was changed here, and is put back: it belongs to base" in caplog.text
+    assert base.core.get("/robot_description") == "x" * size, "one direction"
+    # While its owner is away too.
+    base.down(1)
+    pad.down(1)
+    assert pad.states() == {"/base/robot_description": "waiting"}
+    pad.core.call("/x", "deleteParam", "/base/robot_description")
+    await pad.look()
+    assert pad.core.get("/base/robot_description") == "x" * size
+
+
+async def test_an_owner_that_comes_back_without_it_takes_nothing_away(sides: Any) -> None:
+    base, pad = Side("base"), Side("pad", follows(DESCRIPTION))
+    sides(base, pad)
+    base.core.set("/robot_description", "one")
+    join(base, pad)
+    await until(lambda: pad.core.get("/base/robot_description") == "one")
+    base.down(1)
+    pad.down(1)
+    again = Side("base")
+    sides(again)
+    join(again, pad, 2)
+    await until(lambda: again.params._desk._last == {"/robot_description": None})
+    await pad.ask(transfer.NAMES, {}, 2)  # its answer comes behind what was told
+    await until(lambda: not pad.params._follower._working)
+    await again.look()
+    await pad.look()
+    assert pad.core.get("/base/robot_description") == "one"
+    again.core.set("/robot_description", "two")
+    await until(lambda: pad.core.get("/base/robot_description") == "two")
+
+
+async def test_two_of_one_name_are_not_mixed(sides: Any, caplog: pytest.LogCaptureFixture) -> None:
+    first, second, pad = Side("base"), Side("base"), Side("pad", follows(DESCRIPTION))
+    sides(first, second, pad)
+    first.core.set("/robot_description", "first")
+    second.core.set("/robot_description", "second")
+    join(first, pad, 1)
+    join(second, pad, 2)
+    await until(lambda: pad.core.get("/base/robot_description") == "first")
+    assert "two peers are named base" in caplog.text
+    first.down(1)
+    pad.down(1)
+    await until(lambda: pad.core.get("/base/robot_description") == "second")
+
+
+async def test_refusals_are_said_and_asked_again(sides: Any, caplog: pytest.LogCaptureFixture) -> None:
+    base = Side("base", ParamSettings(remote_get=("/arm/**",)), TimeSettings())
+    pad = Side("pad", follows(DESCRIPTION, ARM), TimeSettings(follow="base"))
+    sides(base, pad)
+    base.core.set("/use_sim_time", True)
+    base.core.set("/robot_description", "one")
+    join(base, pad)
+    await until(lambda: list(pad.states().values()).count("refused") == 2)
+    problems = {entry.rule.to: entry.problem for entry in pad.params.followed}
+    assert "remote_get" in problems["/base/robot_description"]
+    assert "does not share its time" in problems["/use_sim_time"]
+    assert problems["/base/robot_description"] in caplog.text
+    assert pad.core.get("/use_sim_time") is None
+    # The owner's rules change: it is followed without a word of ours.
+    base.params.reload(Settings(params=ParamSettings(), time=TimeSettings(share=True)))
+    await pad.look()
+    await until(lambda: pad.core.get("/use_sim_time") is True)
+    await until(lambda: pad.core.get("/base/robot_description") == "one")
+    # And back: what is here stays, and is not followed any more.
+    base.params.reload(Settings(params=ParamSettings(), time=TimeSettings()))
+    await until(lambda: pad.states()["/use_sim_time"] == "refused")
+    base.core.set("/use_sim_time", False)
+    await base.look()
+    assert pad.core.get("/use_sim_time") is True
+
+
+async def test_no_chains_and_no_loops(sides: Any) -> None:
+    base = Side("base", follows(FollowRule("/arm/p", "pad", "/arm/p")))
+    pad = Side("pad", follows(ARM))
+    sides(base, pad)
+    base.core.set("/arm", {"p": 1})
+    pad.core.set("/arm", {"p": 2})
+    join(base, pad)
+    await until(lambda: "refused" in {**base.states(), **pad.states()}.values())
+    text = await write_text("", 5)
+    with pytest.raises(PeerRefused, match="followed from base:/arm"):
+        await base.ask(transfer.SET, {"key": "/arm/x", "text": text})
+
+
+async def test_a_core_that_is_started_anew_gets_all_of_it_again(sides: Any) -> None:
+    base, pad = Side("base"), Side("pad", follows(DESCRIPTION, ARM))
+    sides(base, pad)
+    base.core.set("/robot_description", "x" * 9000)
+    base.core.set("/arm", 1)
+    join(base, pad)
+    await until(lambda: pad.core.get("/arm") == 1)
+    await until(lambda: pad.core.get("/base/robot_description") == "x" * 9000)
+    await pad.look()
+    await base.look()
+    pad.core.api = MasterApi("http://core/", 1, lambda _: None)
+    pad.core.down = True
+    await pad.look()
+    pad.core.down = False
+    pad.core.call("/core", "setParam", "/run_id", "2")
+    await pad.look()
+    await until(lambda: pad.core.get("/base/robot_description") == "x" * 9000)
+    await until(lambda: pad.core.get("/arm") == 1)
+    # The owner's: it is subscribed to again, and what it has is told.
+    base.core.api = MasterApi("http://core/", 1, lambda _: None)
+    base.core.call("/core", "setParam", "/run_id", "2")
+    base.core.call("/core", "setParam", "/robot_description", "new")
+    await base.look()
+    await until(lambda: pad.core.get("/base/robot_description") == "new")
+    base.core.set("/arm", 2)
+    await until(lambda: pad.core.get("/arm") == 2)
+
+
+async def test_a_lost_notification_is_noticed(sides: Any) -> None:
+    base, pad = Side("base"), Side("pad", follows(ARM))
+    sides(base, pad)
+    base.core.set("/arm", 1)
+    join(base, pad)
+    await until(lambda: pad.core.get("/arm") == 1)
+    base.core.told = lambda _: False
+    base.core.set("/arm", 2)
+    await base.look()
+    await until(lambda: pad.core.get("/arm") == 2)
+
+
+async def test_other_rules_leave_the_rest_alone(sides: Any) -> None:
+    base, pad = Side("base"), Side("pad", follows(DESCRIPTION))
+    sides(base, pad)
+    base.core.set("/robot_description", "one")
+    base.core.set("/arm", 1)
+    join(base, pad)
+    await until(lambda: pad.core.get("/base/robot_description") == "one")
+    pad.params.reload(Settings(params=follows(ARM)))
+    await until(lambda: pad.core.get("/arm") == 1)
+    base.core.set("/robot_description", "two")
+    pad.core.set("/base/robot_description", "mine")
+    await pad.look()
+    await base.look()
+    assert pad.core.get("/base/robot_description") == "mine", "it is ours again"
+    assert list(base.params._desk.followed) == ["/arm"]
+
+
+async def test_a_namespace_that_may_not_be_read_in_full_is_not_followed(sides: Any) -> None:
+    base = Side("base", ParamSettings(remote_get=("/arm", "/arm/p")))
+    pad = Side("pad", follows(ARM))
+    sides(base, pad)
+    base.core.set("/arm", {"p": 1, "secret": 2})
+    join(base, pad)
+    await until(lambda: pad.states() == {"/arm": "refused"})
+    assert pad.core.get("/arm") is None
+    base.core.call("/x", "deleteParam", "/arm/secret")
+    await until(lambda: pad.core.get("/arm") == {"p": 1})
+
+
+async def test_values_that_do_not_parse_change_nothing(sides: Any, caplog: pytest.LogCaptureFixture) -> None:
+    base, pad = Side("base"), Side("pad", follows(ARM))
+    sides(base, pad)
+    base.core.set("/arm", 1)
+    join(base, pad)
+    await until(lambda: pad.core.get("/arm") == 1)
+    base.asks.tell(base.links[1], transfer.VALUE, {"key": "/arm", "exists": True, "size": 3, "text": "<x>"})
+    await until(lambda: pad.states() == {"/arm": "refused"})
+    assert pad.core.get("/arm") == 1
+    assert "/arm is not as over there" in caplog.text

@@ -1,0 +1,351 @@
+"""Calls over a route: every byte arrives, in whichever size; whoever will get no answer is told so at once."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, cast
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rmpa.bridge.services.io.bodies import BodyReceiver, BodySender, Budget
+from rmpa.bridge.services.io.calls import Budgets, Caller, CallStats, Server
+from rmpa.core import limits
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.core.outbox import ABORT, FIRST, LAST, Outbox, QueuedMessage
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.bridge.services.io.connection_pool import ServicePool
+    from rmpa.ros.node.service_server import ServiceCall
+    from rmpa.runtime.stream import Buffer
+
+SMALL = b"x" * 100
+MIDDLE = bytes(range(256)) * 64
+LARGE = bytes(range(251)) * 4000
+
+
+class Lane:
+    """One lane that hands on at once; ``slow`` keeps what comes."""
+
+    def __init__(self, wire: Wire) -> None:
+        self.wire = wire
+        self.outbox = Outbox(10, 1 << 20)
+        self.ended = False
+        self.slow = False
+        self.kept: list[Callable[[], None]] = []
+        self.sent = 0
+
+    def send(self, route: int, sequence: int, stamp_ns: int, payload: Buffer) -> int:
+        assert len(payload) <= limits.FRAGMENT_BYTES
+        framed = memoryview(bytes(payload))
+        self._go(lambda: self.wire.takers[route].message(sequence, stamp_ns, framed))
+        return 0
+
+    def open(self, route: int, size: int, sequence: int, stamp_ns: int) -> QueuedMessage:
+        return QueuedMessage(route, size, sequence, stamp_ns)
+
+    def extend(self, parcel: QueuedMessage, data: Buffer) -> int:
+        view = memoryview(bytes(data))
+        for start in range(0, len(view), limits.FRAGMENT_BYTES):
+            part = view[start : start + limits.FRAGMENT_BYTES]
+            flags = (0 if parcel.sent else FIRST) | LAST * (parcel.sent + len(part) == parcel.size)
+            parcel.sent += len(part)
+            self._go(
+                lambda flags=flags, part=part: self.wire.takers[parcel.key].part(  # type: ignore[misc]
+                    parcel.sequence, parcel.stamp_ns, flags, part
+                )
+            )
+        return 0
+
+    def set_terms(self, route: int, depth: int, max_age: float | None, *, strict: bool) -> None:
+        assert (depth, max_age) == (limits.KEEP_ALL_MESSAGES, None), "nothing of a call may be dropped"
+
+    def _go(self, deliver: Callable[[], None]) -> None:
+        self.sent += 1
+        if self.slow:
+            self.kept.append(deliver)
+        else:
+            deliver()
+
+
+class Wire:
+    """A link's one direction; ``takers`` are the other side's."""
+
+    def __init__(self) -> None:
+        self.express, self.bulk = Lane(self), Lane(self)
+        self.takers: dict[int, BodyReceiver] = {}
+        self.closed: list[int] = []
+
+    def close_route(self, route: int) -> int:
+        self.closed.append(route)
+        return 0
+
+
+class Kept(BodyReceiver):
+    """Keeps what comes."""
+
+    def __init__(self, budget: Budget | None = None) -> None:
+        super().__init__(budget or Budget())
+        self.bodies: list[tuple[int, bytes]] = []
+        self.failures: list[tuple[int, str]] = []
+
+    def body(self, sequence: int, body: bytes | bytearray) -> None:
+        self.bodies.append((sequence, bytes(body)))
+
+    def failed(self, sequence: int, reason: str) -> None:
+        self.failures.append((sequence, reason))
+
+
+class Call:
+    """A client's request at a proxy."""
+
+    def __init__(self, request: bytes) -> None:
+        self.request = request
+        self.deadline = asyncio.get_running_loop().time() + 5
+        self.on_gone: Callable[[], None] | None = None
+        self.answer: tuple[bool, bytes] | None = None
+
+    def reply(self, ok: bool, body: Buffer) -> None:
+        assert self.answer is None
+        self.answer = (ok, bytes(body))
+
+    def fail(self, text: str) -> None:
+        self.reply(False, text.encode())
+
+    @property
+    def text(self) -> str:
+        assert self.answer is not None
+        assert not self.answer[0]
+        return self.answer[1].decode()
+
+
+class Pool:
+    """The server: answers with the request backwards, unless it is told to wait."""
+
+    service = "/add"
+
+    def __init__(self) -> None:
+        self.waiting: list[tuple[bytes, Callable[[bool, Buffer], None]]] | None = None
+        self.timeouts: list[float] = []
+
+    def call(self, body: Buffer, timeout: float, done: Callable[[bool, Buffer], None]) -> None:
+        self.timeouts.append(timeout)
+        if self.waiting is not None:
+            self.waiting.append((bytes(body), done))
+        elif bytes(body) == b"fail":
+            done(False, b"it sticks")
+        else:
+            done(True, bytes(body)[::-1])
+
+
+class Ends:
+    """A caller and a server with a wire each way."""
+
+    def __init__(self) -> None:
+        self.there, self.back = Wire(), Wire()
+        self.pool = Pool()
+        self.stats, self.served = CallStats(), CallStats()
+        self.budgets, self.budgets_there = Budgets(), Budgets()
+        self.caller = Caller(self.there, 2, "service [/add] of base", self.budgets, self.stats)
+        self.server = Server(self.back, 1, cast("ServicePool", self.pool), 7.0, self.budgets_there, self.served)
+        self.there.takers[2] = self.server
+        self.back.takers[1] = self.caller
+
+    def call(self, request: bytes) -> Call:
+        call = Call(request)
+        self.caller.call(cast("ServiceCall", call))
+        return call
+
+    def assert_nothing_held(self) -> None:
+        held = [b.used for pair in (self.budgets, self.budgets_there) for b in (pair.outgoing, pair.incoming)]
+        assert held == [0, 0, 0, 0]
+        assert (self.stats.active, self.served.active, self.caller.active) == (0, 0, 0)
+
+
+async def _answered(*calls: Call) -> None:
+    async with asyncio.timeout(20):
+        while any(call.answer is None for call in calls):
+            await asyncio.sleep(0)
+    await asyncio.sleep(0)
+
+
+async def test_calls_of_every_size_at_once_by_the_lane_of_their_size() -> None:
+    ends = Ends()
+    requests = [b"", SMALL, MIDDLE, LARGE, SMALL + b"2", MIDDLE + b"2", LARGE + b"2", b"fail"]
+    calls = [ends.call(request) for request in requests]
+    await _answered(*calls)
+    for call in calls[:-1]:
+        assert call.answer == (True, call.request[::-1])
+    assert calls[-1].text == "it sticks"
+    assert ends.there.express.sent == ends.back.express.sent == 4
+    assert ends.there.bulk.sent > 4
+    assert (ends.stats.calls, ends.stats.failed, ends.stats.problem) == (8, 1, "it sticks")
+    assert (ends.served.calls, ends.served.failed) == (8, 1)
+    assert len(ends.stats.latencies) == 7
+    assert set(ends.pool.timeouts) == {7.0 + limits.SERVICE_GRACE}
+    ends.assert_nothing_held()
+
+
+async def test_answers_come_in_any_order() -> None:
+    ends = Ends()
+    ends.pool.waiting = []
+    calls = [ends.call(b"%d" % number) for number in range(3)]
+    for body, done in reversed(ends.pool.waiting):
+        done(True, b"to " + body)
+    assert [call.answer for call in calls] == [(True, b"to %d" % number) for number in range(3)]
+
+
+async def test_a_client_that_leaves_wants_no_answer() -> None:
+    ends = Ends()
+    ends.pool.waiting = []
+    call = ends.call(LARGE)
+    async with asyncio.timeout(20):
+        while not ends.pool.waiting:
+            await asyncio.sleep(0)
+    assert call.on_gone is not None
+    call.on_gone()
+    assert ends.stats.problem == "the client left in the middle of the call"
+    ends.pool.waiting[0][1](True, LARGE)
+    await asyncio.sleep(0)
+    while ends.server._sender is not None and ends.server._sender._task is not None:
+        await asyncio.sleep(0)
+    assert call.answer is None
+    ends.assert_nothing_held()
+
+
+async def test_who_waits_when_the_service_is_closed_is_told_why() -> None:
+    ends = Ends()
+    ends.pool.waiting = []
+    calls = [ends.call(SMALL), ends.call(LARGE)]
+    ends.caller.close("the link to base was lost")
+    assert {call.text for call in calls} == {"service [/add] of base: the link to base was lost"}
+    assert ends.there.closed == [2]
+    ends.server.close()
+    for _, done in ends.pool.waiting:
+        done(True, SMALL)
+    assert ends.back.express.sent == 0
+    ends.assert_nothing_held()
+
+
+async def test_a_reply_that_is_lost_with_the_bulk_lane_is_an_error() -> None:
+    ends = Ends()
+    ends.back.bulk.slow = True
+    call = ends.call(b"small")
+    ends.pool.waiting = []
+    other = ends.call(SMALL)
+    ends.pool.waiting[0][1](True, LARGE)
+    while ends.server._sender is not None and ends.server._sender._task is not None:
+        await asyncio.sleep(0)
+    ends.back.bulk.kept[0]()
+    ends.caller.lane_lost()
+    ends.server.lane_lost()
+    assert call.answer == (True, b"llams")
+    assert "the connection for large messages was lost" in other.text
+    ends.assert_nothing_held()
+
+
+async def test_a_request_on_the_bulk_lane_when_it_is_lost_is_an_error() -> None:
+    ends = Ends()
+    ends.there.bulk.slow = True
+    large, small = ends.call(MIDDLE), ends.call(SMALL)
+    ends.caller.lane_lost()
+    assert "was lost in the middle of the call" in large.text
+    assert small.answer == (True, SMALL[::-1])
+
+
+async def test_more_than_the_budget_is_refused_and_the_rest_goes_on() -> None:
+    ends = Ends()
+    ends.budgets.outgoing.limit = 2 * len(MIDDLE)
+    ends.pool.waiting = []
+    calls = [ends.call(MIDDLE) for _ in range(3)]
+    assert "of calls are under way; try again later" in calls[2].text
+    ends.budgets.outgoing.limit = 1 << 20
+    ends.budgets_there.incoming.limit = 1
+    late = ends.call(SMALL)
+    assert "requests are being served" in late.text
+    ends.budgets_there.outgoing.limit = len(MIDDLE)
+    for _, done in ends.pool.waiting:
+        done(True, MIDDLE)
+    await _answered(*calls)
+    assert [call.answer and call.answer[0] for call in calls] == [True, True, False]
+    ends.assert_nothing_held()
+
+
+async def test_a_slow_link_holds_up_only_what_is_larger_than_it_takes() -> None:
+    """Of a large body no more is copied than may wait; small ones go past it."""
+    ends = Ends()
+    pending = SimpleNamespace(pending_bytes=1 << 30)
+    ends.there.bulk.outbox = cast("Outbox", pending)
+    large = ends.call(LARGE)
+    for _ in range(5):
+        await asyncio.sleep(0)
+    sent = ends.there.bulk.sent
+    assert ends.call(SMALL).answer == (True, SMALL[::-1])
+    assert ends.there.bulk.sent == sent
+    pending.pending_bytes = 0
+    await _answered(large)
+    assert large.answer == (True, LARGE[::-1])
+
+
+@given(st.lists(st.sampled_from([0, 1, 8191, 8192, 8193, 131067, 131068, 131069, 300_000]), max_size=6))
+def test_bodies_arrive_whole_and_once(sizes: list[int]) -> None:
+    async def run() -> None:
+        wire, kept = Wire(), Kept()
+        wire.takers[5] = kept
+        sender = BodySender(wire, 5)
+        bodies = [(number, bytes([number]) * size) for number, size in enumerate(sizes)]
+        for number, body in bodies:
+            sender.send(number, body, b"!")
+        while sender._task is not None:
+            await asyncio.sleep(0)
+        assert sorted(kept.bodies) == [(number, b"!" + body) for number, body in bodies]
+        assert kept._budget.used == 0
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize(
+    ("parts", "error"),
+    [
+        ([(FIRST, b"\1\0")], RemoteProtocolError),
+        ([(FIRST, (limits.SERVICE_MESSAGE_MAX + 2).to_bytes(4, "little"))], LimitExceeded),
+        ([(FIRST, b"\2\0\0\0"), (0, b"abc")], RemoteProtocolError),
+        ([(FIRST, b"\2\0\0\0"), (LAST, b"a")], RemoteProtocolError),
+    ],
+)
+def test_parts_that_cannot_be_break_the_protocol(parts: list[tuple[int, bytes]], error: type[Exception]) -> None:
+    taker = Kept()
+
+    def take() -> None:
+        for flags, part in parts:
+            taker.part(1, 0, flags, memoryview(part))
+
+    with pytest.raises(error):
+        take()
+
+
+def test_parts_that_are_not_followed_are_told_and_let_go() -> None:
+    taker = Kept()
+    taker.part(1, 0, FIRST, memoryview(b"\4\0\0\0ab"))
+    taker.part(1, 0, LAST | ABORT, memoryview(b""))
+    taker.part(2, 0, FIRST, memoryview(b"\4\0\0\0ab"))
+    taker.part(3, 0, FIRST, memoryview(b"\1\0\0\0"))
+    taker.part(2, 0, LAST, memoryview(b"cd"))
+    taker.part(3, 0, LAST, memoryview(b"x"))
+    assert [sequence for sequence, _ in taker.failures] == [1, 2]
+    assert taker.bodies == [(3, b"x")]
+    assert taker._budget.used == 0
+
+
+def test_parts_beyond_the_budget_pass_unkept() -> None:
+    budget = Budget(10)
+    assert budget.take(8)
+    taker = Kept(budget)
+    taker.part(1, 0, FIRST, memoryview(b"\4\0\0\0ab"))
+    taker.part(1, 0, LAST, memoryview(b"cd"))
+    assert [sequence for sequence, _ in taker.failures] == [1]
+    assert (taker.bodies, budget.used) == ([], 8)

@@ -1,0 +1,443 @@
+"""The proxies of one peer in made-up time: what becomes of a source's flow, its watch and its subscribers."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
+
+import pytest
+
+from rmpa.bridge.actions import Describe, Detach, Publish, Retract
+from rmpa.bridge.data.qos_events import QosEventKind
+from rmpa.bridge.messages import Description, Source
+from rmpa.bridge.topics.io.proxies import PeerProxies
+from rmpa.core import limits
+from rmpa.core.contract import Contract, Durability, Liveliness, Reliability
+from rmpa.core.outbox import FIRST
+from tests.bridge.io.nodes import MD5, Core, Ear, stages
+from tests.bridge.io.two_bridges import made_up
+from tests.bridge.io.virtual import VirtualLoop, run
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
+
+    from rmpa.bridge.data.io.flows import ImportFlow
+    from rmpa.bridge.data.qos_events import QosEvent
+    from rmpa.ros.core.embedded import RosCore
+    from rmpa.ros.node.publication import Publication
+
+CMD = Source("/cmd", "/joy")
+SURE = Contract(reliability=Reliability.RELIABLE)
+TOLD: list[tuple[dict[str, Any], int, list[QosEventKind]]] = [
+    ({"epoch": 5, "following": 2}, 0, []),
+    ({"epoch": 5, "following": 9}, 7, [QosEventKind.MESSAGES_LOST]),
+    ({"epoch": 6, "lost": 0}, 0, []),
+    ({"epoch": 6, "lost": 7}, 7, [QosEventKind.MESSAGES_LOST]),
+    ({"epoch": 6, "lost": 7, "at_least": True}, 7, [QosEventKind.MESSAGES_LOST, QosEventKind.LOSS_UNKNOWN]),
+    ({"epoch": 6}, 0, [QosEventKind.LOSS_UNKNOWN]),
+]
+"""What a peer says when its route is open again, and what is made of it."""
+ALIVE = Contract(liveliness_lease=5.0)
+
+
+def framed(text: str, size: int = 0) -> memoryview:
+    body = text.encode().ljust(size, b".")
+    return memoryview(len(body).to_bytes(4, "little") + body)
+
+
+class Heard:
+    """A local node that listens to one publication."""
+
+    def __init__(self, publication: Publication) -> None:
+        self.texts: list[str] = []
+        self.ears: dict[Publication, Ear] = {}
+        self.ear = self.ears[publication] = Ear(cast("Any", self), publication)
+        publication.attach(cast("Any", self.ear))
+
+    def heard(self, _ear: Ear, message: bytes) -> None:
+        self.texts.append(message[4:].decode().rstrip("."))
+
+    @property
+    def closed(self) -> bool:
+        return bool(self.ear.stream.closed)
+
+
+class Proxied:
+    """The proxies of one peer, and what was said of them."""
+
+    def __init__(self) -> None:
+        self.named: list[str] = []
+        self.demands: list[bool] = []
+        self.occurred: list[tuple[float, QosEvent]] = []
+        self.acks: list[int] = []
+        self.loop = asyncio.get_running_loop()
+        self.core = Core(cast("Any", SimpleNamespace(name="a", named=self.named.append)))
+        self.inbound = PeerProxies(
+            cast("RosCore", self.core),
+            "/rmpa/b",
+            on_demand=lambda _source, wanted: self.demands.append(wanted),
+            on_mismatch=lambda _source, _who, text: pytest.fail(text),
+            on_occurred=lambda _source, occurred: self.occurred.append((self.loop.time(), occurred)),
+        )
+
+    async def publish(self) -> Publication:
+        self.inbound.publish(Publish(1, CMD, "a/B"))
+        await asyncio.sleep(0.01)
+        publication = self.inbound.publication(CMD)
+        assert publication is not None
+        return publication
+
+    def describe(
+        self,
+        contract: Contract,
+        *,
+        route: int = 1,
+        epoch: int = 0,
+        first: int = 1,
+        latching: bool = False,
+        definition: str = "",
+        **told: Any,
+    ) -> ImportFlow:
+        about = Description("a/B", MD5, definition, latching)
+        self.inbound.describe(Describe(1, CMD, route, about, contract, epoch, first, **told), self.acks.append)
+        return self.inbound.flows[route]
+
+    def kinds(self) -> list[QosEventKind]:
+        return [occurred.kind for _, occurred in self.occurred]
+
+
+def play(scene: Callable[[Proxied], Coroutine[object, object, None]]) -> None:
+    loop = VirtualLoop()
+
+    async def main() -> None:
+        proxied = Proxied()
+        await scene(proxied)
+        await proxied.inbound.close()
+        assert proxied.core.publishers("/cmd") == {}
+
+    with made_up(loop):
+        run(main(), loop)
+    assert not stages
+
+
+def test_a_source_appears_flows_and_disappears() -> None:
+    async def scene(proxied: Proxied) -> None:
+        publication = await proxied.publish()
+        assert set(proxied.core.publishers("/cmd")) == {"/rmpa/b/joy"}
+        listener = Heard(publication)
+        assert proxied.demands == [True]
+        flow = proxied.describe(Contract())
+        flow.message(1, 0, framed("one"))
+        proxied.inbound.detach(Detach(1, CMD, 1))
+        assert proxied.inbound.flows == {}
+        proxied.inbound.retract(Retract(1, CMD))
+        await asyncio.sleep(0.01)
+        assert listener.texts == ["one"]
+        assert listener.closed
+        assert proxied.core.publishers("/cmd") == {}
+
+    play(scene)
+
+
+def test_what_is_described_before_its_proxy_is_there_or_after_it_went_is_left_alone() -> None:
+    async def scene(proxied: Proxied) -> None:
+        about = Description("a/B", MD5, "", False)
+        proxied.inbound.describe(Describe(1, CMD, 1, about, Contract()), proxied.acks.append)
+        assert proxied.inbound.flows == {}
+
+    play(scene)
+
+
+def test_the_contract_bounds_what_waits_for_a_subscriber_and_says_what_is_kept() -> None:
+    async def scene(proxied: Proxied) -> None:
+        publication = await proxied.publish()
+        proxied.describe(Contract(durability=Durability.TRANSIENT_LOCAL, depth=2), latching=True)
+        for number, text in enumerate("abc", 1):
+            proxied.inbound.flows[1].message(number, 0, framed(text))
+        assert publication._queue_messages == 2
+        assert Heard(publication).texts == ["b", "c"]
+
+    play(scene)
+
+
+def test_hung_up_on_in_the_middle_the_proxy_is_named_twice_and_not_at_once() -> None:
+    async def scene(proxied: Proxied) -> None:
+        listener = Heard(await proxied.publish())
+        flow = proxied.describe(Contract())
+        proxied.named.clear()
+        flow.part(1, 0, FIRST, framed("half", 1000)[:500])
+        proxied.inbound.link_down()
+        assert listener.closed
+        assert proxied.named == [], "rospy has not noticed yet"
+        for delay in limits.CALL_BACK_DELAYS:
+            before = len(proxied.named)
+            await asyncio.sleep(delay)
+            assert len(proxied.named) == before + 1
+        await asyncio.sleep(5.0)
+        assert proxied.named == ["/cmd"] * len(limits.CALL_BACK_DELAYS)
+
+    play(scene)
+
+
+def test_another_header_hangs_up_on_the_old_subscribers_and_calls_them_back() -> None:
+    async def scene(proxied: Proxied) -> None:
+        publication = await proxied.publish()
+        listener = Heard(publication)
+        proxied.describe(Contract(), latching=True)
+        proxied.inbound.flows[1].message(1, 0, framed("map"))
+        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        proxied.named.clear()
+        flow = proxied.describe(Contract(), route=2, latching=True, definition="string data")
+        assert listener.closed
+        again = Heard(publication)
+        flow.message(1, 0, framed("map"))
+        assert again.texts == ["map"], "who was hung up on has nothing of what the others had"
+        await asyncio.sleep(2.0)
+        assert len(proxied.named) == 2
+
+    play(scene)
+
+
+# --- over links that fall -----------------------------------------------------------------------------------------
+
+
+def test_a_reliable_source_goes_on_with_the_same_flow() -> None:
+    async def scene(proxied: Proxied) -> None:
+        listener = Heard(await proxied.publish())
+        flow = proxied.describe(SURE, epoch=5)
+        flow.message(1, 0, framed("one"))
+        flow.part(2, 0, FIRST, framed("half", 1000)[:500])
+        proxied.inbound.link_down()
+        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        assert proxied.inbound.position(CMD) == (5, 1)
+        assert proxied.inbound.flow(CMD, 1) is flow
+        assert proxied.describe(SURE, route=4, epoch=5) is flow
+        flow.message(2, 0, framed("two"))
+        flow.message(5, 0, framed("five"))
+        assert listener.texts == ["one", "two", "five"]
+        assert (flow.quality.messages, flow.lost) == (3, 2)
+        assert not listener.closed
+        await asyncio.sleep(limits.ACK_DELAY * 2)
+        assert proxied.acks[-1] == 5
+
+    play(scene)
+
+
+def test_a_sender_that_began_anew_is_said_and_brings_nothing_again() -> None:
+    async def scene(proxied: Proxied) -> None:
+        listener = Heard(await proxied.publish())
+        flow = proxied.describe(SURE, epoch=5, latching=True)
+        flow.message(1, 0, framed("map"))
+        proxied.inbound.link_down()
+        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        assert proxied.describe(SURE, epoch=6, latching=True) is flow
+        flow.message(1, 0, framed("map"))
+        flow.message(2, 0, framed("new map"))
+        assert listener.texts == ["map", "new map"]
+        assert proxied.kinds() == [QosEventKind.LOSS_UNKNOWN]
+
+    play(scene)
+
+
+@pytest.mark.parametrize(("told", "lost", "kinds"), TOLD)
+def test_what_a_sender_says_that_it_has_given_up_is_lost(
+    told: dict[str, Any], lost: int, kinds: list[QosEventKind]
+) -> None:
+    async def scene(proxied: Proxied) -> None:
+        await proxied.publish()
+        flow = proxied.describe(SURE, epoch=5)
+        flow.message(1, 0, framed("one"))
+        proxied.inbound.link_down()
+        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        assert proxied.describe(SURE, route=2, **told) is flow
+        assert (flow.lost, proxied.kinds()) == (lost, kinds)
+
+    play(scene)
+
+
+def test_where_a_numbering_goes_on_a_gap_is_counted_once() -> None:
+    async def scene(proxied: Proxied) -> None:
+        listener = Heard(await proxied.publish())
+        flow = proxied.describe(SURE, epoch=5)
+        flow.message(1, 0, framed("one"))
+        proxied.inbound.retract(Retract(1, CMD))
+        await asyncio.sleep(1.0)
+        assert proxied.inbound.position(CMD) == (5, 1)
+        again = Heard(await proxied.publish())
+        new = proxied.describe(SURE, route=2, epoch=5, following=8)
+        assert new is not flow
+        assert (new.lost, proxied.kinds()) == (6, [QosEventKind.MESSAGES_LOST])
+        new.message(9, 0, framed("nine"))
+        assert (new.lost, listener.texts, again.texts) == (7, ["one"], ["nine"])
+
+    play(scene)
+
+
+def test_a_contract_that_changed_meanwhile_makes_a_new_flow_that_loses_nothing() -> None:
+    async def scene(proxied: Proxied) -> None:
+        listener = Heard(await proxied.publish())
+        old = proxied.describe(SURE, epoch=5)
+        old.message(1, 0, framed("one"))
+        proxied.inbound.link_down()
+        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        new = proxied.describe(Contract(reliability=Reliability.RELIABLE, depth=7), epoch=5)
+        assert new is not old
+        new.message(1, 0, framed("one"))
+        new.message(2, 0, framed("two"))
+        assert listener.texts == ["one", "two"]
+        assert new.lost == 0
+
+    play(scene)
+
+
+@pytest.mark.parametrize("how", ["detach", "retract"])
+def test_what_is_not_to_go_on_any_more_is_forgotten(how: str) -> None:
+    async def scene(proxied: Proxied) -> None:
+        publication = await proxied.publish()
+        flow = proxied.describe(SURE, epoch=5, latching=True)
+        flow.message(1, 0, framed("one"))
+        proxied.inbound.link_down()
+        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        if how == "detach":
+            proxied.inbound.detach(Detach(1, CMD, 0))
+            assert publication.latched == ()
+        else:
+            proxied.inbound.retract(Retract(1, CMD))
+        # A source that leaves the graph while its peer is away is still missed.
+        assert proxied.inbound.position(CMD) == (None if how == "detach" else (5, 1))
+        proxied.inbound.unheard(lambda topic: topic == CMD.topic)
+        assert proxied.inbound.position(CMD) == (None if how == "detach" else (5, 1))
+        proxied.inbound.unheard(lambda _: False)
+        assert proxied.inbound.position(CMD) is None
+        assert proxied.inbound._latest == {}
+        await asyncio.sleep(limits.ACK_DELAY * 2)
+        assert proxied.acks == []
+
+    play(scene)
+
+
+def test_a_short_silence_of_a_latched_source_brings_its_message_to_nobody_twice() -> None:
+    async def scene(proxied: Proxied) -> None:
+        publication = await proxied.publish()
+        listener = Heard(publication)
+        proxied.describe(Contract(), latching=True).message(1, 0, framed("map"))
+        proxied.inbound.link_down()
+        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        late = Heard(publication)
+        flow = proxied.describe(Contract(), latching=True)
+        flow.message(1, 0, framed("map"))
+        flow.message(2, 0, framed("map"))
+        assert listener.texts == late.texts == ["map", "map"]
+        assert flow.quality.messages == 1
+        assert publication.latched == (bytes(framed("map")),)
+
+    play(scene)
+
+
+# --- what becomes of the contract -----------------------------------------------------------------------------------
+
+
+def test_a_missed_deadline_is_said_when_it_is_missed() -> None:
+    async def scene(proxied: Proxied) -> None:
+        await proxied.publish()
+        began = proxied.loop.time()
+        flow = proxied.describe(Contract(deadline=1.0))
+        await asyncio.sleep(0.9)
+        flow.message(1, 0, framed("one"))
+        await asyncio.sleep(1.5)
+        assert [(round(now - began, 3), occurred.kind) for now, occurred in proxied.occurred] == [
+            (1.9, QosEventKind.DEADLINE_MISSED)
+        ]
+        proxied.inbound.detach(Detach(1, CMD, 1))
+        await asyncio.sleep(60.0)
+        assert len(proxied.occurred) == 1, "nobody waits for it any more"
+
+    play(scene)
+
+
+def test_while_its_peer_is_away_a_source_misses_its_deadlines() -> None:
+    async def scene(proxied: Proxied) -> None:
+        await proxied.publish()
+        proxied.describe(Contract(deadline=0.2))
+        proxied.inbound.link_down()
+        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        await asyncio.sleep(0.5)
+        assert proxied.kinds() == [QosEventKind.DEADLINE_MISSED] * 2
+        proxied.inbound.retract(Retract(1, CMD))
+        await asyncio.sleep(60.0)
+        assert len(proxied.occurred) == 2
+
+    play(scene)
+
+
+@pytest.mark.parametrize("silent", [False, True])
+def test_a_source_that_leaves_with_its_peer_is_lost_at_once_however_the_link_ended(silent: bool) -> None:
+    async def scene(proxied: Proxied) -> None:
+        await proxied.publish()
+        proxied.describe(ALIVE)
+        proxied.inbound.link_down()
+        if silent:
+            proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+            await asyncio.sleep(limits.AWAY_GRACE)
+            assert proxied.occurred == []
+        else:
+            proxied.inbound.detach(Detach(1, CMD, 1))
+        proxied.inbound.retract(Retract(1, CMD))
+        assert proxied.kinds() == [QosEventKind.LIVELINESS_LOST]
+        await asyncio.sleep(60.0)
+        assert len(proxied.occurred) == 1
+
+    play(scene)
+
+
+def test_a_source_that_is_back_within_its_lease_was_never_lost() -> None:
+    async def scene(proxied: Proxied) -> None:
+        await proxied.publish()
+        contract = Contract(reliability=Reliability.RELIABLE, liveliness_lease=5.0)
+        proxied.describe(contract, epoch=5)
+        proxied.inbound.link_down()
+        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        await asyncio.sleep(4.0)
+        proxied.describe(contract, epoch=5)
+        await asyncio.sleep(60.0)
+        assert proxied.occurred == []
+
+    play(scene)
+
+
+def test_a_source_whose_peer_stays_away_is_lost_when_its_lease_is_over() -> None:
+    async def scene(proxied: Proxied) -> None:
+        await proxied.publish()
+        proxied.describe(Contract(reliability=Reliability.RELIABLE, liveliness_lease=5.0), epoch=5)
+        await asyncio.sleep(10.0)
+        began = proxied.loop.time()
+        proxied.inbound.link_down()
+        proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
+        await asyncio.sleep(20.0)
+        [(lost, occurred)] = proxied.occurred
+        assert occurred.kind is QosEventKind.LIVELINESS_LOST
+        assert 5.0 <= lost - began <= 5.5
+
+    play(scene)
+
+
+def test_one_that_must_say_itself_that_it_lives_is_watched_by_its_messages() -> None:
+    async def scene(proxied: Proxied) -> None:
+        await proxied.publish()
+        flow = proxied.describe(Contract(liveliness=Liveliness.MANUAL_BY_TOPIC, liveliness_lease=1.0))
+        await asyncio.sleep(1.5)
+        flow.message(1, 0, framed("here"))
+        await asyncio.sleep(0.5)
+        assert proxied.kinds() == [QosEventKind.LIVELINESS_LOST, QosEventKind.LIVELINESS_RESTORED]
+
+    play(scene)
+
+
+def test_all_is_registered_again_that_the_core_has_lost() -> None:
+    async def scene(proxied: Proxied) -> None:
+        await proxied.publish()
+        assert proxied.inbound.reconcile({"/cmd": dict(proxied.core.publishers("/cmd"))}) == 0
+        assert proxied.inbound.reconcile({}) == 1
+
+    play(scene)

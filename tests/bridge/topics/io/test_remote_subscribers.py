@@ -1,0 +1,201 @@
+"""Who listens is told to the peer that publishes; whom a peer tells of is connected to our publisher."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+import pytest
+
+from rmpa.bridge.messages import (
+    Advertise,
+    Audience,
+    CloseRoute,
+    Description,
+    OpenRoute,
+    RouteClosed,
+    RouteOpened,
+    Source,
+    TopicOffer,
+    decode,
+)
+from rmpa.bridge.policy import Policy
+from rmpa.bridge.topics.exports import Exports, LocalSource
+from rmpa.bridge.topics.imports import Imports
+from rmpa.bridge.topics.io import remote_subscribers as module
+from rmpa.bridge.topics.io.remote_subscribers import RemoteSubscribers
+from rmpa.config.settings import PolicySettings
+from rmpa.core import limits
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.bridge.io.bridge import PeerSession
+
+GOAL = Source("/count/goal", "/client")
+CHATTER = Source("/chatter", "/client")
+TYPE = "actionlib/TestActionGoal"
+GOAL_OFFER = TopicOffer("/count/goal", "/client", TYPE)
+MD5 = "5a9ea5f83505693b71e785041e67a8bb"
+URI = "http://client:1/"
+
+
+class Connection:
+    """A connection to a local publisher that is only noted."""
+
+    made: ClassVar[list[Connection]] = []
+
+    def __init__(
+        self, topic: str, uri: str, caller_id: str, *, on_message: Callable[[memoryview], None], on_parts: object
+    ) -> None:
+        assert on_parts is not None, "a large goal would be kept"
+        on_message(memoryview(b"what comes is dropped"))
+        self.what = (topic, uri, caller_id)
+        self.running = False
+        self.made.append(self)
+
+    def start(self) -> None:
+        self.running = True
+
+    def close(self) -> None:
+        self.running = False
+
+
+def connected() -> list[str]:
+    """Under which names we are connected."""
+    return sorted(one.what[2] for one in Connection.made if one.running)
+
+
+class World:
+    """The plans of one bridge, and one peer."""
+
+    def __init__(self) -> None:
+        policy = Policy(PolicySettings())
+        self.exports, self.imports = Exports(policy), Imports(policy, lambda: 0.5)
+        self.sent: list[object] = []
+        self.warned: list[str] = []
+        self.listeners: dict[Source, tuple[str, ...]] = {}
+        link = SimpleNamespace(name="base", send_control=lambda payload: self.sent.append(decode(payload)))
+        inbound = SimpleNamespace(prefix="/rmpa/base", publication=self._publication)
+        self.peer = cast("PeerSession", SimpleNamespace(peer=1, link=link, inbound=inbound))
+        refusals = SimpleNamespace(refuse=lambda _now, kind, _who, _text: self.warned.append(kind))
+        self.presence = RemoteSubscribers(self.exports, self.imports, {1: self.peer}.get, cast("Any", refusals))
+        self.exports.link_up(1)
+        self.imports.link_up(1)
+
+    def _publication(self, source: Source) -> object:
+        return SimpleNamespace(listeners=self.listeners[source]) if source in self.listeners else None
+
+    async def changed(self, source: Source, *listeners: str) -> list[object]:
+        """These listen to a source of the peer now; return what it was told."""
+        self.listeners[source] = listeners
+        self.presence.changed(1, source)
+        await asyncio.sleep(0)
+        sent, self.sent = self.sent, []
+        return sent
+
+    def publish(self, source: Source, type_name: str, route: int) -> None:
+        """A source of ours that the peer has open."""
+        self.exports.graph(source.topic, {source.node: LocalSource(type_name, URI)})
+        self.exports.tell()
+        self.exports.opened(1, OpenRoute(route, source.topic, source.node))
+        self.exports.described(source, Description(type_name, MD5, "", False))
+
+    def told(self, route: int, *nodes: str) -> list[str]:
+        """The peer says who listens; return under which names we are connected then."""
+        assert self.presence.message(self.peer, Audience(route, nodes))
+        return connected()
+
+
+@pytest.fixture
+def world(monkeypatch: pytest.MonkeyPatch) -> World:
+    monkeypatch.setattr(module, "PublisherConnection", Connection)
+    monkeypatch.setattr(Connection, "made", [])
+    return World()
+
+
+# --- our listeners ----------------------------------------------------------------------------------------------
+
+
+async def test_listeners_are_told_once_the_route_is_open_and_when_they_change(world: World) -> None:
+    world.imports.advertised(1, Advertise(added=(GOAL_OFFER,)))
+    world.imports.demand(1, GOAL, 0.0, wanted=True)
+    assert await world.changed(GOAL, "/server") == [], "it is not open yet"
+    world.imports.opened(1, RouteOpened(1, Description(TYPE, MD5, "", False)), 0.0)
+    assert await world.changed(GOAL, "/server") == [Audience(1, ("/server",))]
+    assert await world.changed(GOAL, "/server") == [], "that is known"
+    assert await world.changed(GOAL, "/server", "/echo") == [Audience(1, ("/echo", "/server"))]
+    world.imports.demand(1, GOAL, 1.0, wanted=False)
+    assert await world.changed(GOAL) == [Audience(1, ())], "while the route lingers"
+    # A new route begins with nobody.
+    world.imports.closed(1, RouteClosed(1, "restarted"), 2.0)
+    assert await world.changed(GOAL) == []
+    world.imports.demand(1, GOAL, 3.0, wanted=True)
+    world.imports.opened(1, RouteOpened(2, Description(TYPE, MD5, "", False)), 3.0)
+    assert await world.changed(GOAL, "/server") == [Audience(2, ("/server",))]
+
+
+async def test_of_several_changes_at_once_the_last_is_told(world: World) -> None:
+    world.imports.advertised(1, Advertise(added=(GOAL_OFFER,)))
+    world.imports.demand(1, GOAL, 0.0, wanted=True)
+    world.imports.opened(1, RouteOpened(1, Description(TYPE, MD5, "", False)), 0.0)
+    for listeners in (("/one",), ("/one", "/two"), ("/two",)):
+        world.listeners[GOAL] = listeners
+        world.presence.changed(1, GOAL)
+    await asyncio.sleep(0)
+    assert world.sent == [Audience(1, ("/two",))]
+
+
+async def test_other_topics_and_sources_that_went_are_nobodys_business(world: World) -> None:
+    world.imports.advertised(1, Advertise(added=(TopicOffer("/chatter", "/client", "std_msgs/String"),)))
+    world.imports.demand(1, CHATTER, 0.0, wanted=True)
+    world.imports.opened(1, RouteOpened(1, Description("std_msgs/String", MD5, "", False)), 0.0)
+    assert await world.changed(CHATTER, "/listener") == []
+    assert await world.changed(GOAL, "/server") == []
+
+
+# --- the peer's listeners ---------------------------------------------------------------------------------------
+
+
+async def test_each_is_connected_under_its_name_here_until_it_leaves(world: World) -> None:
+    world.publish(GOAL, TYPE, 7)
+    assert world.told(7, "/server", "/echo") == ["/rmpa/base/echo", "/rmpa/base/server"]
+    assert [one.what[:2] for one in Connection.made] == [("/count/goal", URI)] * 2
+    assert world.told(7, "/server") == ["/rmpa/base/server"]
+    assert world.presence.shown(1, GOAL) == ("/rmpa/base/server",)
+    assert len(Connection.made) == 2, "who stays is not connected anew"
+    assert world.told(7) == []
+    assert world.presence.shown(1, GOAL) == ()
+
+
+async def test_nobody_stays_behind_a_route_a_link_or_the_end(world: World) -> None:
+    world.publish(GOAL, TYPE, 7)
+    ends: list[Callable[[], None]] = [
+        lambda: world.presence.route_over(1, GOAL),
+        lambda: world.presence.link_down(world.peer),
+    ]
+    for end in ends:
+        assert world.told(7, "/server") == ["/rmpa/base/server"]
+        end()
+        assert connected() == []
+    world.told(7, "/server")
+    await world.presence.close()
+    assert connected() == []
+
+
+async def test_what_does_not_belong_is_left_alone(world: World) -> None:
+    world.publish(CHATTER, "std_msgs/String", 8)
+    assert world.told(8, "/listener") == [], "its publisher does not look"
+    assert world.told(9, "/server") == [], "no such route"
+    world.publish(GOAL, TYPE, 7)
+    world.exports.closed(1, CloseRoute(7))
+    assert world.told(7, "/server") == [], "closed meanwhile"
+    assert not world.presence.message(world.peer, CloseRoute(7))
+
+
+async def test_a_peer_can_make_us_connect_so_often_and_no_more(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "AUDIENCES_MAX", 3)
+    world.publish(GOAL, TYPE, 7)
+    assert len(world.told(7, "/a", "/b", "/c", "/d")) == 3
+    assert world.warned == ["audience.too_many"]

@@ -1,0 +1,421 @@
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, SuspendRoute, Warn
+from rmpa.bridge.bounds import Beyond
+from rmpa.bridge.messages import (
+    Advertise,
+    CloseRoute,
+    Description,
+    OpenRoute,
+    RouteClosed,
+    RouteOpened,
+    Source,
+    TopicOffer,
+)
+from rmpa.bridge.policy import Policy, PolicyDecision
+from rmpa.bridge.topics.exports import Exports, LocalSource
+from rmpa.config.settings import LimitSettings, PolicySettings
+from rmpa.core.contract import Contract, ContractRule, Contracts, Durability, Priority, Reliability
+
+CMD = Source("/cmd", "/joy")
+JOY = LocalSource("sensor_msgs/Joy", "http://127.0.0.1:4000/")
+ABOUT = Description("sensor_msgs/Joy", "5a9ea5f83505693b71e785041e67a8bb", "Header header\n", False)
+
+
+def graph(exports: Exports, sources: dict[Source, LocalSource]) -> list[Action]:
+    """Say all that the local graph has, and what the peers are told of it."""
+    actions = []
+    for topic in sorted({*exports.topics, *(source.topic for source in sources)}):
+        actions += exports.graph(topic, {s.node: local for s, local in sources.items() if s.topic == topic})
+    while exports.untold:
+        actions += exports.tell()
+    return actions
+
+
+@pytest.fixture
+def exports() -> Exports:
+    return Exports(Policy(PolicySettings(deny=("/secret",))))
+
+
+def test_a_new_link_is_told_all_that_policy_lets_cross(exports: Exports) -> None:
+    graph(
+        exports,
+        {
+            CMD: JOY,
+            Source("/secret", "/joy"): JOY,
+            Source("/rosout", "/joy"): LocalSource("rosgraph_msgs/Log", "http://127.0.0.1:4000/"),
+            Source("/odd", "/joy"): LocalSource("*", "http://127.0.0.1:4000/"),
+            Source("/no name", "/joy"): JOY,
+            Source("/cmd", "no_node"): JOY,
+        },
+    )
+    assert exports.link_up(1) == [
+        Send(1, Advertise(added=(TopicOffer("/cmd", "/joy", "sensor_msgs/Joy"),), full=True)),
+    ]
+
+
+def test_names_that_no_peer_would_take_stay_home(exports: Exports) -> None:
+    graph(exports, {Source("/" + "x" * 1024, "/n"): JOY, Source("/a//b", "/n"): JOY, CMD: JOY})
+    assert set(exports.offered) == {CMD}
+
+
+def test_changes_are_told_to_every_link_and_only_changes(exports: Exports) -> None:
+    exports.link_up(1)
+    exports.link_up(2)
+    change = Advertise(added=(TopicOffer("/cmd", "/joy", "sensor_msgs/Joy"),))
+    assert graph(exports, {CMD: JOY}) == [Send(1, change), Send(2, change)]
+    assert graph(exports, {CMD: JOY}) == []
+    assert graph(exports, {}) == [Send(1, Advertise(removed=(CMD,))), Send(2, Advertise(removed=(CMD,)))]
+
+
+def test_a_changed_type_is_offered_again_and_a_changed_address_is_not(exports: Exports) -> None:
+    exports.link_up(1)
+    graph(exports, {CMD: JOY})
+    assert graph(exports, {CMD: LocalSource("sensor_msgs/Joy", "http://127.0.0.1:5000/")}) == []
+    assert graph(exports, {CMD: LocalSource("std_msgs/Empty", "http://127.0.0.1:5000/")}) == [
+        Send(1, Advertise(added=(TopicOffer("/cmd", "/joy", "std_msgs/Empty"),)))
+    ]
+
+
+def test_nothing_is_connected_before_somebody_asks_and_one_connection_serves_all(exports: Exports) -> None:
+    graph(exports, {CMD: JOY})
+    exports.link_up(1)
+    exports.link_up(2)
+    assert exports.opened(1, OpenRoute(7, "/cmd", "/joy")) == [Connect(CMD, JOY.type, JOY.uri)]
+    assert exports.opened(2, OpenRoute(9, "/cmd", "/joy")) == []
+    assert exports.described(CMD, ABOUT) == [
+        Send(1, RouteOpened(7, ABOUT)),
+        AddRoute(CMD, 1, 7, Contract()),
+        Send(2, RouteOpened(9, ABOUT)),
+        AddRoute(CMD, 2, 9, Contract()),
+    ]
+    assert exports.flowing(CMD) == (1, 2)
+    assert exports.closed(1, CloseRoute(7)) == [RemoveRoute(CMD, 1, 7, wished=True)]
+    assert exports.closed(2, CloseRoute(9)) == [RemoveRoute(CMD, 2, 9, wished=True), Disconnect(CMD)]
+    assert exports.flowing(CMD) == ()
+
+
+def test_a_late_peer_gets_the_known_description_at_once(exports: Exports) -> None:
+    graph(exports, {CMD: JOY})
+    exports.link_up(1)
+    exports.link_up(2)
+    exports.opened(1, OpenRoute(1, "/cmd", "/joy"))
+    exports.described(CMD, ABOUT)
+    assert exports.opened(2, OpenRoute(1, "/cmd", "/joy")) == [
+        Send(2, RouteOpened(1, ABOUT)),
+        AddRoute(CMD, 2, 1, Contract()),
+    ]
+
+
+@pytest.mark.parametrize("topic", ["/nothing", "/secret", "/rosout"])
+def test_what_is_not_offered_is_not_opened(exports: Exports, topic: str) -> None:
+    graph(exports, {Source(topic, "/joy"): JOY} if topic != "/nothing" else {})
+    exports.link_up(1)
+    [action] = exports.opened(1, OpenRoute(7, topic, "/joy"))
+    assert isinstance(action, Send)
+    assert isinstance(action.message, RouteClosed)
+    assert "policy" in action.message.reason
+
+
+def test_a_lost_publisher_closes_every_route_and_forgets_them(exports: Exports) -> None:
+    graph(exports, {CMD: JOY})
+    exports.link_up(1)
+    exports.opened(1, OpenRoute(7, "/cmd", "/joy"))
+    exports.described(CMD, ABOUT)
+    assert exports.lost(CMD, "it hung up") == [
+        RemoveRoute(CMD, 1, 7, over=True),
+        Send(1, RouteClosed(7, "it hung up")),
+    ]
+    assert exports.lost(CMD, "it hung up") == []
+    assert exports.closed(1, CloseRoute(7)) == []
+    assert exports.opened(1, OpenRoute(7, "/cmd", "/joy")) == [Connect(CMD, JOY.type, JOY.uri)]
+
+
+def test_a_restarted_node_is_left_at_its_old_address(exports: Exports) -> None:
+    graph(exports, {CMD: JOY})
+    exports.link_up(1)
+    exports.opened(1, OpenRoute(7, "/cmd", "/joy"))
+    exports.described(CMD, ABOUT)
+    assert graph(exports, {CMD: LocalSource(JOY.type, "http://127.0.0.1:5000/")}) == [
+        RemoveRoute(CMD, 1, 7, over=True),
+        Send(1, RouteClosed(7, "the node has restarted")),
+        Disconnect(CMD),
+    ]
+
+
+def test_a_link_that_falls_takes_its_routes_along(exports: Exports) -> None:
+    graph(exports, {CMD: JOY})
+    exports.link_up(1)
+    exports.link_up(2)
+    exports.opened(1, OpenRoute(7, "/cmd", "/joy"))
+    exports.opened(2, OpenRoute(7, "/cmd", "/joy"))
+    exports.described(CMD, ABOUT)
+    assert exports.link_down(1) == [RemoveRoute(CMD, 1, 7)]
+    assert exports.link_down(2) == [RemoveRoute(CMD, 2, 7), Disconnect(CMD)]
+    assert exports.link_down(2) == []
+
+
+def test_a_route_opened_twice_is_ignored_and_said(exports: Exports) -> None:
+    graph(exports, {CMD: JOY})
+    exports.link_up(1)
+    exports.opened(1, OpenRoute(7, "/cmd", "/joy"))
+    [action] = exports.opened(1, OpenRoute(7, "/cmd", "/joy"))
+    assert isinstance(action, Warn)
+
+
+def test_a_peer_gets_one_copy_of_a_source_however_often_it_asks(exports: Exports) -> None:
+    graph(exports, {CMD: JOY})
+    exports.link_up(1)
+    exports.opened(1, OpenRoute(7, "/cmd", "/joy"))
+    for route in (8, 9):
+        [action] = exports.opened(1, OpenRoute(route, "/cmd", "/joy"))
+        assert isinstance(action, Send)
+        assert isinstance(action.message, RouteClosed)
+        assert action.message.route == route
+    assert exports.described(CMD, ABOUT) == [Send(1, RouteOpened(7, ABOUT)), AddRoute(CMD, 1, 7, Contract())]
+    exports.closed(1, CloseRoute(7))
+    assert exports.opened(1, OpenRoute(10, "/cmd", "/joy")) == [Connect(CMD, JOY.type, JOY.uri)]
+
+
+def bounded(topics: int) -> Exports:
+    return Exports(Policy(PolicySettings(deny=("/secret",))), most=LimitSettings(topics=topics))
+
+
+def test_the_number_of_routes_is_bounded() -> None:
+    exports = bounded(1)
+    graph(exports, {CMD: JOY})
+    exports.link_up(1)
+    exports.opened(1, OpenRoute(7, "/cmd", "/joy"))
+    [action] = exports.opened(1, OpenRoute(8, "/cmd", "/joy"))
+    assert isinstance(action, Send)
+    assert isinstance(action.message, RouteClosed)
+
+
+def test_too_many_sources_are_cut_and_said() -> None:
+    exports = bounded(2)
+    actions = graph(exports, {Source(f"/t{i}", "/n"): JOY for i in range(3)})
+    assert [type(action) for action in actions] == [Warn]
+    assert len(exports.offered) == 2
+    assert exports.beyond == Beyond("topics", 2, 1)
+    assert exports.is_beyond(Source("/t2", "/n"))
+
+
+def many(count: int) -> dict[Source, LocalSource]:
+    return {Source(f"/t{index:04}", "/n"): JOY for index in range(count)}
+
+
+def test_a_large_graph_is_told_a_part_at_a_time(exports: Exports) -> None:
+    graph(exports, many(200))
+    actions = exports.link_up(1)
+    exports.link_up(2)
+    while exports.untold:
+        told = exports.tell()
+        assert len(told) <= 2
+        actions += told
+    messages = [action.message for action in actions if isinstance(action, Send) and action.peer == 1]
+    assert all(isinstance(message, Advertise) for message in messages)
+    assert [message.full for message in messages if isinstance(message, Advertise)] == [True, False, False, False]
+    offers = [offer for message in messages if isinstance(message, Advertise) for offer in message.added]
+    assert max(len(message.added) for message in messages if isinstance(message, Advertise)) == 64
+    assert {offer.source for offer in offers} == set(many(200))
+    assert len(offers) == 200
+
+
+def test_what_came_and_went_before_it_was_told_is_not_told(exports: Exports) -> None:
+    exports.link_up(1)
+    exports.graph("/cmd", {"/joy": JOY})
+    exports.graph("/cmd", {})
+    assert exports.tell() == []
+    graph(exports, {CMD: JOY})
+    exports.graph("/cmd", {})
+    exports.graph("/cmd", {"/joy": JOY})
+    assert [exports.untold, exports.tell(), exports.untold] == [True, [], False]
+    exports.graph("/cmd", {})
+    exports.graph("/cmd", {"/joy": LocalSource("std_msgs/Empty", JOY.uri)})
+    assert exports.tell() == [Send(1, Advertise(added=(TopicOffer("/cmd", "/joy", "std_msgs/Empty"),)))]
+
+
+def test_room_is_given_to_a_source_that_there_were_too_many_for() -> None:
+    exports = bounded(2)
+    exports.link_up(1)
+    graph(exports, many(4))
+    assert [source.topic for source in exports.offered] == ["/t0000", "/t0001"]
+    exports.graph("/t0003", {})
+    exports.graph("/t0000", {})
+    assert [source.topic for source in exports.offered] == ["/t0001", "/t0002"]
+    assert exports.tell() == [
+        Send(1, Advertise(added=(TopicOffer("/t0002", "/n", JOY.type),), removed=(Source("/t0000", "/n"),)))
+    ]
+    exports.graph("/t0001", {})
+    exports.graph("/t0002", {})
+    assert not exports.offered
+
+
+def test_a_change_costs_what_changed_and_not_what_there_is(exports: Exports) -> None:
+    """The judge is asked about the changed source alone, and the peers' messages hold nothing else."""
+    exports.link_up(1)
+    graph(exports, many(2000))
+    asked: list[str] = []
+    judge = exports._policy.judge
+
+    def counting(topic: str, type_name: str, node: str) -> PolicyDecision:
+        asked.append(topic)
+        return judge(topic, type_name, node)
+
+    exports._policy.judge = counting  # type: ignore[method-assign]
+    assert exports.graph("/t0001", {"/n": JOY}) == []
+    assert exports.graph("/t0001", {}) == []
+    assert exports.graph("/t0001", {"/m": JOY}) == []
+    assert exports.tell() == [
+        Send(1, Advertise(added=(TopicOffer("/t0001", "/m", JOY.type),), removed=(Source("/t0001", "/n"),)))
+    ]
+    assert asked == ["/t0001"]
+
+
+# --- contracts, and links that come back --------------------------------------------------------------------------
+
+RELIABLE = Contract(reliability=Reliability.RELIABLE)
+SURE = OpenRoute(7, "/cmd", "/joy", RELIABLE)
+
+
+def sends(actions: list[Action]) -> list[object]:
+    return [action.message for action in actions if isinstance(action, Send)]
+
+
+@pytest.fixture
+def flowing(exports: Exports) -> Exports:
+    """/cmd flows reliably to peer 1, by epoch 1."""
+    graph(exports, {CMD: JOY})
+    exports.link_up(1)
+    exports.opened(1, SURE)
+    exports.described(CMD, ABOUT)
+    return exports
+
+
+def test_the_stronger_of_both_sides_words_holds_and_both_are_told() -> None:
+    rules = Contracts(
+        (ContractRule(("/cmd",), (), {"depth": 5, "lifespan": 2.0, "durability": Durability.TRANSIENT_LOCAL}),)
+    )
+    exports = Exports(Policy(PolicySettings()), rules)
+    graph(exports, {CMD: JOY})
+    exports.link_up(1)
+    asked = Contract(reliability=Reliability.RELIABLE, depth=3, lifespan=1.0, priority=Priority.HIGH)
+    exports.opened(1, OpenRoute(7, "/cmd", "/joy", asked))
+    holds = Contract(
+        reliability=Reliability.RELIABLE,
+        durability=Durability.TRANSIENT_LOCAL,
+        depth=5,
+        lifespan=1.0,
+        priority=Priority.HIGH,
+    )
+    about = msgspec.structs.replace(ABOUT, latching=True)  # so that the proxy keeps messages for late subscribers
+    assert exports.described(CMD, ABOUT) == [Send(1, RouteOpened(7, about, holds, 1)), AddRoute(CMD, 1, 7, holds, 1)]
+    assert exports.contract(CMD, 1) == holds
+    assert exports.description(CMD) == ABOUT
+
+
+def test_each_peer_has_the_contract_that_it_asked_for_and_each_reliable_route_a_numbering_of_its_own(
+    exports: Exports,
+) -> None:
+    graph(exports, {CMD: JOY})
+    for peer, contract in ((1, RELIABLE), (2, Contract()), (3, RELIABLE)):
+        exports.link_up(peer)
+        exports.opened(peer, OpenRoute(7, "/cmd", "/joy", contract))
+    added = [action for action in exports.described(CMD, ABOUT) if isinstance(action, AddRoute)]
+    assert [(route.peer, route.contract, route.epoch, route.after) for route in added] == [
+        (1, RELIABLE, 1, None),
+        (2, Contract(), 0, None),
+        (3, RELIABLE, 2, None),
+    ]
+
+
+def test_a_reliable_route_outlives_its_link_and_goes_on_where_the_peer_says(flowing: Exports) -> None:
+    assert flowing.link_away(1) == ([SuspendRoute(CMD, 1)], True)
+    assert flowing.waits_for(1)
+    assert flowing.flowing(CMD) == ()
+    flowing.link_up(1)
+    assert flowing.opened(1, OpenRoute(2, "/cmd", "/joy", RELIABLE, epoch=1, after=41)) == [
+        Send(1, RouteOpened(2, ABOUT, RELIABLE, 1)),
+        AddRoute(CMD, 1, 2, RELIABLE, 1, 41),
+    ]
+    assert not flowing.waits_for(1)
+    assert flowing.link_away(1) == ([SuspendRoute(CMD, 1)], True)
+    flowing.link_up(1)
+    flowing.opened(1, OpenRoute(1, "/cmd", "/joy", RELIABLE, epoch=1, after=50))
+    assert flowing.closed(1, CloseRoute(1)) == [RemoveRoute(CMD, 1, 1, wished=True), Disconnect(CMD)]
+
+
+@pytest.mark.parametrize("asked", [SURE, OpenRoute(7, "/cmd", "/joy", RELIABLE, epoch=9, after=3)])
+def test_who_knows_nothing_of_the_old_numbering_gets_a_new_one(flowing: Exports, asked: OpenRoute) -> None:
+    flowing.link_away(1)
+    flowing.link_up(1)
+    assert flowing.opened(1, asked) == [
+        Send(1, RouteOpened(7, ABOUT, RELIABLE, 2)),
+        AddRoute(CMD, 1, 7, RELIABLE, 2),
+    ]
+    assert not flowing.waits_for(1)
+
+
+def test_what_is_not_reliable_or_does_not_flow_yet_ends_with_its_link(exports: Exports) -> None:
+    plain, connecting = Source("/plain", "/joy"), Source("/new", "/joy")
+    graph(exports, {plain: JOY, connecting: JOY})
+    exports.link_up(1)
+    exports.opened(1, OpenRoute(1, "/plain", "/joy"))
+    exports.described(plain, ABOUT)
+    exports.opened(1, OpenRoute(2, "/new", "/joy", RELIABLE))
+    assert exports.link_away(1) == ([RemoveRoute(plain, 1, 1), Disconnect(plain), Disconnect(connecting)], False)
+    assert exports.link_down(1) == []
+
+
+@pytest.mark.parametrize("how", ["link_down", "unclaimed", "given_up"])
+def test_a_suspended_route_that_nobody_asks_for_is_given_up(flowing: Exports, how: str) -> None:
+    flowing.link_away(1)
+    if how == "link_down":
+        assert flowing.link_down(1) == [RemoveRoute(CMD, 1, 0), Disconnect(CMD)]
+    elif how == "unclaimed":
+        flowing.link_up(1)
+        assert flowing.unclaimed(1) == [RemoveRoute(CMD, 1, 0), Disconnect(CMD)]
+    else:
+        assert flowing.given_up(CMD, 1) == [Disconnect(CMD)]
+        assert flowing.given_up(CMD, 1) == []
+    assert not flowing.waits_for(1)
+    assert flowing.link_down(1) == []
+
+
+def test_what_the_peer_asked_for_again_is_not_unclaimed_and_other_peers_stay(flowing: Exports) -> None:
+    flowing.link_up(2)
+    flowing.opened(2, SURE)
+    for peer in (1, 2):
+        flowing.link_away(peer)
+    flowing.link_up(1)
+    flowing.opened(1, OpenRoute(1, "/cmd", "/joy", RELIABLE, epoch=1, after=0))
+    assert flowing.unclaimed(1) == []
+    assert flowing.flowing(CMD) == (1,)
+    assert flowing.link_down(2) == [RemoveRoute(CMD, 2, 0)]
+
+
+def test_a_publisher_that_goes_takes_suspended_routes_along(flowing: Exports) -> None:
+    flowing.link_up(2)
+    flowing.opened(2, SURE)
+    flowing.link_away(1)
+    assert flowing.lost(CMD, "it died") == [
+        RemoveRoute(CMD, 1, 0, over=True),
+        RemoveRoute(CMD, 2, 7, over=True),
+        Send(2, RouteClosed(7, "it died")),
+    ]
+    flowing.link_up(1)
+    assert flowing.opened(1, OpenRoute(1, "/cmd", "/joy", RELIABLE, epoch=1, after=3)) == [
+        Connect(CMD, JOY.type, JOY.uri)
+    ]
+    [opened] = sends(flowing.described(CMD, ABOUT))
+    assert isinstance(opened, RouteOpened)
+    assert opened.epoch == 3, "never one that was used"
+
+
+def test_a_suspended_route_is_told_of_nothing(flowing: Exports) -> None:
+    flowing.link_away(1)
+    assert graph(flowing, {CMD: JOY, Source("/b", "/joy"): JOY}) == []
+    assert flowing.described(CMD, ABOUT) == []

@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from rmpa.config.settings import PeerRule, PolicySettings, Remap
+from rmpa.config.sources import Flags, Loaded, load_settings
+from rmpa.core.errors import ConfigError
+
+ROOT = Path(__file__).parents[2]
+
+
+def load(tmp_path: Path, text: str) -> Loaded:
+    (tmp_path / "rmpa.toml").write_text(text)
+    return load_settings(Flags(), {}, host_name="pc", cwd=tmp_path)
+
+
+def refused(tmp_path: Path, text: str) -> str:
+    with pytest.raises(ConfigError) as error:
+        load(tmp_path, text)
+    return str(error.value).replace(str(tmp_path) + "/", "")
+
+
+def test_everything_that_a_peer_may_have(tmp_path: Path) -> None:
+    loaded = load(
+        tmp_path,
+        """
+        [[peer]]
+        name = "robot*"
+        prefix = "/{peer}"
+        remap_in = { "/tf" = "/tf", "/arm/**" = "/left/**" }
+        remap_out = { "/map_{peer}" = "/map" }
+        allow = ["/{pose,scan}".replace] # a comment
+        """.replace('["/{pose,scan}".replace]', '["/**/cmd_vel", "/left/**"]')
+        + """
+        deny_types = ["sensor_msgs/Image"]
+        [[peer.remap]]
+        direction = "in"
+        from = "/scan"
+        to = "/front/scan"
+        types = ["sensor_msgs/LaserScan"]
+        """,
+    )
+    scan = Remap("/scan", "/front/scan", ("sensor_msgs/LaserScan",))
+    assert loaded.settings.peers == (
+        PeerRule(
+            "robot*",
+            "/{peer}",
+            (scan, Remap("/tf", "/tf"), Remap("/arm/**", "/left/**")),
+            (Remap("/map_{peer}", "/map"),),
+            PolicySettings(allow=("/**/cmd_vel", "/left/**"), deny_types=("sensor_msgs/Image",)),
+        ),
+    )
+    assert loaded.notes == ()
+
+
+PEER = '[[peer]]\nname = "r"\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[[peer]]\nprefix = '/r'", ":1: peer: a rule without a name"),
+        (PEER + "\n\nprefix = 'r'", ":5: peer.prefix: 'r' is not a namespace; did you mean \"/r\"?"),
+        (PEER + "prefix = '/'", ":3: peer.prefix: '/' puts nothing in front"),
+        (PEER + "prefix = '/rmpa/r'", ":3: peer.prefix: /rmpa/r never crosses"),
+        (PEER + "remap_in = {'/a b' = '/c'}", "'/a b' is not a ROS name"),
+        (PEER + "[peer.remap_in]\n'/a' = '/x'\n'/b' = '/c//d'", ":5: peer.remap_in./b: '/c//d' is not a ROS name"),
+        (PEER + "[peer.remap_in]\n'/a' = '/x'\n'/b' = '/clock'", ":5: peer.remap_in./b: /clock never crosses"),
+        (PEER + "remap_out = {'/rosout' = '/log'}", ":3: peer.remap_out./rosout: /rosout never crosses"),
+        (PEER + "remap_out = {'/a' = '/rmpa/**'}", "/rmpa never crosses"),
+        (PEER + "remap_in = {'/a/**' = '/b'}", "both end with /**"),
+        (PEER + "remap_in = {'/a/*/b' = '/b'}", "'/a/*/b' is not a name"),
+        (PEER + "remap_in = {'a' = '/b'}", 'did you mean "/a"?'),
+        (PEER + "[peer.remap_in]\n'/a' = '/c'\n'/b' = '/c'", ":5: peer.remap_in./b: /a and /b would both become /c"),
+        (PEER + "[peer.remap_in]\n'/a/**' = '/c/**'\n'/b' = '/c/d'", "/a/** and /b would both become /c/d"),
+        (PEER + "[peer.remap_in]\n'/a/**' = '/c/**'\n'/b/**' = '/c/d/**'", "would both become /c/d"),
+        (PEER + "remap_in = {'/a' = '/c'}\n" + PEER + "remap_in = {'/b' = '/c'}", ":6: peer.remap_in./b: /a and"),
+        (PEER + "[peer.remap_out]\n'/a' = '/b'\n'/b' = '/a'", ":4: peer.remap_out./a: these rules undo each other"),
+        (PEER + "remap_in = {'/a/**' = '/b/**', '/b/x' = '/a/x'}", "these rules undo each other"),
+        (PEER + "remap = [{direction = 'up', from = '/a', to = '/b'}]", "'up' is not a direction"),
+        (PEER + "[[peer.remap]]\ndirection = 'in'\nform = '/a'\nto = '/b'", ":5: peer.remap.form: an unknown key"),
+        (PEER + "[[peer.remap]]\ndirection = 'in'\nfrom = '/a'\n", ":3: peer.remap: a rule without to"),
+        (PEER + "prefx = '/r'", "did you mean peer.prefix?"),
+        (PEER + "remap_in = '/a'", "peer.remap_in: '/a' is not a table"),
+        ("[peer]\nname = 'r'", "write [[peer]], in two brackets"),
+        ("[[peer]]\nname = '/r'", "'/r' is not a glob over peers' names"),
+        (PEER + "deny = ['x']", ":3: peer.deny: 'x' matches no topic: topics begin with /; did you mean \"/x\"?"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_with_its_line(tmp_path: Path, text: str, says: str) -> None:
+    assert says in refused(tmp_path, text)
+
+
+def test_the_documentation_s_examples_load(tmp_path: Path) -> None:
+    blocks = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "names.md").read_text(), re.DOTALL)
+    assert [load(tmp_path, block).notes for block in blocks] == [()] * 3
+
+
+def test_names_that_only_look_alike_are_taken(tmp_path: Path) -> None:
+    rules = "remap_in = {'/tf' = '/tf', '/a' = '/b', '/b' = '/c', '/arm/**' = '/arm/left/**', '/x/**' = '/y/**'}"
+    both_ways = "remap_out = {'/b' = '/a'}"
+    other = "[[peer]]\nname = 's'\nremap_in = {'/z' = '/b'}"
+    assert load(tmp_path, f"{PEER}\n{rules}\n{both_ways}\n{other}").notes == ()
+    types = "direction = 'in'\nto = '/c'\n"
+    one, two = (f"[[peer.remap]]\n{types}from = '/{n}'\ntypes = ['p/{n}']\n" for n in "ab")
+    assert load(tmp_path, PEER + one + two).notes == ()
+
+
+def test_one_prefix_for_many_peers_is_doubtful(tmp_path: Path) -> None:
+    [note] = load(tmp_path, "[[peer]]\nname = 'r*'\nprefix = '/r'\n").notes
+    assert ":3: peer.prefix: /r is one place for every peer that r* fits; /{peer} would keep them apart" in note

@@ -1,0 +1,73 @@
+"""``[services]`` and ``[[service]]``: what they may say, and what a user is told who says something else."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.config.settings import ServiceRule, ServiceSettings
+from rmpa.config.sources import Flags, load_settings
+from rmpa.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def _load(tmp_path: Path, text: str, **environ: str) -> ServiceSettings:
+    path = tmp_path / "rmpa.toml"
+    path.write_text(text)
+    return load_settings(Flags(config=str(path)), environ, host_name="robot", cwd=tmp_path).settings.services
+
+
+def test_defaults_let_all_but_loggers_cross_for_a_minute(tmp_path: Path) -> None:
+    assert _load(tmp_path, "") == ServiceSettings(("/**",), (), False, 60.0, ())
+
+
+def test_a_file_says_it_all(tmp_path: Path) -> None:
+    text = """
+        [services]
+        allow = ["/arm/**"]
+        deny = ["/**/restart"]
+        loggers = true
+        timeout = "500 ms"
+        [[service]]
+        names = ["/plan/**", "/map"]
+        timeout = "5 min"
+        [[service]]
+        names = ["/**"]
+        timeout = 2
+    """
+    rules = (ServiceRule(("/plan/**", "/map"), 300.0), ServiceRule(("/**",), 2.0))
+    assert _load(tmp_path, text) == ServiceSettings(("/arm/**",), ("/**/restart",), True, 0.5, rules)
+
+
+def test_variables_outweigh_the_file(tmp_path: Path) -> None:
+    found = _load(tmp_path, "[services]\ntimeout = 3\n", RMPA_SERVICE_TIMEOUT="4 s", RMPA_SERVICE_DENY="/a;/b")
+    assert (found.timeout, found.deny) == (4.0, ("/a", "/b"))
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "words"),
+    [
+        ("[services]\nallow = ['/a//b']", 2, "services.allow: '/a//b' matches no service"),
+        ("[services]\nallow = ['arm']", 2, 'did you mean "/arm"?'),
+        ("[services]\ntimeout = 'infinite'", 2, "too long for a call"),
+        ("[services]\ntimeout = 4000", 2, "at most 3600 s"),
+        ("[services]\ntimeout = '10 Hz'", 2, "is a rate"),
+        ("[services]\ntimeouts = 1", 2, "did you mean services.timeout?"),
+        ("[services]\nloggers = 1", 2, "is not true or false"),
+        ("[[service]]\nnames = ['/a']", 1, "a rule without timeout"),
+        ("[[service]]\ntimeout = 1", 1, "a rule without names"),
+        ("\n[[service]]\nnames = []\ntimeout = 1", 3, "an empty list fits nothing"),
+        ("[[service]]\nnames = ['/a', 'b c']\ntimeout = 1", 2, "'b c' is not a glob over services"),
+        ("[[service]]\nnames = ['/a']\ntimeout = 0", 3, "service.timeout: 0 is out of range"),
+        ("[service]\nnames = ['/a']", 1, "write [[service]]"),
+        ("[[service]]\nname = ['/a']\ntimeout = 1", 2, "did you mean service.names?"),
+    ],
+)
+def test_what_cannot_be_is_named_with_its_line(tmp_path: Path, text: str, line: int, words: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        _load(tmp_path, text)
+    assert f"rmpa.toml:{line}: " in str(caught.value)
+    assert words in str(caught.value)

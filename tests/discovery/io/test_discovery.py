@@ -1,0 +1,371 @@
+"""Discovery on real sockets, over loopback with a group and port of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import socket
+from functools import partial
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.config.settings import HostPort, Settings
+from rmpa.core import limits
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+from rmpa.discovery.beacon import Beacon, BeaconKind
+from rmpa.discovery.events import Event, HeardBy, LossReason, PeerConflict, PeerFound, PeerLost, PeerRestarted
+from rmpa.discovery.io.discovery import Discovery
+from rmpa.discovery.io.interfaces import Interface, list_interfaces
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from rmpa.discovery.events import PeerView
+
+DEADLINE = 15.0
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("", 0))
+        port: int = sock.getsockname()[1]
+        return port
+
+
+class Agent:
+    """A Discovery with its socket, and what it told."""
+
+    def __init__(self, name: str, settings: Settings, *, port: int = 0, **options: object) -> None:
+        self.sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        self.sock.bind(("", port))
+        self.port = self.sock.getsockname()[1]
+        self.identity = Identity(Guid.of("127.0.0.1", self.port), os.urandom(16), name, settings.domain)
+        self.events: list[Event] = []
+        self.discovery = Discovery(
+            self.identity,
+            settings,
+            self.sock,
+            on_event=self.events.append,
+            **options,  # type: ignore[arg-type]
+        )
+
+    def names(self) -> set[str]:
+        return {view.identity.name for view in self.discovery.peers() if view.present}
+
+    def view(self, name: str) -> PeerView:
+        return next(v for v in self.discovery.peers() if v.identity.name == name)
+
+    async def end(self) -> None:
+        await self.discovery.close()
+        self.sock.close()
+
+
+@pytest.fixture
+def settings() -> Settings:
+    return Settings(group="239.255.82.78", group_port=free_port(), interfaces=("lo",))
+
+
+@pytest.fixture
+async def agents() -> AsyncIterator[list[Agent]]:
+    started: list[Agent] = []
+    yield started
+    for agent in started:
+        await agent.end()
+
+
+async def start(agents: list[Agent], *new: Agent) -> None:
+    for agent in new:
+        agents.append(agent)
+        await agent.discovery.start()
+
+
+async def until(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(DEADLINE):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+
+async def test_agents_on_one_machine_find_each_other(agents: list[Agent], settings: Settings) -> None:
+    trio = [Agent(name, settings) for name in ("base", "joystick", "pc")]
+    await start(agents, *trio)
+    for agent in trio:
+        others = {"base", "joystick", "pc"} - {agent.identity.name}
+        await until(partial(lambda a, o: a.names() == o, agent, others))
+    assert all(isinstance(e, PeerFound) for e in trio[0].events)
+
+
+async def test_goodbye_is_seen_at_once(agents: list[Agent], settings: Settings) -> None:
+    base, pc = Agent("base", settings), Agent("pc", settings)
+    await start(agents, base, pc)
+    await until(lambda: base.names() and pc.names())
+    await pc.discovery.close()
+    await until(lambda: not base.names())
+    assert base.events[-1] == PeerLost(pc.identity, LossReason.GOODBYE)
+
+
+async def test_a_restart_on_the_same_port_is_told(agents: list[Agent], settings: Settings) -> None:
+    base, pc = Agent("base", settings), Agent("pc", settings)
+    await start(agents, base)
+    await start([], pc)
+    await until(base.names)
+    pc.discovery._roster._closed = True  # killed: no goodbye
+    await pc.end()
+    again = Agent("pc", settings, port=pc.port)
+    await start(agents, again)
+    await until(lambda: any(isinstance(e, PeerRestarted) for e in base.events))
+    assert base.view("pc").identity == again.identity
+
+
+async def test_garbage_is_counted_said_once_and_survived(
+    agents: list[Agent], settings: Settings, caplog: pytest.LogCaptureFixture
+) -> None:
+    base = Agent("base", settings)
+    await start(agents, base)
+    to = ("127.0.0.1", base.port)
+    far = Beacon(BeaconKind.ANNOUNCE, Identity(Guid.of("127.0.0.1", 9), os.urandom(16), "far", 7), 1, 1).serialize()
+    new = Beacon(BeaconKind.ANNOUNCE, Identity(Guid.of("127.0.0.1", 9), os.urandom(16), "new"), 1, 1)
+    newer = bytearray(new.serialize())
+    newer[4] = 2
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock, caplog.at_level(logging.WARNING):
+        for n in range(30):
+            sock.sendto(b"GET / HTTP/1.1 %d" % n, to)
+        sock.sendto(b"", to)
+        sock.sendto(bytes(5000), to)
+        sock.sendto(far, to)
+        sock.sendto(newer, to)
+        counters = base.discovery.counters
+        await until(lambda: counters["beacon.version"])
+    assert counters["beacon.malformed"] == 32
+    assert counters["beacon.other_domain"] == 1
+    lines = [r.getMessage() for r in caplog.records]
+    assert len([line for line in lines if "malformed" in line]) == 1
+    assert any("127.0.0.1 speaks version 2 of the protocol, we speak 1: update" in line for line in lines)
+    assert len([line for line in lines if "is of domain 7, we are of domain 0" in line]) == 1
+    pc = Agent("pc", settings)
+    await start(agents, pc)
+    await until(lambda: base.names() == {"pc"})
+
+
+async def test_a_flood_is_cut_off(agents: list[Agent], settings: Settings, caplog: pytest.LogCaptureFixture) -> None:
+    base = Agent("base", settings)
+    await start(agents, base)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sent = 0
+        async with asyncio.timeout(DEADLINE):
+            while not base.discovery.counters["beacon.flood"]:
+                for _ in range(100):
+                    sock.sendto(b"flood %d" % sent, ("127.0.0.1", base.port))
+                    sent += 1
+                await asyncio.sleep(0)
+    assert "too many packets" in caplog.text
+
+
+async def test_other_domains_do_not_meet(agents: list[Agent], settings: Settings) -> None:
+    base = Agent("base", settings)
+    # The port moves with the domain; a wrong setting could still bring both to one port.
+    other = Agent(
+        "other", Settings(group=settings.group, group_port=settings.group_port - 1, domain=1, interfaces=("lo",))
+    )
+    await start(agents, base, other)
+    await until(lambda: base.discovery.counters["beacon.other_domain"] >= 2)
+    assert base.names() == set()
+
+
+async def test_seeds_without_multicast_and_gossip(agents: list[Agent], settings: Settings) -> None:
+    quiet = {"group": settings.group, "group_port": settings.group_port, "multicast": False}
+    hub = Agent("hub", Settings(**quiet))  # type: ignore[arg-type]
+    seeds = (HostPort("127.0.0.1", hub.port),)
+    left, right = (Agent(n, Settings(**quiet, seeds=seeds)) for n in ("left", "right"))  # type: ignore[arg-type]
+    await start(agents, hub, left, right)
+    await until(lambda: left.names() == {"hub", "right"} and right.names() == {"hub", "left"})
+    assert hub.discovery.counters["beacon.out_multicast"] == 0
+    assert HeardBy.GOSSIP in {left.view("right").found_by, right.view("left").found_by}
+
+
+async def test_a_seed_by_name_and_without_a_port(agents: list[Agent], settings: Settings) -> None:
+    quiet = {"group": settings.group, "group_port": settings.group_port, "multicast": False}
+    tries: list[str] = []
+
+    def resolve(host: str) -> list[str]:
+        tries.append(host)
+        if len(tries) == 1:
+            raise OSError("no name server yet")
+        return ["127.0.0.1"]
+
+    hub = Agent("hub", Settings(**quiet))  # type: ignore[arg-type]
+    await start(agents, hub)
+    # On one machine the last that opened the discovery port gets its unicasts; keep that one the hub.
+    left = Agent("left", Settings(**quiet, seeds=(HostPort("robot.local"),)), resolve=resolve)  # type: ignore[arg-type]
+    left.discovery._open_door = lambda: None  # type: ignore[method-assign]
+    await start(agents, left)
+    await until(lambda: left.names() == {"hub"} and hub.names() == {"left"})
+    assert tries == ["robot.local"] * 2
+
+
+async def test_a_seed_that_never_resolves_does_not_hold_up_the_end(settings: Settings) -> None:
+    import threading
+
+    stuck = threading.Event()
+    agent = Agent(
+        "base",
+        Settings(multicast=False, group_port=settings.group_port, seeds=(HostPort("nowhere"),)),
+        resolve=lambda _: (stuck.wait(DEADLINE) and []) or [],
+    )
+    await agent.discovery.start()
+    async with asyncio.timeout(5):
+        await agent.end()
+    stuck.set()
+
+
+async def test_a_link_keeps_and_brings_a_peer(agents: list[Agent], settings: Settings) -> None:
+    base = Agent("base", settings)
+    await start(agents, base)
+    friend = Identity(Guid.of("127.0.0.1", 1), os.urandom(16), "friend")
+    base.discovery.link_up(friend)
+    assert base.view("friend").linked
+    base.discovery.link_down(friend.guid)
+    assert not base.view("friend").linked
+
+
+async def test_events_may_call_back(agents: list[Agent], settings: Settings) -> None:
+    base, pc = Agent("base", settings), Agent("pc", settings)
+
+    def link(event: Event) -> None:
+        if isinstance(event, PeerFound):
+            base.discovery.link_up(event.identity)
+
+    base.discovery._on_event = link
+    await start(agents, base, pc)
+    await until(lambda: base.names() and base.view("pc").linked)
+
+
+async def test_two_of_one_name_are_told(
+    agents: list[Agent], settings: Settings, caplog: pytest.LogCaptureFixture
+) -> None:
+    pair = [Agent("base", settings) for _ in range(2)]
+    await start(agents, *pair)
+    await until(lambda: all(any(isinstance(e, PeerConflict) for e in agent.events) for agent in pair))
+    assert "rename one: --name" in caplog.text
+
+
+async def test_an_unknown_interface_is_said_and_used_when_it_comes(
+    agents: list[Agent], settings: Settings, caplog: pytest.LogCaptureFixture
+) -> None:
+    there = list_interfaces()
+    (loopback,) = (i for i in there if i.name == "lo")
+    now_there: list[Interface] = [i for i in there if i.name != "lo"]
+    odd = Settings(group=settings.group, group_port=settings.group_port, interfaces=("lo", "wlan7"))
+    base = Agent("base", odd, look=lambda: tuple(now_there))
+    pc = Agent("pc", settings)
+    await start(agents, base, pc)
+    assert "--interface lo, wlan7: not here; there are" in caplog.text
+    assert "other machines are only found by --seed" in caplog.text
+    assert base.discovery.interfaces == ()
+    now_there.append(loopback)
+    base.discovery._watcher._compare()
+    await until(lambda: base.names() == {"pc"} and pc.names() == {"base"})
+    now_there.remove(loopback)
+    base.discovery._watcher._compare()
+    assert base.discovery.interfaces == ()
+
+
+async def test_an_interface_that_refuses_is_said_once(
+    agents: list[Agent], settings: Settings, caplog: pytest.LogCaptureFixture
+) -> None:
+    (loopback,) = (i for i in list_interfaces() if i.name == "lo")
+    gone = Interface("gone0", 4242, loopback.addresses, up=True, multicast=True, loopback=False)
+    both = Settings(group=settings.group, group_port=settings.group_port)
+    base, pc = Agent("base", both, look=lambda: (loopback, gone)), Agent("pc", settings)
+    await start(agents, base, pc)
+    await until(lambda: pc.names() == {"base"} and base.discovery.counters["beacon.send_failed"] >= 3)
+    said = [r.getMessage() for r in caplog.records if "gone0" in r.getMessage() and r.levelno >= logging.WARNING]
+    assert len(said) == 2, said
+    assert any("beacons cannot be sent there" in line for line in said)
+    assert any("cannot be joined" in line for line in said)
+
+
+async def test_a_discovery_port_that_somebody_keeps_is_said(
+    agents: list[Agent], settings: Settings, caplog: pytest.LogCaptureFixture
+) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as keeper:
+        keeper.bind(("", settings.group_port))
+        base = Agent("base", settings)
+        await start(agents, base)
+        assert "cannot listen at" in caplog.text
+        assert "--multicast" in caplog.text
+
+
+async def test_the_watcher_looks_by_itself_where_netlink_is_refused(
+    monkeypatch: pytest.MonkeyPatch, agents: list[Agent], settings: Settings
+) -> None:
+    monkeypatch.setattr("rmpa.discovery.io.interfaces._open_netlink", lambda: None)
+    monkeypatch.setattr(limits, "INTERFACE_LOOK", 0.05)
+    there: list[Interface] = []
+    base = Agent("base", settings, look=lambda: tuple(there))
+    await start(agents, base)
+    there += list_interfaces()
+    await until(lambda: base.discovery.interfaces)
+
+
+async def test_close_twice_and_before_start(settings: Settings) -> None:
+    agent = Agent("base", settings)
+    await agent.discovery.close()
+    await agent.discovery.start()
+    with contextlib.closing(agent.sock):
+        await agent.discovery.close()
+        await agent.discovery.close()
+
+
+async def test_loopback_that_the_user_chose_is_no_trouble(
+    agents: list[Agent], settings: Settings, caplog: pytest.LogCaptureFixture
+) -> None:
+    base = Agent("base", settings)
+    await start(agents, base)
+    assert base.discovery.notes() == ()
+    assert not [r for r in caplog.records if r.levelno >= logging.WARNING]
+
+
+async def test_what_leaves_by_loopback_comes_from_loopback(agents: list[Agent], settings: Settings) -> None:
+    """Linux would take another interface's address, where there is one, which goes when that interface does."""
+    base, pc = Agent("base", settings), Agent("pc", settings)
+    await start(agents, base, pc)
+    await until(lambda: base.names() == {"pc"} and pc.names() == {"base"})
+    assert [event.source for event in base.events if isinstance(event, PeerFound)] == [("127.0.0.1", pc.port)]
+
+
+async def test_an_identity_that_no_longer_fits_is_announced_no_more(agents: list[Agent], settings: Settings) -> None:
+    """Peers that heard the old one on the new network dialled an address that is not ours."""
+    now_there = [*list_interfaces()]
+    asked: list[tuple[Interface, ...]] = []
+
+    def fits(usable: tuple[Interface, ...]) -> bool:
+        asked.append(usable)
+        return len(asked) > 1
+
+    base = Agent("base", settings, look=lambda: tuple(now_there), on_interfaces=fits)
+    await start(agents, base)
+    await until(lambda: not base.discovery._roster._burst)
+    for times in (1, 2):
+        now_there.append(Interface(f"new{times}", 4242 + times, (), up=False, multicast=False, loopback=False))
+        base.discovery._watcher._compare()
+        assert len(asked) == times
+        assert bool(base.discovery._roster._burst) == (times == 2)
+
+
+async def test_seeds_that_do_not_answer_and_another_domain_are_told(
+    agents: list[Agent], settings: Settings, caplog: pytest.LogCaptureFixture
+) -> None:
+    quiet = {"group": settings.group, "group_port": settings.group_port, "multicast": False}
+    hub = Agent("hub", Settings(**quiet, domain=1))  # type: ignore[arg-type]
+    seed = (HostPort("127.0.0.1", hub.port),)
+    left = Agent("left", Settings(**quiet, domain=2, seeds=seed))  # type: ignore[arg-type]
+    await start(agents, hub, left)
+    await until(lambda: "is of domain 2, we are of domain 1: start both with the same --domain" in caplog.text)
+    assert f"seed 127.0.0.1:{hub.port}: no answer" in left.discovery.notes()[0]
+    right = Agent("right", Settings(**quiet, domain=1, seeds=seed))  # type: ignore[arg-type]
+    await start(agents, right)
+    await until(lambda: right.discovery.notes() == ())

@@ -1,0 +1,54 @@
+"""A link that has ended is gone at once, with all that waited for it: without the collector, which looks late."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.mesh.io.meshes import Peer, peers, until
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rmpa.mesh.io.link import MeshLink
+
+MB = 1 << 20
+
+
+@pytest.fixture(autouse=True)
+def no_collector() -> Iterator[None]:
+    gc.disable()
+    yield
+    gc.enable()
+
+
+def of(one: Peer, other: Peer) -> list[weakref.ref[MeshLink]]:
+    """A peer's link to another one, and its bulk lane's connection."""
+    link = one.link(other)
+    assert link.bulk_link is not None
+    return [weakref.ref(link), weakref.ref(link.bulk_link)]
+
+
+@pytest.mark.parametrize("way", ["close", "abort", "end"])
+async def test_an_ended_link_is_gone_with_what_waited(way: str) -> None:
+    async with peers(2) as (one, other):
+        await until(lambda: one.linked(other) and other.linked(one), "a link")
+        await until(lambda: one.link(other).bulk_link is not None, "a bulk lane")
+        await until(lambda: other.link(one).bulk_link is not None, "a bulk lane")
+        links = [*of(one, other), *of(other, one)]
+        for _ in range(20):
+            one.link(other).bulk.send(1, 1, 0, bytes(MB))
+        assert one.link(other).queue_bytes
+        if way == "end":
+            await other.mesh.close()
+        else:
+            getattr(one.link(other), way)("the test says so")
+        for peer in (one, other):
+            await until(lambda peer=peer: peer.downs, "the end")  # type: ignore[misc]
+        for peer in (one, other):
+            for seen in (peer.ups, peer.downs, peer.clocks, peer.lanes_lost):
+                seen.clear()
+        await until(lambda: not any(link() for link in links), "nobody holds the old links")

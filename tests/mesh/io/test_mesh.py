@@ -1,0 +1,410 @@
+"""Meshes on loopback: dialling, accepting, refusing, ends; the lanes are in ``test_mesh_lanes.py``."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import fcntl
+import hashlib
+import socket
+import sys
+from dataclasses import replace
+from ipaddress import IPv4Address
+from typing import Any
+
+import pytest
+
+from rmpa.config.settings import LaneSettings
+from rmpa.core import limits
+from rmpa.core.counters import Counters
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+from rmpa.mesh.frames import Frame, FrameKind
+from rmpa.mesh.handshake import Lane, Refusal, Refuse
+from rmpa.mesh.io.sockets import tune_express
+from rmpa.runtime.descriptors import DESCRIPTORS
+from tests.mesh.io.meshes import DEADLINE, Peer, peers, raw, until
+from tests.runtime.descriptors_left import descriptors_left
+
+_SIOCOUTQNSD = 0x894B  # linux/sockios.h: bytes that were not sent yet
+
+
+@pytest.mark.parametrize("count", [2, 5])
+async def test_a_full_mesh_with_one_link_a_pair(count: int) -> None:
+    async with peers(count) as made:
+        await until(lambda: all(p.linked(*(o for o in made if o is not p)) for p in made), "a full mesh")
+        for peer in made:
+            used = [status for status in peer.mesh.links() if status.used]
+            assert len(used) == count - 1
+            for status in used:
+                assert status.guid is not None
+                assert status.dialled == (peer.identity.guid < status.guid)
+            assert {s.state for s in peer.mesh.peers()} == {"linked"}
+        link = made[0].link(made[1])
+        await until(lambda: link.rtt is not None, "a round trip")
+        assert link.clock_offset is not None
+        assert link.clock_error is not None
+        assert abs(link.clock_offset) <= link.clock_error
+        assert not any(p.downs for p in made)
+    for peer in made:
+        assert len(peer.downs) == count - 1
+        assert not peer.mesh.links()
+
+
+async def test_one_side_alone_knows_the_other() -> None:
+    async with peers(2, found=False) as (one, other):
+        one.mesh.peer_found(other.identity)
+        await until(lambda: one.linked(other) and other.linked(one), "a link")
+        assert other.ups[0].identity == one.identity
+
+
+async def test_of_several_addresses_whichever_answers_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody answers at the GUID's own address; at the next one nobody listens, and at the third a stranger does."""
+    one, other = sorted((Peer(1, host="127.0.0.4"), Peer(2, host="127.0.0.4")), key=lambda p: p.identity.guid)
+    connect = one.mesh._connect  # where packets are swallowed
+
+    async def through(endpoint: tuple[str, int], lane: Lane, within: float = limits.DIAL_TIMEOUT) -> socket.socket:
+        if endpoint[0] == "127.0.0.1":
+            await asyncio.sleep(within)
+            raise TimeoutError
+        return await connect(endpoint, lane, within)
+
+    monkeypatch.setattr(one.mesh, "_connect", through)
+    stranger = await asyncio.start_server(lambda _, writer: writer.close(), "127.0.0.3", other.port)
+    try:
+        await one.mesh.start()
+        await other.mesh.start()
+        began = asyncio.get_running_loop().time()
+        addresses = tuple(map(IPv4Address, ("127.0.0.2", "127.0.0.3", "127.0.0.4")))
+        one.mesh.peer_found(replace(other.identity, addresses=addresses))
+        await until(lambda: one.linked(other) and other.linked(one), "a link")
+        assert one.link(other).remote_endpoint[0] == "127.0.0.4"
+        assert asyncio.get_running_loop().time() - began < sum(limits.DIAL_ATTEMPTS)
+    finally:
+        stranger.close()
+        await stranger.wait_closed()
+        await one.mesh.close()
+        await other.mesh.close()
+
+
+async def test_a_link_that_ends_during_its_redial_leaves_no_socket(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The race of addresses ends when the silent link, and its socket, are closed already."""
+    async with peers(2) as made:
+        one, other = sorted(made, key=lambda peer: peer.identity.guid)
+        await until(lambda: one.linked(other) and other.linked(one), "a link")
+        link = one.link(other)
+        racing, ended = asyncio.Event(), asyncio.Event()
+        sockets: list[socket.socket] = []
+        race = one.mesh._race
+
+        async def late(*args: Any) -> tuple[socket.socket, tuple[str, int]]:
+            racing.set()
+            await ended.wait()
+            sock, endpoint = await race(*args)
+            sockets.append(sock)
+            return sock, endpoint
+
+        monkeypatch.setattr(one.mesh, "_race", late)
+        monkeypatch.setattr(one.mesh, "_alive", lambda _: False)
+        one.mesh.link_quiet(link)
+        task = one.mesh._redials[link.id]
+        await racing.wait()
+        link.abort("the cable is out")
+        await until(lambda: bool(one.downs) and link.sock.fileno() < 0, "its end")
+        ended.set()
+        async with asyncio.timeout(DEADLINE):
+            await asyncio.wait([task])
+        assert task.exception() is None
+        assert [sock.fileno() for sock in sockets] == [-1]
+        assert not any("failed" in record.message for record in caplog.records)
+        await until(lambda: one.linked(other) and other.linked(one), "the peers' machine dials again")
+
+
+async def test_a_link_that_ends_while_its_bulk_lane_is_dialled_leaves_no_socket(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with peers(2, found=False) as made:
+        one, other = sorted(made, key=lambda peer: peer.identity.guid)
+        connected, ended = asyncio.Event(), asyncio.Event()
+        sockets: list[socket.socket] = []
+        connect = one.mesh._connect
+
+        async def late(endpoint: tuple[str, int], lane: Lane, within: float = 2.0) -> socket.socket:
+            sock = await connect(endpoint, lane, within)
+            if lane is Lane.BULK and not sockets:
+                sockets.append(sock)
+                connected.set()
+                await ended.wait()
+            return sock
+
+        opened: list[socket.socket] = []
+        open_link = one.mesh._open
+
+        def note(sock: socket.socket, *args: Any) -> None:
+            opened.append(sock)
+            open_link(sock, *args)
+
+        monkeypatch.setattr(one.mesh, "_connect", late)
+        monkeypatch.setattr(one.mesh, "_open", note)
+        one.mesh.peer_found(other.identity)
+        await connected.wait()
+        one.link(other).abort("the cable is out")
+        await until(lambda: bool(one.downs), "its end")
+        ended.set()
+        await until(lambda: sockets[0].fileno() < 0, "the late socket is closed")
+        assert sockets[0] not in opened, "nobody waits for it"
+        await until(lambda: one.both_lanes(other) and other.both_lanes(one), "the next link has both lanes")
+
+
+async def test_a_dial_that_fails_of_a_bug_is_logged(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with peers(2, found=False) as made:
+        one, other = sorted(made, key=lambda peer: peer.identity.guid)
+
+        async def fails(*_: object) -> tuple[socket.socket, tuple[str, int]]:
+            raise KeyError("as asked")
+
+        monkeypatch.setattr(one.mesh, "_race", fails)
+        one.mesh.peer_found(other.identity)
+        await until(lambda: any(r.exc_info for r in caplog.records), "a line in the log")
+        assert not one.mesh._dials
+
+
+async def test_small_and_large_messages_in_order_and_byte_exact() -> None:
+    async with peers(2) as (one, other):
+        await until(lambda: one.linked(other) and other.linked(one), "a link")
+        link = one.link(other)
+        sent: list[tuple[int, int, int, bytes]] = []
+        for i in range(10_000):
+            sent.append((1, i, i, b"%064d" % i))
+            assert link.express.send(*sent[-1]) == 0
+            if i % 500 == 0:
+                large = hashlib.sha256(bytes([i // 500])).digest() * (limits.MIB // 32)
+                sent.append((2, i, i, large))
+                assert link.express.send(*sent[-1]) == 0
+            if link.queue_bytes or i % 500 == 0:
+                await until(lambda: link.queue_bytes < 65536, "room")
+        link.send_control(b'{"op":"end"}')
+        await until(lambda: len(other.data) == len(sent), "all messages")
+        for route in (1, 2):
+            assert [m for m in other.data if m[0] == route] == [m for m in sent if m[0] == route]
+        assert other.controls == [b'{"op":"end"}']
+        assert not link.dropped
+
+
+async def test_a_killed_peer_comes_back_with_a_new_instance_on_the_same_port() -> None:
+    async with peers(3) as (one, two, three):
+        await until(lambda: one.linked(two, three) and two.linked(one, three) and three.linked(one, two), "a mesh")
+        one.kill()
+        await until(lambda: len(two.downs) == 1 and len(three.downs) == 1, "both see it gone")
+        again = Peer(one.number, instance=1, port=one.port)
+        try:
+            await again.mesh.start()
+            again.mesh.peer_found(two.identity)
+            again.mesh.peer_found(three.identity)
+            await until(lambda: two.linked(again, three) and three.linked(again, two), "the mesh is whole again")
+            assert two.mesh.link(one.identity.guid) is None
+            assert {s.identity.instance for s in two.mesh.peers()} == {
+                again.identity.instance,
+                three.identity.instance,
+            }
+        finally:
+            await again.mesh.close()
+
+
+@pytest.mark.parametrize("garbage", [b"GET / HTTP/1.1\r\n\r\n" * 4, bytes(64), b"\xff" * 64])
+async def test_garbage_on_the_port_closes_that_connection_only(
+    garbage: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with peers(2) as (one, other):
+        await until(lambda: one.linked(other), "a link")
+        for _ in range(3):
+            reader, writer = await asyncio.open_connection("127.0.0.1", one.port)
+            writer.write(garbage)
+            with_reset: bytes | None
+            try:
+                with_reset = await asyncio.wait_for(reader.read(), DEADLINE)
+            except ConnectionResetError:
+                with_reset = b""
+            assert with_reset == b""
+            writer.close()
+        await until(lambda: one.mesh.counters["link.malformed"] == 3, "counted")
+        assert sum("broke the protocol" in r.message for r in caplog.records) == 1
+        assert one.linked(other)
+
+
+async def test_another_domain_is_refused_with_what_to_do(caplog: pytest.LogCaptureFixture) -> None:
+    async with peers(1) as (one,):
+        stranger = Identity(Guid.of("127.0.0.1", 9), b"s" * 16, "stranger", domain=7)
+        sock, answer = await raw(one, stranger)
+        sock.close()
+        assert answer.kind is FrameKind.REFUSE
+        assert Refuse.parse(answer.payload).code == Refusal.DOMAIN
+        assert "--domain" in Refuse.parse(answer.payload).text
+        assert one.mesh.counters["link.refused.domain"] == 1
+        await until(lambda: not one.mesh.links(), "the link ended")
+        assert [r.message for r in caplog.records if "domain" in r.message and r.levelname == "WARNING"] == [
+            f"! refused a link with stranger at 127.0.0.1: {Refuse.parse(answer.payload).text}"
+        ]
+
+
+async def test_a_stopped_peer_is_down_after_its_lease_and_its_memory_is_bounded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(limits, "LINK_QUEUE_BYTES", 4 * limits.MIB)
+    async with peers(1) as (one,):
+        stopped = Identity(Guid.of("127.0.0.1", 9), b"s" * 16, "stopped")
+        sock, answer = await raw(one, stopped, lease=0.5)
+        assert answer.kind is FrameKind.WELCOME
+        await until(lambda: bool(one.ups), "a link")
+        link = one.ups[0]
+        got = link.bytes_in
+        began = asyncio.get_running_loop().time()
+        await asyncio.get_running_loop().sock_sendall(sock, Frame(FrameKind.PING, stamp_ns=1).serialize())
+        await until(lambda: link.bytes_in > got, "its first word, from which on the lease counts")
+        block = bytes(limits.MIB)
+        for i in range(64):
+            link.express.send(5, i, i, block)
+            assert link.queue_bytes <= 6 * limits.MIB
+        assert link.dropped >= 50
+        assert link.close_route(5) <= 4
+        await until(lambda: bool(one.downs), "the lease is over")
+        assert asyncio.get_running_loop().time() - began >= 0.4
+        assert "silent for its lease of 0.5 s" in one.downs[0][1]
+        sock.close()
+
+
+async def test_control_that_nobody_reads_closes_the_link_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "LINK_URGENT_BYTES", limits.MIB)
+    async with peers(1) as (one,):
+        sock, _ = await raw(one, Identity(Guid.of("127.0.0.1", 9), b"s" * 16, "deaf"), lease=60.0)
+        await until(lambda: bool(one.ups), "a link")
+        for _ in range(64):
+            one.ups[0].send_control(bytes(limits.MIB // 2))
+        await until(lambda: bool(one.downs), "closed")
+        assert "deaf does not read" in one.downs[0][1]
+        sock.close()
+
+
+def test_little_waits_in_the_kernel_for_a_peer_that_is_slow() -> None:
+    """What waits in our own queue can be overtaken and dropped; a pong behind megabytes of data was 5 s late."""
+    counters = Counters()
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as sock:
+        tune_express(sock, LaneSettings(), counters)
+        sock.setblocking(False)
+        with server.accept()[0]:  # reads nothing
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    sock.send(bytes(16 * limits.KIB))
+            unsent = fcntl.ioctl(sock, _SIOCOUTQNSD, bytes(4))
+    assert int.from_bytes(unsent, sys.byteorder) <= 2 * limits.LINK_UNSENT_BYTES
+    assert counters.as_dict() == {}
+
+
+async def test_a_bye_says_why() -> None:
+    async with peers(2) as (one, other):
+        # A bulk lane that is still being dialled would be refused behind the bye, and counted.
+        await until(lambda: one.both_lanes(other) and other.both_lanes(one), "both lanes")
+        one.mesh.peer_gone(other.identity.guid)
+        other.mesh.peer_gone(one.identity.guid)
+        assert one.linked(other)
+        one.link(other).close("maintenance")
+        await until(lambda: bool(one.downs) and bool(other.downs), "both down")
+        assert one.downs[0][1] == "maintenance"
+        assert other.downs[0][1] == "peer0 left: maintenance"
+        assert not one.mesh.peers()
+        assert one.mesh.counters.as_dict() == {"link.down": 1}
+
+
+async def test_what_waits_for_a_link_that_ends_is_counted() -> None:
+    async with peers(2) as (one, other):
+        await until(lambda: one.linked(other) and other.linked(one), "a link")
+        lane = one.link(other).express
+        dropped = sum(lane.send(1, number, 0, bytes(limits.MIB // 8)) for number in range(200))
+        waiting = lane.outbox.waiting_entries
+        assert (waiting > 50, dropped) == (True, 0)
+        other.kill()
+        await until(lambda: bool(one.downs), "it is down")
+        assert waiting - 2 <= one.mesh.counters["link.discarded"] <= waiting, "but for what was on its way"
+
+
+async def test_a_peer_that_is_not_there_says_why_it_is_not_linked() -> None:
+    async with peers(1) as (one,):
+        free = socket.socket()
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+        free.close()
+        ghost = Identity(Guid.of("127.0.0.1", port, 65535), b"g" * 16, "ghost")
+        if ghost.guid < one.identity.guid:
+            ghost = Identity(Guid.of("127.255.255.254", port), b"g" * 16, "ghost")
+        one.mesh.peer_found(ghost)
+        await until(lambda: one.mesh.counters["link.dial_failed"] >= 2, "two attempts")
+        (status,) = one.mesh.peers()
+        assert status.state in ("waiting", "dialling")
+        assert "refused" in status.last_error.lower()
+
+
+async def test_no_file_descriptors_left_pauses_and_recovers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "ACCEPT_PAUSE", 0.01)
+    async with peers(2, found=False) as (one, other):
+        before = DESCRIPTORS.counters["descriptors.refused.link"]
+        with descriptors_left(1):  # for the socket that dials
+            other.mesh.peer_found(one.identity)
+            await until(lambda: DESCRIPTORS.counters["descriptors.refused.link"] >= before + 3, "pauses")
+            assert not other.linked(one)
+        await until(lambda: one.linked(other), "a link after the pause")
+
+
+async def test_a_dial_without_file_descriptors_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It used to end the task without a word, and that peer was never dialled again."""
+    async with peers(2, found=False) as (one, other):
+        real = socket.socket
+        full = [True, True]
+
+        def none_left(*args: object, **options: object) -> socket.socket:
+            if full:
+                full.pop()
+                raise OSError(errno.EMFILE, "Too many open files")
+            return real(*args, **options)  # type: ignore[arg-type]
+
+        monkeypatch.setattr("rmpa.runtime.descriptors.socket.socket", none_left)
+        one.mesh.peer_found(other.identity)
+        other.mesh.peer_found(one.identity)
+        await until(lambda: one.linked(other) and other.linked(one), "linked after all")
+        assert not full
+
+
+async def test_silent_connections_from_one_address_are_bounded() -> None:
+    async with peers(1) as (one,):
+        writers = []
+        for _ in range(limits.PENDING_PER_ADDRESS + 4):
+            _, writer = await asyncio.open_connection("127.0.0.1", one.port)
+            writers.append(writer)
+        await until(lambda: one.mesh.counters["link.pending_full"] == 4, "four closed")
+        assert len(one.mesh.links()) == limits.PENDING_PER_ADDRESS
+        for writer in writers:
+            writer.close()
+
+
+async def test_both_dial_at_once_and_one_link_stays() -> None:
+    async with peers(2, found=False) as (one, other):
+        for a, b in ((one, other), (other, one)):
+            a.mesh._peering.peer_found(b.identity, asyncio.get_running_loop().time() - limits.DIAL_FALLBACK)
+        for peer in (one, other):
+            peer.mesh._peering.handle_timer(asyncio.get_running_loop().time())
+            peer.mesh._act()
+        await until(
+            lambda: (
+                one.both_lanes(other)
+                and other.both_lanes(one)
+                and all(sorted(s.bulk for s in p.mesh.links()) == [False, True] for p in (one, other))
+            ),
+            "one connection of each lane",
+        )
+        low, high = sorted((one, other), key=lambda p: p.identity.guid)
+        assert low.link(high).dialled
+        assert not high.link(low).dialled

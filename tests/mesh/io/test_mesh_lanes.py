@@ -1,0 +1,520 @@
+"""The two lanes of a link on loopback: they come up together, bulk falls alone, messages in parts, fences."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import socket
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.config.settings import LaneSettings
+from rmpa.core import limits
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+from rmpa.core.outbox import FIRST, LAST
+from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, unpack_header
+from rmpa.mesh.handshake import Lane, Refusal, Refuse
+from tests.mesh.io.meshes import DEADLINE, Peer, linked_pair, peers, raw, until
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from rmpa.mesh.io.lane import LaneSender
+    from rmpa.mesh.io.link import MeshLink
+
+HAND_MADE = Identity(Guid.of("127.0.0.1", 9), b"h" * 16, "hand_made")
+
+
+def large(number: int, size: int) -> bytes:
+    """Bytes of which no piece is like another."""
+    block = hashlib.sha256(number.to_bytes(4, "big")).digest()
+    return b"".join(hashlib.sha256(block + n.to_bytes(4, "big")).digest() for n in range(size // 32 + 1))[:size]
+
+
+def bulk_of(link: MeshLink) -> MeshLink:
+    bulk = link.bulk_link
+    assert bulk is not None
+    return bulk
+
+
+# --- coming up ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [2, 4])
+async def test_each_link_has_a_bulk_lane_that_the_same_side_dialled(count: int) -> None:
+    async with peers(count) as made:
+        others = {p.number: [o for o in made if o is not p] for p in made}
+        await until(lambda: all(p.both_lanes(*others[p.number]) for p in made), "both lanes everywhere")
+        for peer in made:
+            statuses = peer.mesh.links()
+            assert sum(s.bulk for s in statuses) == sum(s.used for s in statuses) == count - 1
+            assert not any(s.bulk and s.used for s in statuses)
+            assert {(s.guid, s.dialled) for s in statuses if s.bulk} == {
+                (s.guid, s.dialled) for s in statuses if not s.bulk
+            }
+            assert len(peer.ups) == count - 1, "a bulk lane is no link of its own"
+            assert not peer.downs
+            assert not peer.lanes_lost
+    assert not any(p.mesh.links() for p in made)
+
+
+async def test_the_sockets_of_both_lanes_have_their_options() -> None:
+    lanes = LaneSettings(express_dscp=46, express_priority=5, bulk_dscp=8, bulk_priority=2)
+    async with peers(2, lanes=lanes) as (one, other):
+        await until(lambda: one.both_lanes(other) and other.both_lanes(one), "both lanes")
+        for peer, far in ((one, other), (other, one)):
+            express = peer.link(far)
+            wanted = [
+                (express, 46, 5, limits.LINK_UNSENT_BYTES),
+                (bulk_of(express), 8, 2, limits.BULK_UNSENT_BYTES),
+            ]
+            for link, dscp, priority, unsent in wanted:
+                sock = link.sock
+                assert sock.getsockopt(socket.IPPROTO_IP, socket.IP_TOS) == dscp << 2
+                assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_PRIORITY) == priority
+                assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT) == unsent
+                assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+                unacked = sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
+                assert unacked == round(limits.LINK_UNACKED * 1000)
+            assert not peer.mesh.counters["link.option_refused"]
+
+
+async def test_by_default_commands_go_first_in_every_queue_and_wifi_class() -> None:
+    async with linked_pair() as (one, other):
+        for link, tos, priority in ((one.link(other), 0xC0, 6), (bulk_of(one.link(other)), 0, 0)):
+            assert link.sock.getsockopt(socket.IPPROTO_IP, socket.IP_TOS) == tos
+            assert link.sock.getsockopt(socket.SOL_SOCKET, socket.SO_PRIORITY) == priority
+
+
+@pytest.mark.parametrize(
+    ("lane", "code"), [(Lane.BULK, Refusal.NO_EXPRESS), (0, Refusal.LANE), (3, Refusal.LANE), (255, Refusal.LANE)]
+)
+async def test_a_lane_without_an_express_one_and_one_that_does_not_exist_are_refused(
+    lane: int, code: Refusal
+) -> None:
+    async with peers(1) as (one,):
+        sock, answer = await raw(one, HAND_MADE, lane=lane)
+        assert answer.kind is FrameKind.REFUSE
+        assert Refuse.parse(answer.payload).code == code
+        sock.close()
+        await until(lambda: not one.mesh.links(), "closed")
+        assert one.mesh.counters[f"link.refused.{code.name.lower()}"] == 1
+        assert not one.ups
+
+
+async def test_another_instance_gets_no_bulk_lane_beside_a_link_that_is_not_its_own() -> None:
+    async with peers(1) as (one,):
+        express, answer = await raw(one, HAND_MADE)
+        assert answer.kind is FrameKind.WELCOME
+        sock, answer = await raw(one, replace(HAND_MADE, instance=b"x" * 16), lane=Lane.BULK)
+        assert Refuse.parse(answer.payload).code == Refusal.NO_EXPRESS
+        sock.close()
+        express.close()
+        await until(lambda: not one.mesh.links(), "closed")
+
+
+async def test_both_sides_promise_the_bulk_lanes_lease() -> None:
+    async with linked_pair() as (one, other):
+        for link in (one.link(other), other.link(one)):
+            leases = [remote.lease for k in (link, bulk_of(link)) if (remote := k._machine.remote) is not None]
+            assert leases == [limits.LINK_LEASE, limits.BULK_LEASE]
+
+
+async def test_whoever_takes_what_comes_takes_it_from_both_lanes() -> None:
+    async with linked_pair() as (one, other):
+        got: list[int] = []
+        link = other.link(one)
+        taken = replace(other.mesh._takers, data=lambda k, r, s, t, p: got.append(s))
+        link.use(taken)
+        one.link(other).bulk.send(7, 1, 0, b"x")
+        one.link(other).express.send(7, 2, 0, b"x")
+        await until(lambda: sorted(got) == [1, 2], "both")
+
+
+async def test_a_bulk_lane_that_cannot_be_reached_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with peers(2, found=False) as made:
+        one, other = sorted(made, key=lambda peer: peer.identity.guid)
+        hold_bulk(one, fails=3)
+        one.mesh.peer_found(other.identity)
+        await until(lambda: one.both_lanes(other) and other.both_lanes(one), "both lanes after all")
+        assert one.mesh.counters["link.bulk_failed"] == 3
+        assert len(one.ups) == 1
+        assert not one.lanes_lost
+
+
+def hold_bulk(peer: Peer, *, fails: int = 0, until_set: asyncio.Event | None = None) -> None:
+    """Let dials of bulk lanes fail, or wait."""
+    real: Callable[..., Awaitable[socket.socket]] = peer.mesh._connect
+    left = [None] * fails
+
+    async def connect(endpoint: tuple[str, int], lane: Lane, *rest: float) -> socket.socket:
+        if lane is Lane.BULK and left:
+            left.pop()
+            raise ConnectionRefusedError
+        if lane is Lane.BULK and until_set is not None:
+            await until_set.wait()
+        return await real(endpoint, lane, *rest)
+
+    peer.mesh._connect = connect  # type: ignore[assignment, method-assign]
+
+
+# --- messages -----------------------------------------------------------------------------------------------------
+
+SIZES = [65_535, 65_536, 65_537, 131_072, 131_073, 200_000, 1 << 20, (5 << 20) + 7]
+
+
+@pytest.mark.parametrize("lane", ["express", "bulk"])
+async def test_messages_of_all_sizes_arrive_byte_for_byte(lane: str) -> None:
+    async with linked_pair() as (one, other):
+        for sender, receiver in ((one, other), (other, one)):
+            way: LaneSender = getattr(sender.link(receiver), lane)
+            sent = [(7, n, n + 1, large(n, size)) for n, size in enumerate(SIZES)]
+            for message in sent:
+                way.send(*message)
+            await until(lambda: len(receiver.data) == len(SIZES), "all messages")  # noqa: B023 - it is awaited here
+            assert receiver.data == sent
+
+
+async def test_a_message_that_is_sent_while_it_comes_arrives_as_one() -> None:
+    async with linked_pair() as (one, other):
+        lane = one.link(other).bulk
+        payload = large(1, 300_000)
+        parcel = lane.open(7, len(payload), (1 << 32) + 5, 99)
+        for start in range(0, len(payload), 70_000):
+            lane.extend(parcel, memoryview(payload)[start : start + 70_000])
+            lane.send(8, start, 0, b"in between")
+            await asyncio.sleep(0.001)
+        await until(lambda: bool(other.messages(7)), "the message")
+        assert other.messages(7) == [(5, payload)]
+        assert len(other.messages(8)) == 5
+
+
+async def test_an_abandoned_message_is_nobodys_and_the_next_one_comes() -> None:
+    async with linked_pair() as (one, other):
+        lane = one.link(other).bulk
+        parcel = lane.open(7, 300_000, 1, 0)
+        lane.extend(parcel, bytes(100_000))
+        lane.abandon(parcel)
+        lane.extend(parcel, bytes(200_000))
+        lane.send(7, 2, 0, b"next")
+        await until(lambda: bool(other.data), "the next one")
+        assert other.data == [(7, 2, 0, b"next")]
+        assert not other._begun
+
+
+async def test_small_messages_of_the_same_lane_go_between_the_parts_of_large_ones() -> None:
+    async with linked_pair() as (one, other):
+        lane = one.link(other).bulk
+        lane.send(7, 1, 0, bytes(32 << 20))
+        for number in range(100):
+            lane.send(8, number, 0, b"small")
+        await until(lambda: len(other.data) == 101, "all of them")
+        assert [sequence for _, sequence, _, _ in other.data[:100]] == list(range(100))
+        assert other.data[100][0] == 7
+
+
+async def test_each_route_has_its_own_bound_and_drops_its_own() -> None:
+    async with linked_pair() as (one, other):
+        lane = one.link(other).bulk
+        lane.set_terms(8, 2, None, strict=False)
+        lane.send(7, 0, 0, bytes(32 << 20))
+        dropped = [lane.send(8, number, 0, b"%d" % number) for number in range(5)]
+        assert dropped == [0, 0, 1, 1, 1]
+        lane.send(9, 0, 0, b"other")
+        await until(lambda: len(other.data) == 4, "what was kept")
+        assert other.messages(8) == [(3, b"3"), (4, b"4")]
+        assert other.messages(9) == [(0, b"other")]
+        assert one.link(other).dropped == 3
+        assert [s.dropped for s in one.mesh.links() if s.used] == [3]
+
+
+async def test_a_closed_route_lets_go_of_what_waits() -> None:
+    async with linked_pair() as (one, other):
+        link = one.link(other)
+        link.bulk.send(7, 0, 0, bytes(32 << 20))
+        for number in range(5):
+            link.bulk.send(8, number, 0, b"x")
+        assert link.close_route(8) == 5
+        assert link.close_route(8) == 0
+        assert link.close_route(7) == 1
+        link.bulk.send(9, 1, 0, b"next")
+        await until(lambda: bool(other.messages(9)), "what came behind")
+        assert other.data == [(9, 1, 0, b"next")]
+        assert link.queue_bytes < 1 << 20
+
+
+# --- the bulk lane falls alone ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("by_dialler", [True, False])
+async def test_the_bulk_lane_falls_and_comes_back_while_small_messages_go_on(by_dialler: bool) -> None:
+    async with linked_pair() as (one, other):
+        held = asyncio.Event()
+        hold_bulk(one, until_set=held)
+        for sender, receiver in ((one, other), (other, one)):
+            sender.link(receiver).bulk.send(7, 1, 0, large(1, 200_000))
+        await until(lambda: bool(one.data and other.data), "before the cut")
+        victim = one.link(other) if by_dialler else other.link(one)
+        before = [one.link(other), other.link(one)]
+        bytes_before = [(link.bytes_in, link.bytes_out) for link in before]
+        bulk_of(victim).sock.shutdown(socket.SHUT_RDWR)
+        await until(lambda: bool(one.lanes_lost and other.lanes_lost), "both know")
+        for sender, receiver in ((one, other), (other, one)):
+            link = sender.link(receiver)
+            assert link.bulk_link is None
+            assert not link.bulk.connected
+            assert link.up
+            link.bulk.send(7, 2, 0, large(2, 300_000))
+            link.bulk.send(7, 3, 0, b"small behind it")
+            for number in range(50):
+                link.express.send(8, number, 0, b"cmd")
+        await until(lambda: len(one.messages(8)) == len(other.messages(8)) == 50, "commands meanwhile")
+        assert one.messages(7) == other.messages(7) == [(1, large(1, 200_000))]
+        held.set()
+        await until(lambda: len(one.messages(7)) == len(other.messages(7)) == 3, "what waited")
+        for peer in (one, other):
+            assert peer.messages(7)[1:] == [(2, large(2, 300_000)), (3, b"small behind it")]
+            assert not peer.downs
+            assert len(peer.ups) == len(peer.lanes_lost) == 1
+            assert peer.mesh.counters["link.bulk_lost"] == 1
+        assert [one.link(other), other.link(one)] == before
+        for link, (was_in, was_out) in zip(before, bytes_before, strict=True):
+            assert link.bytes_in >= was_in + 300_000, "the counts of the connection before are kept"
+            assert link.bytes_out >= was_out + 300_000
+
+
+async def test_cut_in_the_middle_of_large_messages_none_arrives_by_half_and_those_that_waited_do() -> None:
+    async with linked_pair() as (one, other):
+        lane = one.link(other).bulk
+        for cut in range(5):
+            first = 100 * cut
+            for number in range(4):
+                lane.send(7 + number, first, 0, large(first + number, 3_000_000))
+                lane.send(7 + number, first + 1, 0, large(first + number, 100_000))
+            growing = lane.open(20, 400_000, first, 0)
+            lane.extend(growing, bytes(200_000))
+            bulk_of(one.link(other)).sock.shutdown(socket.SHUT_RDWR)
+            await until(lambda: len(one.lanes_lost) == cut + 1, "the lane is lost")  # noqa: B023 - awaited here
+            lane.extend(growing, bytes(200_000))
+            await until(lambda: one.both_lanes(other) and other.both_lanes(one), "it is back")
+            await until(lambda: not lane.outbox.pending_bytes, "all has left")
+        lane.send(30, 1, 0, b"end")
+        await until(lambda: bool(other.messages(30)), "the end")
+        for route, sequence, _, payload in other.data:
+            if route in range(7, 11):
+                size = 100_000 if sequence % 100 else 3_000_000
+                assert payload == large(sequence // 100 * 100 + route - 7, size)
+            elif route == 20:
+                assert payload == bytes(400_000)
+        for route in range(7, 11):
+            numbers = [sequence for sequence, _ in other.messages(route)]
+            assert numbers == sorted(set(numbers))
+            assert {100 * cut + 1 for cut in range(5)} <= set(numbers), "what had not begun was not lost"
+        assert not one.downs
+        assert not other.downs
+
+
+async def test_the_rest_of_a_message_whose_beginning_went_down_with_the_lane_is_not_sent() -> None:
+    async with linked_pair() as (one, other):
+        lane = one.link(other).bulk
+        parcel = lane.open(7, 200_000, 1, 0)
+        lane.extend(parcel, bytes(100_000))
+        await until(lambda: bool(other._begun), "its first half")
+        bulk_of(one.link(other)).sock.shutdown(socket.SHUT_RDWR)
+        await until(lambda: bool(one.lanes_lost and other.lanes_lost), "cut")
+        lane.extend(parcel, bytes(50_000))
+        await until(lambda: one.both_lanes(other) and other.both_lanes(one), "it is back")
+        lane.extend(parcel, bytes(50_000))
+        lane.send(7, 2, 0, b"next")
+        await until(lambda: bool(other.data), "the next one")
+        assert other.data == [(7, 2, 0, b"next")]
+        assert len(one.lanes_lost) == len(other.lanes_lost) == 1, "nor did its pieces disturb the new one"
+
+
+async def test_a_mesh_ends_while_a_bulk_lane_is_being_dialled() -> None:
+    async with peers(2, found=False) as made:
+        one, other = sorted(made, key=lambda peer: peer.identity.guid)
+        hold_bulk(one, until_set=asyncio.Event())
+        one.mesh.peer_found(other.identity)
+        await until(lambda: one.linked(other) and bool(one.mesh._bulk_dials), "a link, and the dial")
+
+
+async def test_both_lanes_end_with_the_link() -> None:
+    async with linked_pair() as (one, other):
+        link = one.link(other)
+        one.mesh.peer_gone(other.identity.guid)
+        other.mesh.peer_gone(one.identity.guid)
+        link.close("maintenance")
+        await until(lambda: not one.mesh.links() and not other.mesh.links(), "all connections are closed")
+        assert one.downs == [(link, "maintenance")]
+        assert not one.lanes_lost, "the whole link is gone, and that is what is told"
+        assert link.express.ended
+        assert link.bulk.ended
+        assert link.bulk.send(1, 1, 0, b"x") == link.express.send(1, 1, 0, b"x") == 0
+        assert link.bulk.outbox.waiting(1) == 0
+
+
+async def test_a_killed_peer_leaves_no_lane_behind() -> None:
+    async with linked_pair() as (one, other):
+        other.kill()
+        await until(lambda: not one.mesh.links(), "nothing is left")
+        assert len(one.downs) == 1
+        await until(lambda: not one.mesh._bulk_dials, "nobody dials its bulk lane")
+
+
+# --- a bulk lane in place of another ------------------------------------------------------------------------------
+
+
+async def test_a_new_bulk_lane_replaces_one_that_is_stuck_and_carries_what_waited() -> None:
+    """The peer gave its connection up, and we have not heard of it: a router forgot it, perhaps."""
+    async with peers(1) as (one,):
+        express, _ = await raw(one, HAND_MADE, lease=60.0)
+        stuck, answer = await raw(one, HAND_MADE, lease=60.0, lane=Lane.BULK)
+        assert answer.kind is FrameKind.WELCOME
+        await until(lambda: bool(one.ups) and one.ups[0].bulk_link is not None, "both lanes")
+        link = one.ups[0]
+        old = bulk_of(link)
+        for route in range(7, 11):
+            link.bulk.send(route, 1, 0, large(route, 3_000_000))
+            link.bulk.send(route, 2, 0, large(route, 100_000))
+        assert link.queue_bytes > 6_000_000
+        fresh, answer = await raw(one, HAND_MADE, lease=60.0, lane=Lane.BULK)
+        assert answer.kind is FrameKind.WELCOME
+        await until(lambda: link.bulk_link not in (None, old), "replaced")
+        assert one.lanes_lost == [link]
+        got = await read_messages(fresh, lambda found: {(route, 2) for route in range(7, 11)} <= set(found))
+        for (route, number), payload in got.items():
+            assert payload == large(route, 100_000 if number == 2 else 3_000_000)
+        await until(lambda: len(one.mesh.links()) == 2, "the old one is closed")
+        assert link.up
+        assert not one.downs
+        for sock in (express, stuck, fresh):
+            sock.close()
+        await until(lambda: not one.mesh.links(), "closed")
+
+
+async def read_messages(
+    sock: socket.socket, enough: Callable[[dict[tuple[int, int], bytes]], bool]
+) -> dict[tuple[int, int], bytes]:
+    """Whole messages by route and number, of a lane on which nothing but data and keepalives may come."""
+    loop = asyncio.get_running_loop()
+    found: dict[tuple[int, int], bytes] = {}
+    begun: dict[int, bytes] = {}
+    kept = b""
+    async with asyncio.timeout(DEADLINE):
+        while not enough(found):
+            chunk = await loop.sock_recv(sock, 1 << 20)
+            assert chunk, "the new connection is closed"
+            kept += chunk
+            while len(kept) >= 24:
+                length, kind, flags, _, route, number, _ = unpack_header(kept, 0)
+                assert kind in (FrameKind.DATA, FrameKind.PING, FrameKind.PONG), FrameKind(kind).name
+                if len(kept) < 24 + length:
+                    break
+                part, kept = kept[24 : 24 + length], kept[24 + length :]
+                if kind != FrameKind.DATA:
+                    continue
+                assert bool(flags & FIRST) == (route not in begun)
+                begun[route] = begun.get(route, b"") + part
+                if flags & LAST:
+                    found[route, number] = begun.pop(route)
+    return found
+
+
+# --- fences -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("way", ["express", "bulk"])
+async def test_a_fence_is_answered_when_all_before_it_has_arrived(way: str) -> None:
+    async with linked_pair() as (one, other):
+        lane: LaneSender = getattr(one.link(other), way)
+        seen: list[list[int]] = []
+        taken = one.on_mark
+
+        def on_mark(link: MeshLink, kind: FrameKind, route: int, sequence: int) -> None:
+            taken(link, kind, route, sequence)
+            seen.append([number for number, _ in other.messages(7)])
+
+        link = one.link(other)
+        link.use(replace(one.mesh._takers, mark=on_mark))
+        for number in range(4):
+            lane.send(7, 2 * number, 0, large(number, 2_000_000 if number % 2 else 100))
+            lane.fence(7, number + 1)
+            lane.send(7, 2 * number + 1, 0, b"behind it")
+        await until(lambda: len(one.marks) == 4, "all answers")
+        assert one.marks == [(FrameKind.FENCED, 7, number) for number in (1, 2, 3, 4)]
+        for number, arrived in enumerate(seen):
+            assert arrived[: 2 * number + 1] == list(range(2 * number + 1))
+        assert not other.marks, "a fence is answered, and told to nobody"
+
+
+async def test_a_route_that_changes_lanes_behind_fences_keeps_its_order() -> None:
+    async with linked_pair() as (one, other):
+        link = one.link(other)
+        number = 0
+        for change in range(12):
+            lane = link.bulk if change % 2 else link.express
+            for _ in range(20):
+                lane.send(7, number, 0, large(number, 150_000 if change % 2 else 200))
+                number += 1
+            lane.fence(7, change + 1)
+            await until(lambda: one.marks[-1:] == [(FrameKind.FENCED, 7, change + 1)], "the fence")  # noqa: B023
+        await until(lambda: len(other.data) == number, "all messages")
+        assert [sequence for _, sequence, _, _ in other.data] == list(range(number))
+
+
+async def test_a_fence_that_waits_for_the_lanes_connection_is_answered_when_it_is_back() -> None:
+    async with linked_pair() as (one, other):
+        held = asyncio.Event()
+        hold_bulk(one, until_set=held)
+        bulk_of(one.link(other)).sock.shutdown(socket.SHUT_RDWR)
+        await until(lambda: bool(one.lanes_lost and other.lanes_lost), "cut")
+        lane = one.link(other).bulk
+        lane.set_terms(7, 1, None, strict=False)
+        lane.send(7, 1, 0, b"dropped")
+        lane.fence(7, 1)
+        lane.send(7, 2, 0, b"kept")
+        lane.fence(7, 2)
+        held.set()
+        await until(lambda: len(one.marks) == 2, "both answers")
+        assert one.marks == [(FrameKind.FENCED, 7, 1), (FrameKind.FENCED, 7, 2)]
+        assert other.messages(7) == [(2, b"kept")]
+
+
+async def test_a_fence_on_a_link_whose_messages_nobody_takes_is_not_answered() -> None:
+    """The answer would say that they were taken."""
+    async with peers(1) as (one,):
+        sock, _ = await raw(one, HAND_MADE, lease=60.0)
+        await until(lambda: bool(one.ups), "a link")
+        one.ups[0].use(None)
+        before = one.ups[0].bytes_in
+        loop = asyncio.get_running_loop()
+        data = pack_data_header(3, 7, 1, 0) + b"not"
+        await loop.sock_sendall(sock, data + Frame(FrameKind.FENCE, route=7, sequence=1).serialize())
+        await until(lambda: one.ups[0].bytes_in >= before + 2 * 24 + 3, "read")
+        one.ups[0].use(one.mesh._takers)
+        await loop.sock_sendall(sock, data + Frame(FrameKind.FENCE, route=7, sequence=2).serialize())
+        kept = b""
+        answers: list[int] = []
+        while not answers:
+            kept += await asyncio.wait_for(loop.sock_recv(sock, 4096), DEADLINE)
+            while (parsed := Frame.parse(kept)) is not None:
+                kept = kept[parsed[1] :]
+                answers += [parsed[0].sequence] * (parsed[0].kind is FrameKind.FENCED)
+        assert answers == [2]
+        assert len(one.data) == 1
+        sock.close()
+        await until(lambda: not one.mesh.links(), "closed")
+
+
+async def test_acknowledgements_go_in_front_and_by_the_express_lane() -> None:
+    async with linked_pair() as (one, other):
+        link = one.link(other)
+        link.express.send(7, 1, 0, bytes(32 << 20))
+        link.mark(FrameKind.ACK, 9, (1 << 32) + 5)
+        await until(lambda: bool(other.marks), "the acknowledgement")
+        assert other.marks == [(FrameKind.ACK, 9, 5)]
+        assert not other.data

@@ -1,0 +1,275 @@
+"""The control socket, served and called."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+from typing import TYPE_CHECKING
+
+import msgspec
+import pytest
+
+from rmpa.core import limits
+from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, StartError, UnreachableError
+from rmpa.observe.control import ControlReply
+from rmpa.observe.io.control_client import ControlClient, choose_agent, find_agents, same_core
+from rmpa.observe.io.control_server import ControlServer, Handler
+from rmpa.observe.snapshot import PingReply, Snapshot
+from tests.observe.samples import SNAPSHOT
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+
+async def slow_echo(args: dict[str, object]) -> object:
+    await asyncio.sleep(0)
+    return args
+
+
+def fail(_: dict[str, object]) -> object:
+    raise ValueError("a bug")
+
+
+def refuse(_: dict[str, object]) -> object:
+    raise UnreachableError("peer", "10.0.0.9", "is it on?")
+
+
+HANDLERS: dict[str, Handler] = {
+    "snapshot": lambda _: SNAPSHOT,
+    "echo": slow_echo,
+    "ping": lambda _: PingReply(times=(0.5, None), remote="x"),
+    "fail": fail,
+    "refuse": refuse,
+    "object": lambda _: object(),
+}
+
+
+@pytest.fixture
+async def server(place: Path) -> AsyncIterator[ControlServer]:
+    server = ControlServer(place, "base", HANDLERS)
+    await server.start()
+    yield server
+    await server.close()
+    assert list(place.iterdir()) == []
+
+
+async def call(path: Path, op: str, **args: object) -> object:
+    def blocking() -> object:
+        with ControlClient(path) as client:
+            return client.call(op, object, **args)
+
+    return await asyncio.to_thread(blocking)
+
+
+def snapshot_of(path: Path) -> Snapshot:
+    with ControlClient(path) as client:
+        return client.snapshot()
+
+
+async def raw(path: Path, data: bytes) -> list[ControlReply]:
+    """Send bytes, and read all replies until the server hangs up."""
+    reader, writer = await asyncio.open_unix_connection(path, limit=limits.CONTROL_REPLY_MAX)
+    try:
+        writer.write(data)
+        writer.write_eof()
+        return [ControlReply.parse(line) for line in (await reader.read()).splitlines()]
+    finally:
+        writer.close()
+        await writer.wait_closed()
+
+
+async def test_socket_and_directory_are_ours_alone(server: ControlServer, place: Path) -> None:
+    assert server.path.stat().st_mode & 0o777 == 0o600
+    assert place.stat().st_mode & 0o777 == 0o700
+
+
+async def test_calls(server: ControlServer) -> None:
+    assert await call(server.path, "echo", a=1, b=[True, None]) == {"a": 1, "b": [True, None]}
+    snapshot = await asyncio.to_thread(snapshot_of, server.path)
+    assert snapshot == SNAPSHOT
+
+
+async def test_many_requests_on_one_connection_byte_by_byte(server: ControlServer) -> None:
+    reader, writer = await asyncio.open_unix_connection(server.path)
+    for byte in b'{"op":"echo","args":{"n":1}}\n{"op":"echo"}\n':
+        writer.write(bytes([byte]))
+        await writer.drain()
+    assert await reader.readline() == b'{"ok":true,"value":{"n":1}}\n'
+    assert await reader.readline() == b'{"ok":true,"value":{}}\n'
+    writer.close()
+    await writer.wait_closed()
+
+
+async def test_errors_reach_the_client_with_their_remedy(server: ControlServer) -> None:
+    with pytest.raises(PeerRefused, match="no op 'snapshto'; did you mean snapshot"):
+        await call(server.path, "snapshto")
+    with pytest.raises(PeerRefused, match=r"agent base refused: no peer answers at 10.0.0.9; is it on\?"):
+        await call(server.path, "refuse")
+
+
+async def test_a_handlers_bug_is_logged_and_the_connection_goes_on(
+    server: ControlServer, caplog: pytest.LogCaptureFixture
+) -> None:
+    replies = await raw(server.path, b'{"op":"fail"}\n{"op":"object"}\n{"op":"echo"}\n')
+    assert [reply.ok for reply in replies] == [False, False, True]
+    assert "its log says why" in replies[0].remedy
+    assert "ValueError: a bug" in caplog.text
+    assert server.counters["control.failed"] == 1
+
+
+@pytest.mark.parametrize("data", [b"GET / HTTP/1.1\r\n\r\n", b"\x00\xff\n", b"{}\n", b"[" * 5000 + b"\n"])
+async def test_garbage_is_answered_counted_and_closed(
+    server: ControlServer, data: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    (reply,) = await raw(server.path, data + b'{"op":"echo"}\n')
+    assert not reply.ok
+    assert server.counters["control.refused"] == 1
+    assert [record.levelno for record in caplog.records if record.levelno >= logging.WARNING] == [logging.WARNING]
+
+
+async def test_half_a_request_is_no_error(server: ControlServer) -> None:
+    assert await raw(server.path, b'{"op":"ec') == []
+    assert server.counters.as_dict() == {}
+
+
+async def test_too_large_a_request(server: ControlServer) -> None:
+    reader, writer = await asyncio.open_unix_connection(server.path)
+    writer.write(b"x" * (limits.CONTROL_REQUEST_MAX + 2))
+    assert not ControlReply.parse(await reader.readline()).ok
+    writer.close()
+    await asyncio.gather(writer.wait_closed(), return_exceptions=True)
+    assert server.counters["control.refused"] == 1
+
+
+async def test_too_many_clients(server: ControlServer) -> None:
+    held = [await asyncio.open_unix_connection(server.path) for _ in range(limits.CONTROL_CLIENTS_MAX)]
+    for reader, writer in held:
+        writer.write(b'{"op":"echo"}\n')
+        assert (await reader.readline()).startswith(b'{"ok":true')
+    (reply,) = await raw(server.path, b"")
+    assert "too many clients" in reply.error
+    for _, writer in held:
+        writer.close()
+        await writer.wait_closed()
+
+
+async def test_an_idle_client_is_closed(server: ControlServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "CONTROL_IDLE_TIMEOUT", 0.05)
+    reader, writer = await asyncio.open_unix_connection(server.path)
+    assert await reader.read() == b""
+    writer.close()
+    await writer.wait_closed()
+
+
+async def test_a_handler_that_hangs_is_ended(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "CONTROL_HANDLER_TIMEOUT", 0.05)
+
+    async def hang(_: dict[str, object]) -> object:
+        return await asyncio.get_running_loop().create_future()
+
+    server = ControlServer(place, "base", {"hang": hang})
+    await server.start()
+    (reply,) = await raw(server.path, b'{"op":"hang"}\n')
+    assert "took more than" in reply.error
+    await server.close()
+
+
+async def test_closing_ends_clients(place: Path) -> None:
+    server = ControlServer(place, "base", HANDLERS)
+    await server.start()
+    reader, writer = await asyncio.open_unix_connection(server.path)
+    writer.write(b'{"op":"echo"}\n')
+    await reader.readline()
+    await server.close()
+    await server.close()
+    assert await reader.read() == b""
+    writer.close()
+    await writer.wait_closed()
+
+
+async def test_a_second_agent_of_the_name_is_refused_and_harms_nothing(server: ControlServer, place: Path) -> None:
+    second = ControlServer(place, "base", {})
+    with pytest.raises(StartError, match="already runs on this machine"):
+        await second.start()
+    await second.close()
+    assert await call(server.path, "echo") == {}
+
+
+async def test_a_stale_socket_is_replaced(place: Path) -> None:
+    path = place / "base.sock"
+    with socket.socket(socket.AF_UNIX) as left:
+        left.bind(str(path))
+    assert find_agents({"RMPA_RUNTIME_DIR": str(place)}) == []
+    server = ControlServer(place, "base", HANDLERS)
+    await server.start()
+    assert await call(path, "echo") == {}
+    await server.close()
+
+
+async def test_too_long_a_path_says_what_to_do(place: Path) -> None:
+    with pytest.raises(StartError, match="set RMPA_RUNTIME_DIR to a shorter directory"):
+        await ControlServer(place / ("x" * 100), "base", {}).start()
+
+
+async def test_choosing_an_agent(server: ControlServer, place: Path) -> None:
+    env = {"RMPA_RUNTIME_DIR": str(place)}
+
+    async def choose(name: str | None = None, **more: str) -> str:
+        return (await asyncio.to_thread(choose_agent, env | more, name)).name
+
+    assert await choose() == "base"
+    with pytest.raises(UnreachableError, match=r"no agent 'bse' answers at .*/bse\.sock; running here: base"):
+        await choose("bse")
+    moved = msgspec.structs.replace(
+        SNAPSHOT, agent=msgspec.structs.replace(SNAPSHOT.agent, core_uri="http://127.0.0.1:11312/")
+    )
+    second = ControlServer(place, "second", {"snapshot": lambda _: moved})
+    await second.start()
+    with pytest.raises(RmpaError, match="several agents run on this machine: base, second; name one with --agent"):
+        await choose()
+    assert await choose("second") == "second"
+    assert await choose(RMPA_AGENT="second") == "second"
+    assert await choose(ROS_MASTER_URI="http://localhost:11312") == "second"
+    await second.close()
+
+
+def test_no_agent_at_all(place: Path) -> None:
+    with pytest.raises(UnreachableError, match=f"no agent answers at {place}; start one with `rmpa up`"):
+        choose_agent({"RMPA_RUNTIME_DIR": str(place)})
+    with pytest.raises(UnreachableError, match="start it with `rmpa up --name base`"):
+        choose_agent({"RMPA_RUNTIME_DIR": str(place), "RMPA_AGENT": "base"})
+
+
+async def test_another_kind_of_answer(place: Path) -> None:
+    server = ControlServer(place, "base", {"snapshot": lambda _: 5})
+    await server.start()
+    with pytest.raises(RemoteProtocolError, match="is it older"):
+        await asyncio.to_thread(snapshot_of, server.path)
+    await server.close()
+
+
+async def test_an_agent_that_does_not_answer(place: Path) -> None:
+    path = place / "base.sock"
+    with socket.socket(socket.AF_UNIX) as stopped:
+        stopped.bind(str(path))
+        stopped.listen()
+        with ControlClient(path, timeout=0.05) as client, pytest.raises(UnreachableError, match="in time"):
+            client.call("snapshot", object)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("http://127.0.0.1:11311/", "http://localhost:11311", True),
+        ("http://127.0.0.1:11311/", "http://localhost:11312", False),
+        ("http://10.0.0.1:1", "http://10.0.0.1:1/", True),
+        ("http://10.0.0.1:1", "http://localhost:1/", False),
+        ("http://127.0.0.1:1/", f"http://{socket.gethostname()}:1", True),
+        ("http://localhost", "http://localhost", False),
+        ("http://localhost:x", "http://localhost:1", False),
+    ],
+)
+def test_same_core(one: str, other: str, same: bool) -> None:
+    assert same_core(one, other) is same

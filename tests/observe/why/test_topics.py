@@ -1,0 +1,577 @@
+"""``rmpa why``: each stage by itself, from two agents' words that differ in one thing from those of what flows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rmpa.core import limits
+from rmpa.observe.snapshot import FilesInfo, LatencySpread, LinkInfo, PeerInfo, RouteInfo, Snapshot, TopicInfo
+from rmpa.observe.why.diagnosis import (
+    BothSides,
+    Diagnosis,
+    FarSource,
+    FarTopic,
+    NearTopic,
+    PathStage,
+    Reader,
+    StageResult,
+)
+from rmpa.observe.why.topics import walk_topic
+from tests.observe.samples import SNAPSHOT
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+ORDER = (
+    *("peer", "link", "publisher", "policy there", "reachable", "offer", "limit", "policy here", "type", "graph"),
+    *("subscriber", "md5", "route", "sent", "arrived", "contract", "reader"),
+)
+ONLY_FAILS = ("reachable", "limit")
+"""Stages that are shown only where the walk ends at them."""
+LINK = LinkInfo(remote="10.0.0.2:40002", dialled=True, up_ago=60.0, rtt=0.0004, heard_ago=0.1)
+PEER = PeerInfo(
+    name="joystick",
+    guid="10.0.0.2:40002#1",
+    instance="11" * 16,
+    state="linked",
+    since_ago=60.0,
+    source="multicast",
+    link=LINK,
+    topics_in=3,
+)
+ROUTE = RouteInfo(
+    peer="joystick",
+    node="/joy",
+    direction="in",
+    state="open",
+    type="sensor_msgs/Joy",
+    md5="5a9ea5f83505693b71e785041e67a8bb",
+    messages=100,
+    age=0.05,
+    rate=20.0,
+    period=LatencySpread(count=99, mean=0.05, sd=0.001, min=0.049, max=0.052, p50=0.05, p99=0.0515),
+    lane="express",
+)
+SOURCE = FarSource(node="/joy", type="sensor_msgs/Joy", rule="bridge.allow has '/**'", route="open", messages=100)
+ROUTE_LATER = msgspec.structs.replace(ROUTE, messages=120, age=0.03)
+SOURCE_LATER = msgspec.structs.replace(SOURCE, messages=120)
+
+
+@dataclass(frozen=True)
+class Case:
+    """Both sides of ``/cmd``, which flows unless something is changed."""
+
+    peer: PeerInfo | None = PEER
+    route: RouteInfo | None = ROUTE
+    later: RouteInfo | None = ROUTE_LATER
+    source: FarSource | None = SOURCE
+    source_later: FarSource | None = SOURCE_LATER
+    far: FarTopic | None = field(default_factory=FarTopic)
+    refusal: str = ""
+    registered: bool = True
+    conflict: bool = False
+    subscribers: tuple[str, ...] = ("/base",)
+    readers: tuple[Reader, ...] = (Reader(number=1, node="/base", messages=100),)
+    readers_later: tuple[Reader, ...] | None = (Reader(number=1, node="/base", messages=120),)
+    mismatches: tuple[str, ...] = ()
+    only: frozenset[str] | None = None
+    carrier: str = ""
+    files: FilesInfo | None = None
+
+    def _sight(self, route: RouteInfo | None, source: FarSource | None, readers: tuple[Reader, ...]) -> BothSides:
+        topic = TopicInfo(
+            name="/cmd",
+            type="sensor_msgs/Joy",
+            subscribers=self.subscribers,
+            routes=(route,) if route is not None else (),
+        )
+        agent = msgspec.structs.replace(SNAPSHOT.agent, files=self.files)
+        snapshot = Snapshot(agent=agent, taken=0.0, peers=(self.peer,) if self.peer else (), topics=(topic,))
+        far = self.far
+        if far is not None and source is not None:
+            far = msgspec.structs.replace(far, sources=(source,))
+        nodes = frozenset({"/joy"})
+        near = NearTopic(
+            snapshot,
+            "/cmd",
+            only=self.only,
+            carrier=self.carrier,
+            registered=nodes if self.registered else frozenset(),
+            conflict=nodes if self.conflict else frozenset(),
+            readers={"/joy": readers},
+            mismatches={"/joy": self.mismatches},
+        )
+        return BothSides(near, far, self.refusal)
+
+    def walk(self, peer: str = "joystick") -> tuple[Diagnosis, ...]:
+        first = self._sight(self.route, self.source, self.readers)
+        if self.readers_later is None:
+            return walk_topic(first, peer)
+        return walk_topic(first, peer, self._sight(self.later, self.source_later, self.readers_later))
+
+
+def one(case: Case, peer: str = "joystick") -> Diagnosis:
+    (diagnosis,) = case.walk(peer)
+    return diagnosis
+
+
+def route(**changes: object) -> dict[str, Any]:
+    """The route at both looks."""
+    changed = msgspec.structs.replace(ROUTE, **changes)
+    return {"route": changed, "later": changed}
+
+
+def test_what_flows_passes_every_stage_in_order() -> None:
+    found = one(Case())
+    assert found.flows
+    assert found.failed is None
+    assert [stage.name for stage in found.stages] == [name for name in ORDER if name not in ONLY_FAILS]
+    assert {stage.verdict for stage in found.stages} == {StageResult.OK}
+    assert (found.name, found.peer, found.to, found.node) == ("/cmd", "joystick", "base", "/joy")
+    by_name = {stage.name: stage.text for stage in found.stages}
+    assert by_name["arrived"] == "120 messages, the last 0.03 s ago, 20.0 Hz"
+    assert by_name["reader"] == "/base takes them"
+
+
+PATH = {"path_problem": "large packets do not get through", "path_remedy": "give it its true MTU"}
+
+
+def test_a_path_that_drops_large_packets_is_told_by_whichever_end_knows() -> None:
+    here = one(Case(peer=msgspec.structs.replace(PEER, link=msgspec.structs.replace(LINK, **PATH))))
+    (stage,) = [stage for stage in here.stages if stage.verdict is StageResult.WARN]
+    assert (stage.name, stage.remedy) == ("link", "give it its true MTU")
+    assert stage.text.endswith("large packets do not get through")
+    there = one(Case(far=msgspec.structs.replace(FarTopic(), **PATH)))
+    (stage,) = [stage for stage in there.stages if stage.verdict is StageResult.WARN]
+    assert (stage.name, stage.text) == ("path", "joystick says: large packets do not get through")
+    assert there.flows
+
+
+FAILURES: dict[str, tuple[Case, str, str, str]] = {
+    # What is different: the stage that fails, a part of its text, a part of its remedy.
+    "unknown peer": (Case(peer=None), "peer", "base knows no peer 'joystick' (domain 3", "rmpa doctor"),
+    "conflict": (
+        Case(peer=msgspec.structs.replace(PEER, conflicts=("shares its name",))),
+        "peer",
+        "shares its name",
+        "--name",
+    ),
+    "shared address": (
+        Case(peer=msgspec.structs.replace(PEER, conflicts=("its address is also b's; give one another",))),
+        "peer",
+        "its address is also b's",
+        "give one another",
+    ),
+    "unreachable": (
+        Case(source=msgspec.structs.replace(SOURCE, offered=False, unreachable="http://nosuch:1/: no such name")),
+        "reachable",
+        "/joy is registered on joystick, but cannot be reached at http://nosuch:1/: no such name",
+        "ROS_IP=127.0.0.1",
+    ),
+    "not linked": (
+        Case(peer=msgspec.structs.replace(PEER, state="linking", link=None, last_error="timed out")),
+        "link",
+        "joystick is linking: timed out",
+        "firewall",
+    ),
+    "only beacons": (
+        Case(peer=msgspec.structs.replace(PEER, state="linking", link=None, beacon_ago=1.5)),
+        "link",
+        "its beacons come (the last 1.5 s ago), but there is no TCP connection",
+        "TCP to 10.0.0.2:40002",
+    ),
+    "refused": (
+        Case(peer=msgspec.structs.replace(PEER, state="refused", link=None, last_error="domain 4 is not 3")),
+        "link",
+        "domain 4 is not 3",
+        "do what the text says",
+    ),
+    "nobody publishes": (Case(source=None, route=None), "publisher", "no node of joystick publishes", "start its"),
+    "nearly its name": (
+        Case(source=None, route=None, far=FarTopic(near="/cmd_vel")),
+        "publisher",
+        "no node of joystick publishes /cmd",
+        "did you mean /cmd_vel?",
+    ),
+    "only subscribed there": (
+        Case(source=None, route=None, far=FarTopic(subscribers=("/echo",))),
+        "publisher",
+        "/echo there only subscribe",
+        "start its",
+    ),
+    "published before its agent was restarted": (
+        Case(source=None, route=None, far=FarTopic(awaited=("/talker at http://127.0.0.1:4001/",))),
+        "publisher",
+        "/talker at http://127.0.0.1:4001/ published /cmd before the agent of joystick was restarted",
+        "it is asked again by itself",
+    ),
+    "an older agent, nothing offered": (
+        Case(route=None, far=None, refusal="it does not know the question"),
+        "publisher",
+        "does not tell why (it does not know the question)",
+        "rostopic info",
+    ),
+    "policy there": (
+        Case(source=msgspec.structs.replace(SOURCE, crosses=False, rule="bridge.deny has '/cmd'"), route=None),
+        "policy there",
+        "joystick keeps it at home: bridge.deny has '/cmd'",
+        "rmpa.toml of joystick",
+    ),
+    "built in": (
+        Case(source=msgspec.structs.replace(SOURCE, crosses=False, rule="built in: time stays home"), route=None),
+        "policy there",
+        "time stays home",
+        "another name",
+    ),
+    "no type": (
+        Case(source=msgspec.structs.replace(SOURCE, type="*"), route=None),
+        "offer",
+        "what type",
+        "registers",
+    ),
+    "too many": (
+        Case(source=msgspec.structs.replace(SOURCE, offered=False, beyond=70), route=None),
+        "offer",
+        "does not offer it: it has more topics than limits.topics = 70",
+        "bridge.deny",
+    ),
+    "too long a name": (
+        Case(source=msgspec.structs.replace(SOURCE, offered=False), route=None),
+        "offer",
+        "does not offer it: its name or type",
+        str(limits.CROSSING_NAME_MAX),
+    ),
+    "no place for its node": (
+        Case(**route(state="hidden", problem="joystick has more nodes than limits.nodes = 2", limit="nodes")),
+        "limit",
+        "more nodes than limits.nodes = 2",
+        "raise limits.nodes",
+    ),
+    "not told yet": (Case(route=None), "offer", "has not come here (3 topics of joystick have)", "both logs"),
+    "policy here": (
+        Case(**route(state="hidden", problem="bridge.deny has '/cmd'")),
+        "policy here",
+        "does not take it: bridge.deny has '/cmd'",
+        "rmpa reload",
+    ),
+    "type": (
+        Case(**route(state="hidden", problem="its type is a/B, but c/D here; rename one"), conflict=True),
+        "type",
+        "its type is a/B, but c/D here",
+        "rename one",
+    ),
+    "not registered": (Case(registered=False), "graph", "/rmpa/joystick/joy is not in the local graph", "5 s"),
+    "no descriptor for its proxy": (
+        Case(registered=False, **route(state="idle", problem="no file descriptor is left for its proxy; raise it")),
+        "graph",
+        "of /cmd: no file descriptor is left for its proxy",
+        "raise it",
+    ),
+    "no descriptor for its subscriber": (
+        Case(
+            readers=(),
+            files=FilesInfo(
+                open=60, limit=64, hard=64, reserved=16, problem="node /x has to wait: none left; raise it"
+            ),
+            **route(state="idle"),
+        ),
+        "subscriber",
+        "the agent has no file descriptor to accept it with: node /x has to wait: none left",
+        "raise it",
+    ),
+    "nobody here": (
+        Case(subscribers=(), readers=(), **route(state="idle")),
+        "subscriber",
+        "no node here subscribes to /cmd",
+        "rmpa topic echo /cmd",
+    ),
+    "not connected": (
+        Case(readers=(), **route(state="idle")),
+        "subscriber",
+        "/base subscribes, but has not connected",
+        "ROS_IP",
+    ),
+    "md5": (
+        Case(readers=(), mismatches=("/base: wants 1234",), **route(state="idle")),
+        "md5",
+        "/base: wants 1234",
+        "one version of the message",
+    ),
+    "publisher does not answer": (
+        Case(
+            **route(state="opening", md5=""),
+            source=msgspec.structs.replace(SOURCE, route="opening"),
+            source_later=msgspec.structs.replace(SOURCE, route="opening"),
+        ),
+        "route",
+        "waits for the publisher /joy to answer",
+        "rosnode ping /joy",
+    ),
+    "peer does not answer": (Case(**route(state="opening", md5="")), "route", "has not answered", "log there"),
+    "route closed": (
+        Case(**route(state="waiting", md5="", problem="its publisher refuses: no")),
+        "route",
+        "waiting: its publisher refuses: no",
+        "tried again by itself",
+    ),
+    "nothing published": (
+        Case(
+            **route(messages=0, age=None, rate=None, period=None),
+            source=msgspec.structs.replace(SOURCE, messages=0),
+            source_later=msgspec.structs.replace(SOURCE, messages=0),
+        ),
+        "sent",
+        "/joy is connected, and has published nothing since",
+        "rostopic hz /cmd",
+    ),
+    "too long": (
+        Case(
+            **route(messages=0, age=None, rate=None, period=None),
+            source=msgspec.structs.replace(SOURCE, messages=0, oversized=4, oversized_bytes=270_000_000),
+            source_later=msgspec.structs.replace(SOURCE, messages=0, oversized=5, oversized_bytes=270_000_000),
+        ),
+        "sent",
+        "5 messages of its publisher /joy are too long, the last has 270000000 bytes, and at most 268435452 cross",
+        "send them in parts, or compressed",
+    ),
+    "nothing arrives": (
+        Case(**route(messages=0, age=None, rate=None, period=None)),
+        "arrived",
+        "joystick has sent 20 meanwhile, and none arrived at base",
+        "max_rate",
+    ),
+    "nothing arrives any more": (
+        Case(later=ROUTE, source_later=msgspec.structs.replace(SOURCE, messages=120, dropped=20)),
+        "arrived",
+        "(20 were given up over there)",
+        "link too slow",
+    ),
+    "silent": (
+        Case(**route(age=8.0), source_later=SOURCE),
+        "arrived",
+        "nothing for 8.0 s; until then a message came every 52 ms at the latest",
+        "fallen silent",
+    ),
+    "readers have left": (Case(readers_later=()), "reader", "have just left", "again"),
+    "reader stuck": (
+        Case(
+            readers=(Reader(number=1, node="/base", waiting=70_000),),
+            readers_later=(Reader(number=1, node="/base", waiting=90_000, dropped=3),),
+        ),
+        "reader",
+        "/base (90000 B wait, 3 dropped) does not read",
+        "callbacks",
+    ),
+}
+
+
+@pytest.mark.parametrize(("case", "stage", "text", "remedy"), FAILURES.values(), ids=FAILURES)
+def test_the_first_stage_that_fails(case: Case, stage: str, text: str, remedy: str) -> None:
+    found = one(case)
+    assert not found.flows
+    assert found.failed is not None
+    assert found.failed is found.stages[-1], "nothing behind it is looked at"
+    assert found.failed.name == stage
+    assert text in found.failed.text
+    assert remedy in found.failed.remedy
+    # The stages before it are those of a topic that flows; md5 is only there where something is known of it.
+    names = [s.name for s in found.stages]
+    assert names == [name for name in ORDER if name in names]
+    missing = set(ORDER[: ORDER.index(stage)]) - set(names)
+    assert missing <= {"md5", *ONLY_FAILS}
+
+
+def test_every_stage_can_fail_but_the_contract() -> None:
+    assert {stage for _, stage, _, _ in FAILURES.values()} == set(ORDER) - {"contract"}
+
+
+WARNINGS: dict[str, tuple[Case, str, str]] = {
+    "a link that is silent": (
+        Case(peer=msgspec.structs.replace(PEER, link=msgspec.structs.replace(LINK, heard_ago=0.8))),
+        "link",
+        "silent for 0.8 s",
+    ),
+    "one was refused": (Case(mismatches=("/old: wants 1234",)), "md5", "/old: wants 1234"),
+    "dropped there": (
+        Case(source_later=msgspec.structs.replace(SOURCE, messages=120, dropped=2)),
+        "sent",
+        "2 given up over there",
+    ),
+    "some too long": (
+        Case(source_later=msgspec.structs.replace(SOURCE, messages=120, oversized=1, oversized_bytes=270_000_000)),
+        "sent",
+        "1 messages of its publisher /joy are too long, the last has 270000000 bytes, and at most 268435452 cross",
+    ),
+    "given up": (
+        Case(source_later=msgspec.structs.replace(SOURCE, messages=120, lost=7046)),
+        "sent",
+        "7046 of them given up, while joystick had no link to this module",
+    ),
+    "few messages": (
+        Case(**route(messages=1, age=30.0, rate=None, period=None), source_later=SOURCE),
+        "arrived",
+        "1 messages, the last 30.00 s ago",
+    ),
+    "contract": (
+        Case(later=msgspec.structs.replace(ROUTE, messages=120, lost=3, events={"deadline_missed": 2})),
+        "contract",
+        "3 lost, deadline missed 2 times",
+    ),
+    "one reader of two is stuck": (
+        Case(
+            readers=(Reader(number=1, node="/base"), Reader(number=2, node="/slow", waiting=1)),
+            readers_later=(Reader(number=1, node="/base"), Reader(number=2, node="/slow", waiting=1)),
+        ),
+        "reader",
+        "/slow (1 B wait, 0 dropped) does not keep up",
+    ),
+    "a reader was slow": (
+        Case(readers_later=(Reader(number=1, node="/base", dropped=9),)),
+        "reader",
+        "/base has missed 9",
+    ),
+}
+
+
+@pytest.mark.parametrize(("case", "stage", "text"), WARNINGS.values(), ids=WARNINGS)
+def test_what_is_worth_knowing_though_it_flows(case: Case, stage: str, text: str) -> None:
+    found = one(case)
+    assert found.flows
+    warned = [s for s in found.stages if s.verdict is StageResult.WARN]
+    assert [s.name for s in warned] == [stage]
+    assert text in warned[0].text
+
+
+def test_bytes_that_wait_at_one_look_alone_are_on_their_way() -> None:
+    found = one(Case(readers_later=(Reader(number=1, node="/base", waiting=70_000),)))
+    assert found.stages[-1].verdict is StageResult.OK
+
+
+def test_an_agent_that_does_not_tell_leaves_stages_open() -> None:
+    found = one(Case(far=None, refusal="it is older"))
+    assert found.flows
+    unknown = [stage.name for stage in found.stages if stage.verdict is StageResult.UNKNOWN]
+    assert unknown == ["publisher", "policy there", "sent"]
+
+
+def test_a_latched_topic_of_one_old_message_flows() -> None:
+    quiet = route(messages=1, age=3600.0, rate=None, period=None, latched=True)
+    found = one(Case(**quiet, source_later=SOURCE))
+    assert {stage.verdict for stage in found.stages} == {StageResult.OK}
+
+
+def test_a_message_that_is_on_its_way_is_not_missing() -> None:
+    found = one(Case(later=ROUTE, source_later=msgspec.structs.replace(SOURCE, messages=101)))
+    assert found.flows
+
+
+def test_a_topic_that_is_thinned_out_is_not_missing() -> None:
+    thin = msgspec.structs.replace(ROUTE, contract={"max_rate": 0.5})
+    assert one(Case(route=thin, later=thin)).flows
+    quick = msgspec.structs.replace(ROUTE, contract={"max_rate": 10.0})
+    assert not one(Case(route=quick, later=quick)).flows
+
+
+def test_each_publisher_has_a_way_of_its_own() -> None:
+    far = FarTopic(sources=(SOURCE, msgspec.structs.replace(SOURCE, node="/second", crosses=False, rule="no")))
+    first, second = Case(far=far, source=None, source_later=None).walk()
+    assert (first.node, first.flows) == ("/joy", True)
+    assert (second.node, second.flows) == ("/second", False)
+    assert second.failed is not None
+    assert second.failed.name == "policy there"
+
+
+def test_no_more_ways_are_walked_than_a_user_reads() -> None:
+    many = tuple(msgspec.structs.replace(SOURCE, node=f"/n{i}") for i in range(10 * limits.WHY_SOURCES_MAX))
+    found = Case(far=FarTopic(sources=many), source=None, source_later=None).walk()
+    assert len(found) == limits.WHY_SOURCES_MAX
+
+
+def test_a_peer_is_found_by_its_guid_and_a_wrong_name_by_the_nearest() -> None:
+    assert one(Case(), "10.0.0.2:40002").flows
+    assert one(Case(), "10.0.0.2:40002#1").peer == "joystick"
+    found = one(Case(), "joystik")
+    assert found.failed is not None
+    assert found.failed.remedy.startswith("did you mean joystick?")
+
+
+def test_a_relayed_module_has_no_link_of_its_own() -> None:
+    relayed = msgspec.structs.replace(PEER, name="arm", state="relayed", via="joystick", link=None)
+    found = one(Case(peer=relayed, carrier="joystick", only=frozenset({"/joy"})), "arm")
+    assert found.flows
+    assert found.stages[1].text == "no link of its own; joystick passes on what it publishes"
+    # What the relay brings of other modules is not this one's.
+    nothing = one(Case(peer=relayed, carrier="joystick", only=frozenset(), source=None, source_later=None), "arm")
+    assert nothing.failed is not None
+    assert nothing.failed.name == "publisher"
+
+
+def test_names_of_both_sides_are_told() -> None:
+    renamed = Case(**route(wire="/stick"), source=msgspec.structs.replace(SOURCE, topic="/joy/stick"))
+    first = renamed._sight(renamed.route, renamed.source, renamed.readers)
+    (found,) = walk_topic(first, "joystick", None, "/stick")
+    texts = {stage.name: stage.text for stage in found.stages}
+    assert texts["publisher"] == "/joy on joystick publishes /stick (/joy/stick over there)"
+    assert texts["policy here"] == "this module takes it as /cmd (its /stick)"
+
+
+def test_one_look_alone_is_judged_too() -> None:
+    found = one(replace(Case(), readers_later=None))
+    assert found.flows
+
+
+_names = st.text(max_size=20)
+_sources = st.builds(
+    FarSource,
+    node=st.sampled_from(["/joy", "/other"]),
+    type=_names,
+    crosses=st.booleans(),
+    rule=_names,
+    offered=st.booleans(),
+    route=st.sampled_from(["", "opening", "open", "?"]),
+    messages=st.integers(0, 1 << 40),
+    dropped=st.integers(0, 1 << 40),
+)
+_fars = st.none() | st.builds(
+    FarTopic, sources=st.lists(_sources, max_size=3).map(tuple), subscribers=st.tuples(_names), near=_names
+)
+_routes: Callable[[], st.SearchStrategy[RouteInfo]] = lambda: st.builds(  # noqa: E731
+    lambda **changes: msgspec.structs.replace(ROUTE, **changes),
+    state=st.sampled_from(["idle", "opening", "open", "lingering", "waiting", "hidden"]),
+    messages=st.integers(0, 1000),
+    age=st.none() | st.floats(0, 1e6),
+    period=st.none() | st.just(ROUTE.period),
+    problem=_names,
+)
+
+
+@given(_fars, _fars, st.none() | _routes(), st.none() | _routes(), st.booleans())
+def test_whatever_another_agent_says_there_is_an_answer(
+    far: FarTopic | None, later: FarTopic | None, before: RouteInfo | None, after: RouteInfo | None, known: bool
+) -> None:
+    one_, other = Case(far=far, source=None, route=before), Case(far=later, source=None, route=after)
+    found = walk_topic(
+        one_._sight(before, None, one_.readers),
+        "joystick",
+        other._sight(after, None, one_.readers) if known else None,
+    )
+    assert found
+    for diagnosis in found:
+        assert diagnosis.flows is (diagnosis.failed is None)
+        for stage in diagnosis.stages[:-1]:
+            assert stage.verdict is not StageResult.FAIL
+        assert msgspec.convert(msgspec.to_builtins(diagnosis), Diagnosis) == diagnosis
+
+
+def test_a_stage_is_short_as_json() -> None:
+    assert msgspec.to_builtins(PathStage("peer", StageResult.OK, "known")) == {
+        "name": "peer",
+        "verdict": "ok",
+        "text": "known",
+    }

@@ -1,0 +1,112 @@
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.core import limits
+from rmpa.resource.declare.resource import Resource, at_most
+from rmpa.resource.run.member import Member
+from rmpa.resource.run.preconditions import Preconditions
+from rmpa.ros.core.embedded import RosCore
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+
+@pytest.fixture
+async def core() -> AsyncIterator[RosCore]:
+    one = RosCore(port=0)
+    await one.start()
+    yield one
+    await one.close()
+
+
+async def until(fits: Callable[[], object]) -> None:
+    async with asyncio.timeout(30):
+        while not fits():
+            await asyncio.sleep(0.01)
+
+
+def declared(needs: Callable[[], str | bool | None]) -> Resource:
+    one = Resource("sonar", role="sensing")
+    one.attribute("noise", better="min", unit="m")
+    one.profile(offers={"noise": 0.01}, needs=needs, name="fine")(lambda: None)
+    one.profile(offers={"noise": 0.1}, cost=1, name="coarse")(lambda: None)
+    one.adaptation(window="50 ms", dwell=0)
+    return one
+
+
+async def test_one_that_blocks_holds_up_neither_the_start_nor_the_loop(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "PRECONDITION_TIMEOUT", 0.3)
+    goes_on, threads = threading.Event(), set()
+    calls: list[float] = []
+
+    def needs() -> bool:
+        calls.append(time.monotonic())
+        threads.add(threading.get_ident())
+        return goes_on.wait(40)
+
+    member = Member(declared(needs), core.uri)
+    await member.start()
+    loop = member.adapter.loop
+    windows: list[None] = []
+    member.adapter.on_window.append(lambda *_: windows.append(None))
+    noise = member.resource.attributes["noise"]
+    member.adapter.shift("lab", {"noise": at_most("5 cm").bound(noise)}, {})
+    await until(lambda: loop.profile == "coarse")
+    await until(lambda: len(windows) >= 5)
+    assert member.adapter.explain()[0].excluded == "its precondition has not answered for 0.3 s"
+    assert len(calls) == 1  # it is not asked again as long as it has not answered
+    goes_on.set()
+    await until(lambda: loop.profile == "fine")
+    assert threading.get_ident() not in threads
+    await member.close()
+
+
+async def test_the_first_decision_knows_the_answers(core: RosCore) -> None:
+    member = Member(declared(lambda: "the lid is shut"), core.uri)
+    applied: list[str] = []
+    member.adapter.listeners.append(lambda action: applied.append(getattr(action, "profile", "")))
+    await member.start()
+    await until(lambda: applied)
+    assert applied[0] == "coarse"
+    assert member.adapter.explain()[0].excluded == "the lid is shut"
+    await member.close()
+
+
+@pytest.mark.parametrize(
+    ("answer", "why"),
+    [(True, None), (None, None), (False, "its precondition does not hold"), ("no lens", "no lens"), ("", None)],
+)
+async def test_what_an_answer_means(answer: str | bool | None, why: str | None) -> None:
+    one = Preconditions(declared(lambda: answer).profiles, lambda: None)
+    await one.start()
+    assert one.barred().get("fine") == why
+    await one.close()
+
+
+async def test_one_that_raises_does_not_hold_and_another_answer_is_told() -> None:
+    answers: list[Exception | bool] = [OSError("no bus"), True, True, False]
+    changes: list[dict[str, str]] = []
+
+    def needs() -> bool:
+        answer = answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    one = Preconditions(declared(needs).profiles, lambda: changes.append(one.barred()))
+    await one.start()
+    assert one.barred() == {"fine": "its precondition failed: OSError: no bus"}
+    for left in (2, 1, 0):
+        one.look()
+        while len(answers) > left or one._asked:
+            await asyncio.sleep(0.01)
+    assert changes == [{}, {"fine": "its precondition does not hold"}]
+    await one.close()

@@ -1,0 +1,489 @@
+from __future__ import annotations
+
+import asyncio
+import uuid
+from typing import TYPE_CHECKING, Final, Self
+
+import pytest
+
+from rmpa.core import limits
+from rmpa.core.errors import StartError
+from rmpa.ros.core import identify, liveness
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.core.rosout import AGGREGATED, LOG_MD5, LOG_TYPE
+from rmpa.ros.http.client import call, call_api
+from rmpa.ros.http.server import XmlRpcServer
+from rmpa.ros.master.effects import GraphChange, RegistrationKind
+from rmpa.ros.node.publication import Publication
+from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.ros.node.subscription import Subscription
+from rmpa.ros.wire.tcpros import TopicDescription, frame_message
+from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from rmpa.runtime.descriptors import Use
+
+DEADLINE: Final = 10.0
+STRING: Final = "std_msgs/String"
+
+
+class Slave:
+    """A slave API that records what it is called with; it can be slow, and can have a name or none."""
+
+    def __init__(self, name: str | None = None) -> None:
+        self.name = name
+        self.calls: list[tuple[str, list[XmlRpcValue]]] = []
+        self.go = asyncio.Event()
+        self.go.set()
+        self.at_once = 0
+        self.most_at_once = 0
+        self._news = asyncio.Event()
+        self.server = XmlRpcServer(self._answer)
+
+    async def __aenter__(self) -> Self:
+        await self.server.start()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.go.set()
+        await self.server.close()
+
+    @property
+    def uri(self) -> str:
+        return f"http://127.0.0.1:{self.server.port}/"
+
+    async def _answer(self, method: str, params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
+        if method in {"getName", "requestTopic"}:
+            if method == "getName" and self.name is not None:
+                return [1, "", self.name]
+            raise RosFault(-1, f"{method}: unknown method name")
+        self.calls.append((method, list(params)))
+        self._news.set()
+        self.at_once += 1
+        self.most_at_once = max(self.at_once, self.most_at_once)
+        await self.go.wait()
+        self.at_once -= 1
+        return [1, "", 0]
+
+    async def wait(self, wanted: Callable[[], bool]) -> None:
+        async with asyncio.timeout(DEADLINE):
+            while not wanted():
+                self._news.clear()
+                await self._news.wait()
+
+
+async def until(wanted: Callable[[], bool]) -> None:
+    async with asyncio.timeout(DEADLINE):
+        while not wanted():
+            await asyncio.sleep(0.005)
+
+
+@pytest.fixture
+async def core() -> AsyncIterator[RosCore]:
+    made = RosCore(port=0, rosout=False)
+    await made.start()
+    yield made
+    await made.close()
+
+
+@pytest.mark.trap(35)
+async def test_it_says_what_roscore_says(core: RosCore) -> None:
+    assert core.uri == f"http://127.0.0.1:{core.port}/"
+    assert await call_api(core.uri, "getUri", "/x") == (1, "", core.uri)
+    run_id = (await call_api(core.uri, "getParam", "/x", "/run_id")).value
+    assert isinstance(run_id, str)
+    assert uuid.UUID(run_id).version == 1
+    assert core.call("getParam", "/x", "/rosdistro").value == "noetic\n"
+    assert core.call("getParam", "/x", "/rosversion").value == "1.15.15\n"
+
+
+async def test_it_listens_on_loopback_only(core: RosCore) -> None:
+    acceptor = core._server._acceptor
+    assert acceptor is not None
+    assert acceptor.address[0] == "127.0.0.1"
+
+
+async def test_a_port_in_use(core: RosCore) -> None:
+    with pytest.raises(StartError, match=f"port {core.port} is already in use"):
+        await RosCore(port=core.port).start()
+
+
+async def test_changes_are_reported_before_the_reply_leaves(core: RosCore) -> None:
+    seen: list[GraphChange] = []
+    core.on_change(seen.append)
+    await call(core.uri, "registerPublisher", "/p", "/t", STRING, "http://127.0.0.1:1/")
+    assert seen == [GraphChange(RegistrationKind.PUBLISHER, True, "/t", "/p", "http://127.0.0.1:1/", STRING)]
+    assert core.state().publishers == {"/t": {"/p": "http://127.0.0.1:1/"}}
+
+
+async def test_a_listener_that_fails_or_registers_harms_nobody(
+    core: RosCore, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Slave() as slave:
+        core.call("registerSubscriber", "/s", "/t", STRING, slave.uri)
+
+        def fails(_change: GraphChange) -> None:
+            raise KeyError("as asked")
+
+        def joins(change: GraphChange) -> None:
+            if change.node == "/p":
+                core.call("registerPublisher", "/proxy", "/t", STRING, "http://127.0.0.1:2/")
+
+        core.on_change(fails)
+        core.on_change(joins)
+        core.call("registerPublisher", "/p", "/t", STRING, "http://127.0.0.1:1/")
+        await slave.wait(lambda: bool(slave.calls))
+        # The last list that a subscriber hears is the one with both.
+        assert slave.calls[-1] == (
+            "publisherUpdate",
+            ["/master", "/t", ["http://127.0.0.1:1/", "http://127.0.0.1:2/"]],
+        )
+    assert "a listener failed" in caplog.text
+
+
+@pytest.mark.trap(31)
+async def test_notifications_never_wait_in_the_reply_and_one_goes_at_a_time(core: RosCore) -> None:
+    """A node that holds its lock while it registers would wait for itself."""
+    async with Slave() as slow, Slave() as quick:
+        slow.go.clear()
+        for slave, name in ((slow, "/slow"), (quick, "/quick")):
+            core.call("registerSubscriber", name, "/t", STRING, slave.uri)
+        for number in range(1, 6):
+            await call(core.uri, "registerPublisher", f"/p{number}", "/t", STRING, f"http://127.0.0.1:{number}/")
+        await quick.wait(lambda: bool(quick.calls) and len(quick.calls[-1][1][2]) == 5)  # type: ignore[arg-type]
+        await slow.wait(lambda: bool(slow.calls))
+        assert len(slow.calls) == 1
+        slow.go.set()
+        await slow.wait(lambda: len(slow.calls) == 2)
+        assert slow.calls[-1][1][2] == [f"http://127.0.0.1:{number}/" for number in range(1, 6)]
+        assert slow.most_at_once == 1
+
+
+async def test_a_node_that_does_not_answer_is_told_again(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rmpa.ros.core.notifier.call", _with_timeout(0.05))
+    async with Slave() as slave:
+        slave.go.clear()
+        core.call("registerSubscriber", "/s", "/t", STRING, slave.uri)
+        core.call("registerPublisher", "/p", "/t", STRING, "http://127.0.0.1:1/")
+        await slave.wait(lambda: len(slave.calls) >= 2)
+        slave.go.set()
+        await until(lambda: core.counters["notify.sent"] == 1)
+        assert core._notifier is not None
+        await until(lambda: core._notifier is not None and core._notifier.waiting == 0)
+
+
+def _with_timeout(seconds: float) -> Callable[..., object]:
+    async def quick(uri: str, method: str, *params: XmlRpcValue, use: Use) -> XmlRpcValue:
+        return await call(uri, method, *params, timeout=seconds, use=use)
+
+    return quick
+
+
+async def test_parameters_are_told_in_order(core: RosCore) -> None:
+    async with Slave() as slave:
+        slave.go.clear()
+        core.call("subscribeParam", "/s", slave.uri, "/p")
+        for number in range(20):
+            core.call("setParam", "/x", "/p", number)
+        slave.go.set()
+        await slave.wait(lambda: len(slave.calls) == 20)
+        assert [params[2] for _, params in slave.calls] == list(range(20))
+
+
+async def test_what_waits_for_a_slow_node_is_bounded(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "NOTIFY_QUEUE_MAX", 100)
+    async with Slave() as slave:
+        slave.go.clear()
+        core.call("subscribeParam", "/s", slave.uri, "/")
+        for number in range(1000):
+            core.call("setParam", "/x", f"/p{number}", number)
+        assert core._notifier is not None
+        assert core._notifier.waiting == 100
+        assert core.counters["notify.dropped"] == 900
+
+
+@pytest.mark.trap(33)
+async def test_a_twin_pushes_the_older_node_out(core: RosCore) -> None:
+    async with Slave("/twin") as old:
+        core.call("registerPublisher", "/twin", "/t", STRING, old.uri)
+        core.call("registerPublisher", "/twin", "/t", STRING, "http://127.0.0.1:1/")
+        await old.wait(lambda: bool(old.calls))
+        assert old.calls == [
+            ("shutdown", ["/master", "[/twin] Reason: new node registered with same name"]),
+        ]
+
+
+async def test_another_node_at_a_stale_uri_is_not_shut_down(core: RosCore) -> None:
+    """ros_comm#2018, #2241: the port belongs to somebody else by now."""
+    async with Slave("/innocent") as innocent:
+        core.call("registerPublisher", "/twin", "/t", STRING, innocent.uri)
+        core.call("registerPublisher", "/twin", "/t", STRING, "http://127.0.0.1:1/")
+        await until(lambda: core.counters["notify.stale"] == 1)
+        assert innocent.calls == []
+
+
+async def test_a_registered_node_that_tells_no_name_is_not_shut_down_for_another(core: RosCore) -> None:
+    async with Slave(None) as roscpp:
+        core.call("registerPublisher", "/twin", "/t", STRING, roscpp.uri)
+        core.call("registerPublisher", "/innocent", "/u", STRING, roscpp.uri)
+        core.call("registerPublisher", "/twin", "/t", STRING, "http://127.0.0.1:1/")
+        await until(lambda: core.counters["notify.stale"] == 1)
+        assert roscpp.calls == []
+
+
+async def test_a_nameless_node_at_its_own_uri_is_shut_down(core: RosCore) -> None:
+    async with Slave(None) as roscpp:
+        core.call("registerPublisher", "/twin", "/t", STRING, roscpp.uri)
+        core.call("registerPublisher", "/twin", "/t", STRING, "http://127.0.0.1:1/")
+        await roscpp.wait(lambda: bool(roscpp.calls))
+        assert roscpp.calls[0][0] == "shutdown"
+
+
+@pytest.mark.trap(29)
+async def test_a_node_without_get_name_tells_its_name_in_its_header(monkeypatch: pytest.MonkeyPatch) -> None:
+    node = SlaveNode("/like_roscpp", "127.0.0.1", "http://127.0.0.1:11311/")
+    await node.start()
+    node.add_publication(Publication("/rosout", "/like_roscpp", TopicDescription(LOG_TYPE, LOG_MD5, "")))
+
+    async def no_get_name(uri: str, method: str, *params: XmlRpcValue, use: Use) -> object:
+        if method == "getName":
+            raise RosFault(-1, "getName: unknown method name")
+        return await call_api(uri, method, *params, use=use)
+
+    monkeypatch.setattr(identify, "call_api", no_get_name)
+    assert await identify.name_at(node.uri, ["/t"]) == "/like_roscpp"
+    await node.close()
+
+
+async def test_a_dead_node_is_purged_when_suspected(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "NODE_RECHECK_DELAY", 0.01)
+    async with Slave() as subscriber:
+        async with Slave() as dead:
+            core.call("registerPublisher", "/dead", "/t", STRING, dead.uri)
+        core.call("registerSubscriber", "/s", "/t", STRING, subscriber.uri)
+        core.suspect("/dead")
+        core.suspect("/dead")
+        core.suspect("/nobody")
+        await subscriber.wait(lambda: bool(subscriber.calls))
+        assert subscriber.calls == [("publisherUpdate", ["/master", "/t", []])]
+        assert core.state().nodes == {"/s": subscriber.uri}
+        assert core.counters["node.dead"] == 1
+
+
+async def test_a_live_node_survives_suspicion(core: RosCore) -> None:
+    async with Slave() as alive:
+        core.call("registerPublisher", "/alive", "/t", STRING, alive.uri)
+        core.suspect("/alive")
+        assert core._liveness is not None
+        await until(lambda: core._liveness is not None and not core._liveness._checks)
+        assert core.state().nodes == {"/alive": alive.uri}
+
+
+async def test_a_node_that_came_back_meanwhile_is_not_purged(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "NODE_RECHECK_DELAY", 0.05)
+    async with Slave() as dead:
+        core.call("registerPublisher", "/n", "/t", STRING, dead.uri)
+    async with Slave() as again:
+        core.suspect("/n")
+        core.call("registerPublisher", "/n", "/t", STRING, again.uri)
+        await until(lambda: core._liveness is not None and not core._liveness._checks)
+        assert core.state().nodes == {"/n": again.uri}
+
+
+@pytest.mark.trap(40)
+async def test_dead_nodes_are_found_without_a_hint() -> None:
+    nodes = {"/odd": "rosrpc://x"}
+    found: list[str] = []
+    alive_calls = 0
+
+    def on_dead(node: str, _api: str) -> None:
+        found.append(node)
+        del nodes[node]
+
+    async with Slave() as alive:
+        async with Slave() as dead:
+            nodes.update({"/dead": dead.uri, "/alive": alive.uri})
+        watch = liveness.Liveness(nodes=lambda: dict(nodes), on_dead=on_dead, interval=0.05)
+        watch.start()
+        await until(lambda: found == ["/dead"])
+        alive_calls = alive.server.connections
+        await watch.close()
+    assert alive_calls == 0, "a node that listens is not knocked at"
+    assert nodes.keys() == {"/odd", "/alive"}
+
+
+async def test_a_client_can_end_it() -> None:
+    reasons: list[str] = []
+    core = RosCore(port=0, rosout=False, on_shutdown=reasons.append)
+    await core.start()
+    assert await call_api(core.uri, "shutdown", "/x", "enough") == (1, "the core ends", 0)
+    assert reasons == ["/x: 'enough'"]
+    await core.close()
+
+
+class Logs:
+    """A node that logs, and one that reads what is aggregated, following the core as ROS nodes do."""
+
+    def __init__(self, core: RosCore) -> None:
+        self.core = core
+        self.heard: list[bytes] = []
+        self.speaker = SlaveNode("/speaker", "127.0.0.1", core.uri)
+        self.reader = SlaveNode("/reader", "127.0.0.1", core.uri)
+        self.log = Publication("/rosout", "/speaker", TopicDescription(LOG_TYPE, LOG_MD5, "any"))
+        self.aggregated = Subscription(
+            AGGREGATED, "/reader", on_message=lambda _, framed: self.heard.append(bytes(framed))
+        )
+
+    async def __aenter__(self) -> Self:
+        await self.speaker.start()
+        await self.reader.start()
+        self.speaker.add_publication(self.log)
+        self.core.call("registerPublisher", "/speaker", "/rosout", LOG_TYPE, self.speaker.uri)
+        self.reader.add_subscription(self.aggregated)
+        uris = self.core.call("registerSubscriber", "/reader", AGGREGATED, LOG_TYPE, self.reader.uri).value
+        assert isinstance(uris, list)
+        self.aggregated.update([str(uri) for uri in uris])
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.reader.close()
+        await self.speaker.close()
+
+    async def flow(self, text: bytes) -> None:
+        """Wait until a log message comes out at the other end."""
+        async with asyncio.timeout(DEADLINE):
+            while frame_message(text) not in self.heard:
+                self.log.publish_framed(frame_message(text))
+                await asyncio.sleep(0.005)
+
+
+def rosout_at(core: RosCore) -> str:
+    """The slave API of whatever publishes /rosout_agg; empty for nothing."""
+    return core.publishers(AGGREGATED).get("/rosout", "")
+
+
+async def test_rosout_is_aggregated_byte_for_byte() -> None:
+    core = RosCore(port=0)
+    await core.start()
+    async with Logs(core) as logs:
+        published = core.call("getPublishedTopics", "/x", "").value
+        assert published == [[AGGREGATED, LOG_TYPE], ["/rosout", LOG_TYPE]]
+        await until(lambda: logs.log.subscribers == 1 and logs.aggregated.publishers == 1)
+        logs.log.publish_framed(frame_message(b"not decoded"))
+        await until(lambda: bool(logs.heard))
+        assert logs.heard == [frame_message(b"not decoded")]
+    await core.close()
+    assert core.state().nodes.keys() <= {"/speaker", "/reader"}
+
+
+async def test_a_killed_rosout_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "ROSOUT_RESPAWN", 0.01)
+    core = RosCore(port=0)
+    await core.start()
+    async with Logs(core) as logs:
+        await logs.flow(b"before")
+        killed = rosout_at(core)
+        assert await call_api(killed, "shutdown", "/rosnode", "user request") == (1, "shutdown", 0)
+        await until(lambda: rosout_at(core) not in {"", killed})
+        await logs.flow(b"after")
+        assert core.counters["rosout.restarted"] == 1
+        assert sorted(s for s in core.state().services if s.startswith("/rosout/")) == [
+            "/rosout/get_loggers",
+            "/rosout/set_logger_level",
+        ]
+    await core.close()
+    assert core.state().nodes.keys() <= {"/speaker", "/reader"}
+
+
+async def test_an_unregistered_rosout_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "ROSOUT_RESPAWN", 0.01)
+    core = RosCore(port=0)
+    await core.start()
+    async with Logs(core) as logs:
+        before = rosout_at(core)
+        assert core.call("unregisterSubscriber", "/rosout", "/rosout", before).value == 1
+        await until(lambda: rosout_at(core) not in {"", before})
+        await logs.flow(b"again")
+    await core.close()
+
+
+async def test_rosout_yields_its_name_and_takes_it_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "ROSOUT_RESPAWN", 0.01)
+    monkeypatch.setattr(limits, "ROSOUT_LOOK", 0.05)
+    core = RosCore(port=0)
+    await core.start()
+    async with Slave("/rosout") as other, Logs(core) as logs:
+        first = rosout_at(core)
+        core.call("registerPublisher", "/rosout", AGGREGATED, LOG_TYPE, other.uri)
+        core.call("subscribeParam", "/rosout", other.uri, "/p")
+        assert rosout_at(core) == other.uri
+        await until(lambda: core._rosout is not None and not core._rosout.uri)
+        for _ in range(20):
+            await asyncio.sleep(0.01)
+            assert rosout_at(core) == other.uri, "the name is the other node's as long as that is there"
+        core.call("unregisterPublisher", "/rosout", AGGREGATED, other.uri)
+        assert core._api.registrations.node_api("/rosout") == other.uri
+        core.call("unsubscribeParam", "/rosout", other.uri, "/p")
+        await until(lambda: rosout_at(core) not in {"", first, other.uri})
+        await logs.flow(b"back")
+        assert not [name for name, _ in other.calls if name == "shutdown"]
+    await core.close()
+
+
+async def test_rosout_starts_when_it_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "ROSOUT_RESPAWN", 0.01)
+    monkeypatch.setattr(limits, "ROSOUT_LOOK", 0.01)
+    core = RosCore(port=0)
+    await core.start()
+    start, failures = SlaveNode.start, 0
+
+    async def fails_twice(node: SlaveNode) -> None:
+        nonlocal failures
+        failures += 1
+        if failures < 3:
+            raise StartError("node /rosout", "no file descriptor is left")
+        await start(node)
+
+    monkeypatch.setattr(SlaveNode, "start", fails_twice)
+    killed = rosout_at(core)
+    await call_api(killed, "shutdown", "/rosnode", "user request")
+    await until(lambda: rosout_at(core) not in {"", killed})
+    assert failures == 3
+    await core.close()
+
+
+async def test_a_core_ends_while_another_rosout_has_the_name() -> None:
+    core = RosCore(port=0)
+    await core.start()
+    async with Slave("/rosout") as other:
+        core.call("registerSubscriber", "/rosout", "/rosout", LOG_TYPE, other.uri)
+        assert core.state().nodes == {"/rosout": other.uri}
+        await until(lambda: core._rosout is not None and not core._rosout.uri)
+        await core.close()
+        assert core.state().nodes == {"/rosout": other.uri}, "our late unregisters do not hit it"
+
+
+@pytest.mark.trap(26)
+async def test_services_are_looked_up_at_once_whatever_else_waits(core: RosCore) -> None:
+    async with Slave() as stopped:
+        stopped.go.clear()
+        core.call("registerSubscriber", "/s", "/t", STRING, stopped.uri)
+        core.call("registerPublisher", "/p", "/t", STRING, "http://127.0.0.1:1/")
+        await stopped.wait(lambda: bool(stopped.calls))
+        await call(core.uri, "registerService", "/p", "/add", "rosrpc://127.0.0.1:5/", "http://127.0.0.1:1/")
+        assert (await call_api(core.uri, "lookupService", "/c", "/add"))[::2] == (1, "rosrpc://127.0.0.1:5/")
+        assert (await call_api(core.uri, "lookupService", "/c", "/none"))[::2] == (-1, "")
+        assert stopped.at_once == 1, "the notification still waits"
+
+
+@pytest.mark.trap(29)
+async def test_no_connection_to_a_node_is_kept_open(core: RosCore) -> None:
+    async with Slave() as slave:
+        core.call("registerSubscriber", "/s", "/t", STRING, slave.uri)
+        for number in range(1, 9):
+            core.call("registerPublisher", f"/p{number}", "/t", STRING, f"http://127.0.0.1:{number}/")
+            await slave.wait(lambda wanted=number: len(slave.calls) == wanted)  # type: ignore[misc]
+        await until(lambda: core.counters["notify.sent"] == 8)
+        await until(lambda: not slave.server._connections)

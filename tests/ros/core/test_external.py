@@ -1,0 +1,315 @@
+"""The external core against masters: the embedded one as another program's, and such that do wrong."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any, Final
+
+import pytest
+
+from rmpa.core import limits
+from rmpa.core.errors import LocalProtocolError, StartError, UnreachableError
+from rmpa.ros.core import liveness
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.core.external import ExternalCore
+from rmpa.ros.http.server import XmlRpcServer
+from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from rmpa.ros.master.effects import GraphChange
+
+DEADLINE: Final = 20.0
+STRING: Final = "std_msgs/String"
+OURS: Final = "http://127.0.0.1:1/"
+
+
+async def until(condition: Callable[[], object]) -> None:
+    """Let the loop turn until something has happened."""
+    async with asyncio.timeout(DEADLINE):
+        while not condition():
+            await asyncio.sleep(0.005)
+
+
+async def a_master(port: int = 0) -> RosCore:
+    """A master, which here is somebody else's."""
+    made = RosCore(port=port, rosout=False)
+    await made.start()
+    return made
+
+
+@pytest.fixture
+async def master() -> AsyncIterator[RosCore]:
+    made = await a_master()
+    yield made
+    await made.close()
+
+
+@asynccontextmanager
+async def a_node() -> AsyncIterator[str]:
+    """Somebody else's slave API, as long as he lives."""
+    server = XmlRpcServer(lambda *_: [1, "", 0])
+    await server.start()
+    yield f"http://127.0.0.1:{server.port}/"
+    await server.close()
+
+
+def external(uri: str) -> ExternalCore:
+    """Ours."""
+    return ExternalCore(uri, own_node="/rmpa")
+
+
+@pytest.fixture
+async def core(master: RosCore) -> AsyncIterator[ExternalCore]:
+    made = external(master.uri)
+    await made.start()
+    yield made
+    await made.close()
+
+
+async def test_what_is_called_arrives_in_order_and_is_gone_at_the_end(master: RosCore) -> None:
+    seen: list[tuple[bool, str]] = []
+    master.on_change(lambda change: seen.append((change.added, change.name)))
+    core = external(master.uri)
+    await core.start()
+    told: list[GraphChange] = []
+    core.on_change(told.append)
+    for number in range(3):
+        assert core.call("registerPublisher", "/rmpa", f"/t{number}", STRING, OURS).code == 1
+    core.call("unregisterPublisher", "/rmpa", "/t1", OURS)
+    core.call("registerService", "/rmpa", "/srv", "rosrpc://127.0.0.1:1", OURS)
+    core.call("setParam", "/rmpa", "/key", 5)
+    assert [(change.added, change.name) for change in told][-2:] == [(False, "/t1"), (True, "/srv")], "at once"
+    assert (await core.ask("getParam", "/rmpa", "/key")).value == 5, "behind what was called"
+    expected = [(True, "/t0"), (True, "/t1"), (True, "/t2"), (False, "/t1"), (True, "/srv")]
+    assert seen == expected
+    assert (await core.ask("subscribeParam", "/rmpa", OURS, "/key")).value == 5
+    await core.close()
+    assert sorted(seen[len(expected) :]) == [(False, "/srv"), (False, "/t0"), (False, "/t2")]
+    assert master.state().nodes == {}
+
+
+async def test_others_are_seen_soon(master: RosCore, core: ExternalCore) -> None:
+    told: list[GraphChange] = []
+    core.on_change(told.append)
+    await asyncio.sleep(limits.MASTER_LOOK_IDLE)  # it looks seldom by now
+    begin = asyncio.get_running_loop().time()
+    async with a_node() as api:
+        master.call("registerPublisher", "/n", "/t", STRING, api)
+        await until(lambda: told)
+        assert asyncio.get_running_loop().time() - begin < 2.0, "a second, on a busy machine"
+        assert core.publishers("/t") == {"/n": api}
+        assert (core.type_of("/t"), core.type_of("/u")) == (STRING, "*")
+        assert core.state() == master.state()
+
+
+async def test_a_master_that_is_not_there_yet_is_waited_for() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    core = external(f"http://127.0.0.1:{port}/")
+    await core.start()
+    assert "does not answer" in core.notes()[0]
+    assert core.call("registerPublisher", "/rmpa", "/t", STRING, OURS).code == 1
+    assert core.call("setParam", "/rmpa", "/key", 5).code == 0
+    with pytest.raises(UnreachableError):
+        await core.ask("getParam", "/rmpa", "/key")
+    with pytest.raises(UnreachableError):
+        await core.ask("deleteParam", "/rmpa", "/key")
+    master = await a_master(port)
+    await until(lambda: master.publishers("/t"))
+    assert core.notes() == ()
+    await core.close()
+    await master.close()
+
+
+async def test_a_master_that_was_started_anew_gets_everything_and_the_living_stay(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    master = await a_master()
+    core = external(master.uri)
+    await core.start()
+    core.call("registerPublisher", "/rmpa", "/t", STRING, OURS)
+    async with a_node() as api:
+        master.call("registerPublisher", "/n", "/u", STRING, api)
+        await until(lambda: core.publishers("/u"))
+        port = master.port
+        await master.close()
+        await until(core.notes)
+        await asyncio.sleep(2 * limits.MASTER_RETRY)
+        assert len([r for r in caplog.records if "is waited for" in r.getMessage()]) == 1, "said once"
+        assert core.publishers("/u") == {"/n": api}
+        master = await a_master(port)
+        await until(lambda: master.publishers("/t"))
+        assert core.publishers("/u") == {"/n": api}, "it goes on, and so do its connections"
+    await core.close()
+    await master.close()
+
+
+async def test_a_stopped_master_holds_up_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "MASTER_TIMEOUT", 0.2)
+    stopped = asyncio.Event()
+    master = await a_master()
+
+    async def answer(method: str, params: tuple[XmlRpcValue, ...], client: str) -> XmlRpcValue:
+        if stopped.is_set():
+            await asyncio.sleep(DEADLINE)
+        return master._answer(method, params, client)
+
+    server = XmlRpcServer(answer)
+    await server.start()
+    core = external(f"http://127.0.0.1:{server.port}/")
+    await core.start()
+    stopped.set()
+    await until(core.notes)
+    assert "no answer to system.multicall in 0.2 s" in core.notes()[0]
+    assert core.call("registerPublisher", "/rmpa", "/t", STRING, OURS).code == 1
+    stopped.clear()
+    await until(lambda: master.publishers("/t"))
+    stopped.set()
+    core.call("unregisterPublisher", "/rmpa", "/t", OURS)
+    asking = asyncio.create_task(core.ask("setParam", "/rmpa", "/key", 1))
+    async with asyncio.timeout(limits.MASTER_FAREWELL + 2.0):
+        await asyncio.sleep(0.01)
+        await core.close()
+        with pytest.raises(UnreachableError):
+            await asking
+    await server.close()
+    await master.close()
+
+
+@pytest.mark.parametrize("wrong", ["fault", "text", "empty", "short", "state"])
+async def test_a_master_that_talks_nonsense_is_told_of_and_asked_again(master: RosCore, wrong: str) -> None:
+    nonsense: dict[str, Any] = {
+        "text": "no",
+        "empty": [],
+        "short": [[[1, "", 5]]],
+        "state": [[[1, "", [1, 2, 3]]]] * 9,
+    }
+    talking = asyncio.Event()
+
+    def answer(method: str, params: tuple[XmlRpcValue, ...], client: str) -> XmlRpcValue:
+        if not talking.is_set():
+            return master._answer(method, params, client)
+        if wrong == "fault":
+            raise RosFault(1, "no such method")
+        answered: XmlRpcValue = nonsense[wrong]
+        return answered
+
+    server = XmlRpcServer(answer)
+    await server.start()
+    core = external(f"http://127.0.0.1:{server.port}/")
+    await core.start()
+    talking.set()
+    await until(core.notes)
+    assert "otherwise than a ROS master" in core.notes()[0]
+    talking.clear()
+    await until(lambda: not core.notes())
+    await core.close()
+    await server.close()
+
+
+async def test_what_the_master_refuses_is_said_and_not_tried_for_ever(
+    master: RosCore, core: ExternalCore, caplog: pytest.LogCaptureFixture
+) -> None:
+    core.call("registerPublisher", "/rmpa", "/good", STRING, OURS)
+    core.call("registerPublisher", "/rmpa", "no good", STRING, OURS)
+    core.call("setParam", "/rmpa", "/none", None)
+    core.call("registerPublisher", "/rmpa", "/good2", STRING, OURS)
+    with pytest.raises(LocalProtocolError):
+        await core.ask("setParam", "/rmpa", "/large", 1 << 40)
+    await until(lambda: master.publishers("/good2"))
+    assert master.publishers("/good")
+    assert core.publishers("no good") == {}
+    looks = core.counters.as_dict()["master.looks"]
+    await until(lambda: core.counters.as_dict()["master.looks"] >= looks + 2)
+    assert core.counters.as_dict()["master.refused"] == 3
+    assert "does not take registerPublisher('/rmpa', 'no good'" in caplog.text
+    assert core.call("getParam", "/rmpa", "/good").code == -1, "only the master knows"
+
+
+async def test_a_service_of_a_node_that_no_look_has_shown_yet_is_not_pushed_out(
+    master: RosCore, core: ExternalCore
+) -> None:
+    pushed: list[GraphChange] = []
+    async with a_node() as api:
+        master.call("registerService", "/n", "/srv", "rosrpc://127.0.0.1:1", api)
+        master.on_change(pushed.append)
+        core.call("registerService", "/rmpa", "/srv", "rosrpc://127.0.0.1:2", OURS)
+        core.call("registerService", "/rmpa", "/free", "rosrpc://127.0.0.1:2", OURS)
+        await until(lambda: core.state().services.get("/srv") == {"/n": "rosrpc://127.0.0.1:1"})
+        await until(lambda: core.state() == master.state())
+        assert [change.name for change in pushed] == ["/free"]
+        assert core.state().services["/free"] == {"/rmpa": "rosrpc://127.0.0.1:2"}
+
+
+async def test_writes_beyond_the_bound_are_found_by_the_next_look(
+    master: RosCore, core: ExternalCore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "MASTER_WRITES_MAX", 3)
+    for number in range(10):
+        core.call("registerPublisher", "/rmpa", f"/t{number}", STRING, OURS)
+    await until(lambda: len(master.state().publishers) == 10)
+
+
+async def test_another_agent_there_is_refused_at_the_start_and_waited_for_later(master: RosCore) -> None:
+    node = SlaveNode("/rmpa", "127.0.0.1", master.uri)
+    await node.start()
+    first, second = external(master.uri), external(master.uri)
+    await first.start()
+    await second.start()
+    first.call("registerPublisher", "/rmpa", "/t", STRING, node.uri)
+    await until(lambda: master.publishers("/t"))
+    with pytest.raises(StartError, match=rf"another agent \(/rmpa at {node.uri}, process {os.getpid()}\)"):
+        await external(master.uri).start()
+    await until(second.notes)
+    assert "stands by" in second.notes()[0]
+    second.call("registerPublisher", "/rmpa", "/u", STRING, OURS)
+    with pytest.raises(UnreachableError, match="/rmpa at"):
+        await second.ask("setParam", "/rmpa", "/key", 1)
+    await first.close()
+    await until(lambda: master.publishers("/u"))
+    assert second.notes() == ()
+    await second.close()
+    await node.close()
+
+
+async def test_what_a_killed_agent_left_is_taken_away(master: RosCore) -> None:
+    master.call("registerPublisher", "/rmpa", "/diagnostics", STRING, OURS)
+    master.call("registerSubscriber", "/rmpa/b/n", "/t", STRING, OURS)
+    master.call("registerService", "/rmpa/b/n", "/srv", "rosrpc://127.0.0.1:1", OURS)
+    async with a_node() as api:
+        master.call("registerPublisher", "/n", "/t", STRING, api)
+        core = external(master.uri)
+        await core.start()
+        assert master.state().nodes == {"/n": api}, "before anything of ours is registered"
+        assert core.counters.as_dict()["master.leftovers"] == 3
+        await core.close()
+
+
+async def test_a_node_that_died_is_hidden_and_shown_again_if_it_lives_after_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(limits, "NODE_CHECK_INTERVAL", 0.1)
+    monkeypatch.setattr(limits, "NODE_RECHECK_DELAY", 0.01)
+    monkeypatch.setattr(liveness.Liveness, "start", lambda _: None)  # only what is suspected is looked at
+    master = await a_master()
+    master._liveness = None  # a roscore has none: it keeps what is dead
+    core = external(master.uri)
+    await core.start()
+    async with a_node() as api:
+        master.call("registerPublisher", "/n", "/t", STRING, api)
+        await until(lambda: core.publishers("/t"))
+    core.suspect("/n")
+    await until(lambda: not core.publishers("/t"))
+    assert master.publishers("/t") == {"/n": api}
+    server = XmlRpcServer(lambda *_: [1, "", 0], "127.0.0.1", int(api.rsplit(":")[-1].rstrip("/")))
+    await server.start()
+    await until(lambda: core.publishers("/t"))
+    await core.close()
+    await server.close()
+    await master.close()

@@ -1,0 +1,397 @@
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from rmpa.core import limits
+from rmpa.core.errors import LocalProtocolError, PeerRefused, UnreachableError
+from rmpa.ros.core.embedded import RosCore
+from rmpa.ros.environment import RosEnvironment
+from rmpa.ros.http.client import call
+from rmpa.ros.node.node import Node
+from rmpa.ros.types.definitions import DefinitionError
+from rmpa.ros.types.messages import MessageType
+from rmpa.ros.types.service_types import ServiceType
+from tests.ros.node.peers import DEADLINE, STRING, until
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from rmpa.ros.node.node import Received
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _warm() -> None:
+    """Import numpy and rosbags outside of any loop: that takes a while, and a test's time is not for it."""
+    kind = MessageType("std_msgs/String")
+    kind.deserialize(kind.serialize(kind.make()))
+    for service in ("rospy_tutorials/AddTwoInts", "roscpp/GetLoggers", "roscpp/SetLoggerLevel", "std_srvs/SetBool"):
+        for half in (ServiceType(service).request, ServiceType(service).response):
+            half.deserialize(half.serialize(half.make()))
+
+
+@pytest.fixture
+async def core() -> AsyncIterator[RosCore]:
+    made = RosCore("127.0.0.1", 0)
+    await made.start()
+    yield made
+    await made.close()
+
+
+def node(core: RosCore, name: str, **options: object) -> Node:
+    return Node(name, master_uri=core.uri, environment=RosEnvironment(), **options)  # type: ignore[arg-type]
+
+
+async def test_messages_go_from_one_node_to_another(core: RosCore) -> None:
+    async with node(core, "talker") as talker, node(core, "listener") as listener:
+        publisher = await talker.advertise("chatter", "std_msgs/String")
+        got: list[Received] = []
+        subscriber = await listener.subscribe("chatter", "std_msgs/String", got.append)
+        await publisher.wait_for_subscriber()
+        publisher.publish(publisher.make("hello"))
+        publisher.publish_raw(b"\x03\x00\x00\x00raw")
+        await until(lambda: len(got) == 2)
+        assert got[0].message.data == "hello"
+        assert got[1].plain == {"data": "raw"}
+        assert (got[0].caller_id, got[0].raw) == ("/talker", b"\x05\x00\x00\x00hello")
+        assert got[0].header["topic"] == "/chatter"
+        assert got[0].stamp_ns > 0
+        assert (publisher.subscribers, subscriber.publishers) == (1, 1)
+        assert ("/chatter", "std_msgs/String") in await listener.get_published_topics()
+    state = core.state()
+    assert "/chatter" not in state.publishers
+    assert "/chatter" not in state.subscribers
+
+
+async def test_any_type_is_learnt_from_its_publisher_and_iterated(core: RosCore) -> None:
+    kind = MessageType.learn("my_msgs/Pair", "int32 a\nint32 b\n")
+    async with node(core, "talker") as talker, node(core, "echo", anonymous=True) as echo:
+        subscriber = await echo.subscribe("/pair")
+        publisher = await talker.advertise("/pair", kind, latch=True)
+        for n in range(3):
+            publisher.publish(kind.make({"a": n, "b": 7}))
+        got = []
+        async with asyncio.timeout(DEADLINE):
+            async for received in subscriber:
+                got.append(received.plain)
+                if received.plain["a"] == 2:
+                    break
+        assert got[-1] == {"a": 2, "b": 7}
+        assert echo.name.startswith("/echo_")
+
+
+async def test_the_iteration_ends_with_its_subscriber_and_with_its_node(core: RosCore) -> None:
+    async with node(core, "n") as one:
+        for end in (lambda s: s.close(), lambda _: one.close()):
+            subscriber = await one.subscribe("/t")
+
+            async def read(subscriber: object = subscriber) -> list[object]:
+                return [received async for received in subscriber]  # type: ignore[attr-defined]
+
+            reading = asyncio.get_running_loop().create_task(read())
+            await asyncio.sleep(0)
+            await end(subscriber)
+            assert await asyncio.wait_for(reading, DEADLINE) == []
+
+
+async def test_a_slow_iteration_loses_the_oldest(core: RosCore) -> None:
+    async with node(core, "talker") as talker, node(core, "listener") as listener:
+        publisher = await talker.advertise("/t", "std_msgs/String")
+        subscriber = await listener.subscribe("/t", queue_messages=2)
+        await publisher.wait_for_subscriber()
+        for n in range(5):
+            publisher.publish(publisher.make(str(n)))
+        await until(lambda: subscriber.dropped == 3)
+        iterator = aiter(subscriber)
+        assert [(await anext(iterator)).plain["data"] for _ in range(2)] == ["3", "4"]
+
+
+async def test_a_failing_callback_is_logged_and_called_again(core: RosCore, caplog: pytest.LogCaptureFixture) -> None:
+    calls: list[bytes] = []
+
+    def fail(received: Received) -> None:
+        calls.append(received.raw)
+        raise RuntimeError("the user's mistake")
+
+    async with node(core, "talker") as talker, node(core, "listener") as listener:
+        publisher = await talker.advertise("/t", STRING)
+        await listener.subscribe("/t", callback=fail)
+        await publisher.wait_for_subscriber()
+        publisher.publish_raw(b"1")
+        publisher.publish_raw(b"2")
+        await until(lambda: calls == [b"1", b"2"])
+        with pytest.raises(LocalProtocolError, match="use publish_raw"):
+            publisher.publish("x")
+    assert "the user's mistake" in caplog.text
+
+
+@pytest.mark.trap(17)
+async def test_a_bad_message_is_one_error_and_the_next_is_read(
+    core: RosCore, caplog: pytest.LogCaptureFixture
+) -> None:
+    """rospy closes, and reads what comes next behind the bytes that are left of the bad one."""
+    heard: list[str] = []
+    async with node(core, "talker") as talker, node(core, "listener") as listener:
+        publisher = await talker.advertise("/t", "std_msgs/String")
+        subscriber = await listener.subscribe(
+            "/t", "std_msgs/String", lambda received: heard.append(received.message.data)
+        )
+        await publisher.wait_for_subscriber()
+        good = b"\x02\x00\x00\x00ok"
+        for bad in (b"", b"\xff\xff\xff\x7fx", good[:-1], good + b"trailing"):
+            publisher.publish_raw(bad)
+            publisher.publish_raw(good)
+        await until(lambda: len(heard) == 4)
+        assert subscriber.publishers == 1
+    assert set(heard) == {"ok"}
+    assert caplog.text.count("bytes are not a std_msgs/String") == 4
+
+
+async def test_another_md5_sum_is_told_to_both_sides(core: RosCore, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.WARNING)
+    async with node(core, "talker") as talker, node(core, "listener") as listener:
+        publisher = await talker.advertise("/t", "std_msgs/String")
+        subscriber = await listener.subscribe("/t", "std_msgs/Int32")
+        await until(lambda: subscriber.refusals)
+        assert "client [/listener] wants topic /t" in subscriber.refusals[talker.uri]
+        assert publisher.subscribers == 0
+    assert "client [/listener] wants topic /t" in caplog.text
+
+
+async def test_parameters(core: RosCore) -> None:
+    changes: list[tuple[str, object]] = []
+    async with (
+        node(core, "n", on_param_update=lambda key, value: changes.append((key, value))) as one,
+        node(core, "other") as other,
+    ):
+        await one.set_param("~gains", {"p": 1.5, "names": ["a", True]})
+        assert await other.get_param("/n/gains/p") == 1.5
+        assert await one.get_param("~gains") == {"p": 1.5, "names": ["a", True]}
+        assert await one.search_param("gains") == "/n/gains"
+        assert await one.search_param("nothing") is None
+        assert not await one.has_param("/nothing")
+        assert await one.get_param("/nothing", 7) == 7
+        with pytest.raises(PeerRefused, match="nothing"):
+            await one.get_param("/nothing")
+        assert await one.follow_param("~gains") == {"p": 1.5, "names": ["a", True]}
+        await other.set_param("/n/gains/p", 2.5)
+        await until(lambda: changes)
+        assert changes == [("/n/gains/p", 2.5)]
+        await one.delete_param("~gains")
+        assert not await one.has_param("~gains")
+
+
+async def test_nodes_survive_a_master_that_is_started_anew(core: RosCore) -> None:
+    async with node(core, "talker") as talker, node(core, "listener") as listener:
+        publisher = await talker.advertise("/t", "std_msgs/String")
+        got: list[Received] = []
+        subscriber = await listener.subscribe("/t", None, got.append)
+        await publisher.wait_for_subscriber()
+        port = core.port
+        await core.close()
+        publisher.publish(publisher.make("meanwhile"))
+        await until(lambda: len(got) == 1)
+        again = RosCore("127.0.0.1", port)
+        await again.start()
+        await until(lambda: again.state().publishers.get("/t") == {"/talker": talker.uri})
+        await until(lambda: again.state().subscribers.get("/t") == {"/listener": listener.uri})
+        publisher.publish(publisher.make("afterwards"))
+        await until(lambda: len(got) == 2)
+        assert [received.plain["data"] for received in got] == ["meanwhile", "afterwards"]
+        assert subscriber.publishers == 1
+        await talker.close()
+        await listener.close()
+        await again.close()
+
+
+async def test_the_master_ends_a_node_whose_name_is_taken(core: RosCore) -> None:
+    reasons: list[str] = []
+    async with node(core, "twin", on_shutdown=reasons.append) as first:
+        await first.advertise("/t", "std_msgs/String")
+        async with node(core, "twin") as second:
+            await second.advertise("/u", "std_msgs/String")
+            await asyncio.wait_for(first.stopped.wait(), DEADLINE)
+            await first.close()
+            assert len(reasons) == 1
+            assert core.state().publishers["/u"] == {"/twin": second.uri}
+            assert "/t" not in core.state().publishers
+
+
+async def test_no_master_is_a_clear_error() -> None:
+    core = RosCore("127.0.0.1", 0)
+    await core.start()
+    await core.close()
+    with pytest.raises(UnreachableError) as caught:
+        async with Node("n", master_uri=core.uri, environment=RosEnvironment()):
+            pass
+    assert f"no ROS master answers at {core.uri} (ROS_MASTER_URI); start one" in str(caught.value)
+
+
+async def test_unadvertised_and_unsubscribed(core: RosCore) -> None:
+    async with node(core, "n") as one:
+        publisher = await one.advertise("~out", "std_msgs/String")
+        subscriber = await one.subscribe("/in")
+        assert core.state().publishers["/n/out"] == {"/n": one.uri}
+        with pytest.raises(ValueError, match="publishes /n/out already"):
+            await one.advertise("/n/out", "std_msgs/String")
+        with pytest.raises(ValueError, match="subscribes to /in already"):
+            await one.subscribe("/in")
+        with pytest.raises(DefinitionError):
+            await one.advertise("/x", "no_msgs/Such")
+        await publisher.close()
+        await subscriber.close()
+        assert "/n/out" not in core.state().publishers
+        assert "/in" not in core.state().subscribers
+
+
+async def test_an_ending_node_unregisters_side_by_side(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One behind the other they had one second together, and a slow master kept some."""
+    one = node(core, "n")
+    async with one:
+        for number in range(6):
+            await one.advertise(f"/out{number}", "std_msgs/String")
+            await one.subscribe(f"/in{number}", "std_msgs/String")
+        await one.follow_param("/key")
+        call_master, together = one.call_master, asyncio.Barrier(13)
+
+        async def meeting(method: str, *params: Any) -> Any:
+            await together.wait()  # no call goes on before all have begun
+            if params[0] == "/out0":
+                raise PeerRefused("the master", "one that is refused")
+            return await call_master(method, *params)
+
+        monkeypatch.setattr(one, "call_master", meeting)
+    assert core.state().publishers == {"/out0": {"/n": one.uri}} | {
+        topic: who for topic, who in core.state().publishers.items() if "/n" not in who
+    }
+    assert not any("/n" in who for who in core.state().subscribers.values())
+
+
+async def test_a_master_that_hangs_does_not_keep_a_node_from_its_end(
+    core: RosCore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "NODE_UNREGISTER_TIMEOUT", 0.1)
+    one = node(core, "n")
+    async with one:
+        for number in range(20):
+            await one.advertise(f"/out{number}", "std_msgs/String")
+        begun: list[str] = []
+
+        async def hanging(method: str, *_params: Any) -> Any:
+            begun.append(method)
+            await asyncio.Event().wait()
+
+        monkeypatch.setattr(one, "call_master", hanging)
+        async with asyncio.timeout(DEADLINE):
+            await one.close()
+    assert len(begun) == limits.NODE_UNREGISTER_AT_ONCE
+    assert one.stopped.is_set()
+
+
+async def test_names_are_remapped_and_loopback_is_used_for_a_local_master(core: RosCore) -> None:
+    environment = RosEnvironment.read({"ROS_NAMESPACE": "robot"}, ["out:=there", "__name:=bob"], ["192.0.2.1"])
+    async with Node("n", master_uri=core.uri, environment=environment) as one:
+        await one.advertise("out", "std_msgs/String")
+        assert core.state().publishers["/robot/there"] == {"/robot/bob": one.uri}
+        assert one.uri.startswith("http://127.0.0.1:")
+        assert await call(one.uri, "getPublications", "/x") == [
+            1,
+            "publications",
+            [["/robot/there", "std_msgs/String"]],
+        ]
+
+
+async def test_closing_twice_is_closing_once(core: RosCore) -> None:
+    one = node(core, "n")
+    async with one:
+        await one.close()
+    await one.close()
+    assert one.stopped.is_set()
+    assert limits.NODE_MASTER_CHECK < 1
+
+
+async def test_a_service_is_served_and_called(core: RosCore) -> None:
+    async def slowly(request: Any) -> dict[str, int]:
+        await asyncio.sleep(0)
+        return {"sum": request.a + request.b}
+
+    async with node(core, "server") as server, node(core, "client") as client:
+        service = await server.advertise_service("~add", "rospy_tutorials/AddTwoInts", slowly)
+        assert service.name == "/server/add"
+        assert core.call("lookupService", "/x", "/server/add").value == server.slave.service_uri
+        assert await client.lookup_service("/server/add") == server.slave.service_uri
+        response = await client.call_service("/server/add", "rospy_tutorials/AddTwoInts", [20, 22])
+        assert response.sum == 42
+        calls = await client.connect_service("/server/add", service.kind)
+        assert [(await calls.call({"a": n})).sum for n in range(5)] == list(range(5))
+        with pytest.raises(ValueError, match="/server serves /server/add already"):
+            await server.advertise_service("~add", "std_srvs/Empty", slowly)
+        with pytest.raises(PeerRefused, match="to have md5sum"):
+            await client.call_service("/server/add", "std_srvs/Trigger")
+        await service.close()
+        await until(lambda: calls.closed)
+        with pytest.raises(UnreachableError, match="no server of service /server/add answers at the ROS master"):
+            await client.call_service("/server/add", "rospy_tutorials/AddTwoInts")
+    assert not [name for name, _ in services(core) if name == "/server/add"]
+
+
+def services(core: RosCore) -> list[tuple[str, object]]:
+    """All services and their nodes."""
+    value = core.call("getSystemState", "/x").value
+    assert isinstance(value, list)
+    assert isinstance(value[2], list)
+    return [(str(pair[0]), pair[1]) for pair in value[2] if isinstance(pair, list)]
+
+
+async def test_what_a_handler_raises_is_the_clients_error(core: RosCore, caplog: pytest.LogCaptureFixture) -> None:
+    def fails(request: Any) -> object:
+        if request.data:
+            raise PeerRefused("the gripper", "it is jammed")
+        return {"succes": True}
+
+    async with node(core, "server") as server:
+        await server.advertise_service("/grip", "std_srvs/SetBool", fails)
+        with pytest.raises(PeerRefused, match="service /grip refused: the gripper refused: it is jammed"):
+            await server.call_service("/grip", "std_srvs/SetBool", True)
+        with pytest.raises(PeerRefused, match="std_srvs/SetBoolResponse has no field 'succes'"):
+            await server.call_service("/grip", "std_srvs/SetBool", False)
+        assert not caplog.records
+        client = await server.connect_service("/grip", "std_srvs/SetBool")
+        ok, text = await client.connection.call(b"too long")
+        assert not ok
+        assert b"8 bytes are not a std_srvs/SetBoolRequest" in bytes(text)
+        client.close()
+
+
+async def test_the_core_and_its_loggers(core: RosCore) -> None:
+    found = dict(services(core))
+    assert found == {"/rosout/get_loggers": ["/rosout"], "/rosout/set_logger_level": ["/rosout"]}
+    async with node(core, "rqt") as client:
+        response = await client.call_service("/rosout/get_loggers", "roscpp/GetLoggers")
+        assert [logger.name for logger in response.loggers] == ["ros", "ros.rosout"]
+        try:
+            await client.call_service("/rosout/set_logger_level", "roscpp/SetLoggerLevel", ["ros", "DEBUG"])
+            assert logging.getLogger("rmpa.ros").level == logging.DEBUG
+            response = await client.call_service("/rosout/get_loggers", "roscpp/GetLoggers")
+            assert [logger.level for logger in response.loggers] == ["debug", "debug"]
+        finally:
+            logging.getLogger("rmpa.ros").setLevel(logging.NOTSET)
+        with pytest.raises(PeerRefused, match=r"/rosout has no logger 'nobody'; it has ros, ros\.rosout"):
+            await client.call_service("/rosout/set_logger_level", "roscpp/SetLoggerLevel", ["nobody", "info"])
+        with pytest.raises(PeerRefused, match="'loud' is not a level; there are debug, info, warn, error, fatal"):
+            await client.call_service("/rosout/set_logger_level", "roscpp/SetLoggerLevel", ["ros", "loud"])
+        raw = await client.connect_service("/rosout/set_logger_level", "roscpp/SetLoggerLevel")
+        for junk in (b"", b"\x01", b"\x03\x00\x00\x00ros", b"\xff\xff\xff\xff", bytes(9)):
+            ok, text = await raw.connection.call(junk)
+            assert (ok, b"are not a roscpp/SetLoggerLevelRequest" in bytes(text)) == (False, True)
+        raw.close()
+
+
+async def test_a_core_that_was_started_anew_has_the_services_again(core: RosCore) -> None:
+    async with node(core, "server") as server:
+        await server.advertise_service("/empty", "std_srvs/Empty", lambda _request: None)
+        core.call("unregisterService", "/server", "/empty", server.slave.service_uri)
+        await until(lambda: ("/empty", ["/server"]) in services(core))

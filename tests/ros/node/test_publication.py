@@ -1,0 +1,565 @@
+from __future__ import annotations
+
+import socket
+import struct
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.core import limits
+from rmpa.ros.node.publication import Publication
+from rmpa.ros.node.tcpros_server import TcprosServer
+from rmpa.ros.wire.tcpros import TopicDescription, frame_message
+from tests.ros.node.peers import LATCHED, STRING, RawSubscriber, until
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Mapping
+
+OTHER = TopicDescription("std_msgs/Int32", "da5909fbe378aeaf85e547e830cc1bb7", "int32 data\n")
+
+
+class Owner:
+    """A server with one publication of /t, and what it said."""
+
+    def __init__(self, description: TopicDescription | None, **options: int) -> None:
+        self.said: list[str] = []
+        self.publication = Publication(
+            "/t",
+            "/p",
+            description,
+            on_first_subscriber=lambda: self.said.append("first"),
+            on_last_subscriber=lambda: self.said.append("last"),
+            on_mismatch=self.mismatch,
+            **options,  # type: ignore[arg-type] # all of them are numbers
+        )
+        self.server = TcprosServer("/p", {"/t": self.publication})
+        self.server.start()
+
+    def mismatch(self, fields: Mapping[str, str], text: str) -> None:
+        self.said.append(f"refused {fields['callerid']}: {text}")
+
+    async def subscriber(self, *, buffer: int = 0, **fields: str) -> RawSubscriber:
+        before = self.publication.subscribers
+        link = await RawSubscriber.connect(self.server.address, buffer=buffer, **fields)
+        await until(lambda: self.publication.subscribers > before)
+        return link
+
+    def close(self) -> None:
+        self.publication.withdraw()
+        self.server.close()
+
+
+@pytest.fixture
+async def held() -> AsyncIterator[Owner]:
+    owner = Owner(None)
+    yield owner
+    owner.close()
+
+
+@pytest.fixture
+async def known() -> AsyncIterator[Owner]:
+    owner = Owner(STRING)
+    yield owner
+    owner.close()
+
+
+@pytest.fixture
+async def latched() -> AsyncIterator[Owner]:
+    owner = Owner(LATCHED)
+    yield owner
+    owner.close()
+
+
+async def test_a_subscriber_gets_the_header_and_then_every_message(known: Owner) -> None:
+    link = await known.subscriber()
+    assert await link.header() == {
+        "callerid": "/p",
+        "latching": "0",
+        "md5sum": STRING.md5sum,
+        "message_definition": "string data\n",
+        "topic": "/t",
+        "type": "std_msgs/String",
+    }
+    for payload in (b"one", b"", b"x" * 3_000_000, b"last"):
+        known.publication.publish_framed(frame_message(payload))
+    for payload in (b"one", b"", b"x" * 3_000_000, b"last"):
+        assert await link.message() == payload
+    link.close()
+
+
+async def test_demand_is_told_once_each_way(known: Owner) -> None:
+    one, two = await known.subscriber(), await known.subscriber()
+    one.close()
+    await until(lambda: known.publication.subscribers == 1)
+    assert known.said == ["first"]
+    two.close()
+    await until(lambda: known.said == ["first", "last"])
+
+
+@pytest.mark.trap(15, 38)
+async def test_a_subscriber_is_held_until_the_type_is_known(held: Owner) -> None:
+    link = await held.subscriber()
+    assert held.said == ["first"]
+    assert held.publication.connections()[0].connected is False
+    held.publication.describe(STRING)
+    assert (await link.header())["type"] == "std_msgs/String"
+    held.publication.publish_framed(frame_message(b"now"))
+    assert await link.message() == b"now"
+    assert held.said == ["first"]
+    link.close()
+
+
+async def test_a_held_subscriber_that_does_not_fit_is_refused_and_reported(held: Owner) -> None:
+    wrong, right = await held.subscriber(callerid="/wrong", md5sum="0" * 32), await held.subscriber()
+    held.publication.describe(STRING)
+    error = (await wrong.header())["error"]
+    assert "client [/wrong] wants topic /t to have type/md5sum [std_msgs/String/00000000" in error
+    assert await wrong.ended()
+    assert "error" not in await right.header()
+    assert held.said == ["first", f"refused /wrong: {error}"]
+    wrong.close()
+    right.close()
+
+
+async def test_demand_ends_when_all_held_subscribers_are_refused(held: Owner) -> None:
+    link = await held.subscriber(md5sum="0" * 32)
+    held.publication.describe(STRING)
+    assert [text.split()[0] for text in held.said] == ["first", "refused", "last"]
+    link.close()
+
+
+async def test_a_mismatch_is_no_demand(known: Owner) -> None:
+    link = await RawSubscriber.connect(known.server.address, md5sum="0" * 32)
+    assert "error" in await link.header()
+    assert [text.split()[0] for text in known.said] == ["refused"]
+    link.close()
+
+
+async def test_any_md5_sum_gets_the_real_one(known: Owner) -> None:
+    link = await known.subscriber(md5sum="*", type="*")
+    fields = await link.header()
+    assert (fields["type"], fields["md5sum"]) == (STRING.type, STRING.md5sum)
+    link.close()
+
+
+@pytest.mark.trap(10)
+async def test_the_latched_message_goes_to_each_new_connection_once_and_first(latched: Owner) -> None:
+    early = await latched.subscriber()
+    latched.publication.publish_framed(memoryview(bytearray(frame_message(b"old"))))
+    latched.publication.publish_framed(memoryview(bytearray(frame_message(b"kept"))))
+    late = await latched.subscriber(callerid="/late")
+    latched.publication.publish_framed(frame_message(b"new"))
+    await early.header()
+    assert (await late.header())["latching"] == "1"
+    assert [await early.message() for _ in range(3)] == [b"old", b"kept", b"new"]
+    assert [await late.message() for _ in range(2)] == [b"kept", b"new"]
+    early.close()
+    late.close()
+
+
+async def test_the_latched_message_can_be_forgotten(latched: Owner) -> None:
+    latched.publication.publish_framed(frame_message(b"old"))
+    latched.publication.forget_latched()
+    link = await latched.subscriber()
+    await link.header()
+    latched.publication.publish_framed(frame_message(b"new"))
+    assert await link.message() == b"new"
+    link.close()
+
+
+async def test_without_latching_nothing_is_kept(known: Owner) -> None:
+    known.publication.publish_framed(frame_message(b"old"))
+    link = await known.subscriber()
+    await link.header()
+    known.publication.publish_framed(frame_message(b"new"))
+    assert await link.message() == b"new"
+    link.close()
+
+
+async def test_another_definition_closes_those_who_were_promised_the_old_one(latched: Owner) -> None:
+    link = await latched.subscriber(md5sum="*")
+    latched.publication.publish_framed(frame_message(b"old"))
+    latched.publication.describe(LATCHED)
+    assert latched.publication.subscribers == 1
+    latched.publication.describe(OTHER)
+    await link.header()
+    assert await link.message() == b"old"
+    assert await link.ended()
+    assert latched.said == ["first", "last"]
+    again = await latched.subscriber(md5sum="*")
+    assert (await again.header())["type"] == "std_msgs/Int32"
+    latched.publication.publish_framed(frame_message(b"new"))
+    assert await again.message() == b"new"
+    link.close()
+    again.close()
+
+
+@pytest.mark.trap(2)
+async def test_a_wildcard_is_never_described(held: Owner) -> None:
+    with pytest.raises(ValueError, match="cannot have the type"):
+        held.publication.describe(TopicDescription("*", "*", ""))
+
+
+@pytest.mark.trap(9)
+@pytest.mark.parametrize(("asked", "given"), [("1", 1), ("0", 0), ("true", 0), ("", 0)])
+async def test_tcp_nodelay_is_honoured_on_our_socket(known: Owner, asked: str, given: int) -> None:
+    link = await known.subscriber(tcp_nodelay=asked)
+    (inbound,) = known.publication._open
+    assert inbound._sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == given
+    link.close()
+
+
+@pytest.mark.trap(13)
+async def test_a_half_closed_subscriber_is_gone(known: Owner) -> None:
+    link = await known.subscriber()
+    link.sock.shutdown(socket.SHUT_WR)
+    await until(lambda: known.said == ["first", "last"])
+    link.close()
+
+
+@pytest.mark.trap(20)
+async def test_junk_from_a_subscriber_is_read_away(known: Owner) -> None:
+    link = await known.subscriber()
+    for _ in range(40):
+        await link.send(b"j" * 100_000)
+    (inbound,) = known.publication._open
+    await until(lambda: inbound.stream.bytes_in > 4_000_000)
+    assert len(inbound.stream._buffer) <= 1 << 18
+    known.publication.publish_framed(frame_message(b"still here"))
+    await link.header()
+    assert await link.message() == b"still here"
+    link.close()
+    await until(lambda: known.said == ["first", "last"])
+
+
+async def test_a_reset_is_gone_too(known: Owner) -> None:
+    link = await known.subscriber()
+    link.sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    link.close()
+    await until(lambda: known.said == ["first", "last"])
+    known.publication.publish_framed(frame_message(b"nobody"))
+
+
+@pytest.mark.trap(19)
+async def test_a_slow_subscriber_loses_the_oldest_and_delays_nobody() -> None:
+    owner = Owner(STRING, queue_messages=10, queue_bytes=1 << 30)
+    slow = await owner.subscriber(callerid="/slow", buffer=4096)
+    fast = await owner.subscriber(callerid="/fast")
+    await slow.header()
+    await fast.header()
+    size = 200_000
+    sent = [struct.pack("<I", n) + bytes(size) for n in range(100)]
+    dropped = 0
+    for payload in sent:
+        dropped += owner.publication.publish_framed(frame_message(payload))
+        assert await fast.message() == payload
+    assert dropped == owner.publication.dropped > 50
+    stats = {c.other: c for c in owner.publication.connections()}
+    assert (stats["/slow"].dropped, stats["/fast"].dropped) == (dropped, 0)
+    assert stats["/slow"].messages == stats["/fast"].messages == 100
+    got = [await slow.message() for _ in range(100 - dropped)]
+    assert set(got) <= set(sent)
+    assert got == sorted(got)
+    assert got[-10:] == sent[-10:]
+    slow.close()
+    fast.close()
+    await until(lambda: owner.publication.subscribers == 0)
+    assert owner.publication.dropped == dropped
+    owner.close()
+
+
+@pytest.mark.trap(19)
+async def test_a_slow_subscriber_holds_no_more_than_its_bytes() -> None:
+    owner = Owner(STRING, queue_messages=1000, queue_bytes=1_000_000)
+    slow = await owner.subscriber(buffer=4096)
+    for _ in range(200):
+        owner.publication.publish_framed(frame_message(bytes(100_000)))
+    (inbound,) = owner.publication._open
+    assert inbound.stream.pending_bytes <= 1_000_000 + 100_004
+    slow.close()
+    owner.close()
+
+
+@pytest.mark.trap(16)
+async def test_withdrawn_all_connections_are_closed_and_nothing_is_said(known: Owner) -> None:
+    link = await known.subscriber()
+    await link.header()
+    known.publication.withdraw()
+    assert await link.ended()
+    assert known.said == ["first"]
+    link.close()
+
+
+async def test_figures(known: Owner) -> None:
+    link = await known.subscriber()
+    await link.header()
+    known.publication.publish_framed(frame_message(b"abc"))
+    await link.message()
+    (connection,) = known.publication.connections()
+    assert (connection.other, connection.direction, connection.topic) == ("/s", "o", "/t")
+    assert (connection.connected, connection.messages, connection.dropped) == (True, 1, 0)
+    assert connection.bytes > 7
+    assert connection.info.startswith("TCPROS connection on port ")
+    assert (known.publication.messages, known.publication.bytes) == (1, 7)
+    link.close()
+
+
+async def test_what_was_published_can_be_waited_for(known: Owner) -> None:
+    link = await known.subscriber(buffer=4096)
+    for _ in range(20):
+        known.publication.publish_framed(frame_message(bytes(100_000)))
+    await link.header()
+    reading = [len(await link.message()) for _ in range(20)]
+    await known.publication.drained()
+    assert reading == [100_000] * 20
+    assert limits.SUBSCRIBER_QUEUE_MESSAGES > 20
+    link.close()
+
+
+@pytest.mark.trap(18)
+async def test_a_machine_that_was_switched_off_is_noticed_by_the_kernel(known: Owner) -> None:
+    link = await known.subscriber()
+    (inbound,) = known.publication._open
+    for level, option, value in (
+        (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
+        (socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 60),
+        (socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 10),
+        (socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 9),
+    ):
+        assert inbound._sock.getsockopt(level, option) == value
+    link.close()
+
+
+# --- messages in parts ------------------------------------------------------------------------------------------
+
+PARTS = [bytes([n]) * 100_000 for n in range(1, 11)]
+WHOLE = b"".join(PARTS)
+
+
+def begin(publication: Publication, payload: bytes = WHOLE) -> None:
+    publication.begin(4 + len(payload))
+    publication.extend(memoryview(len(payload).to_bytes(4, "little")))
+
+
+def extend(publication: Publication, *parts: bytes) -> None:
+    for part in parts:
+        buffer = bytearray(part)
+        publication.extend(memoryview(buffer))
+        buffer[:] = bytes(len(buffer))  # the stream's buffer is used again
+
+
+async def test_parts_go_on_as_they_come_and_make_the_message(known: Owner) -> None:
+    link = await known.subscriber()
+    await link.header()
+    known.publication.publish_framed(frame_message(b"before"))
+    begin(known.publication)
+    extend(known.publication, PARTS[0])
+    assert await link.message() == b"before"
+    while len(link.data) < 4 + len(PARTS[0]):
+        await link._more()
+    assert known.publication.messages == 1
+    extend(known.publication, *PARTS[1:])
+    known.publication.publish_framed(frame_message(b"after"))
+    assert await link.message() == WHOLE
+    assert await link.message() == b"after"
+    assert known.publication.messages == 3
+    assert known.publication.bytes == 4 + len(WHOLE) + 2 * 4 + 11
+    link.close()
+
+
+async def test_what_nobody_hears_is_counted_all_the_same(known: Owner) -> None:
+    begin(known.publication)
+    extend(known.publication, *PARTS)
+    assert (known.publication.messages, known.publication.bytes) == (1, 4 + len(WHOLE))
+    link = await known.subscriber()
+    begin(known.publication)
+    link.close()
+    await until(lambda: known.publication.subscribers == 0)
+    extend(known.publication, *PARTS)
+    assert (known.publication.messages, known.publication.bytes) == (2, 2 * (4 + len(WHOLE)))
+
+
+async def test_a_slow_subscriber_among_fast_ones_gets_whole_messages_or_none() -> None:
+    owner = Owner(STRING, queue_messages=2, queue_bytes=1 << 30)
+    slow = await owner.subscriber(callerid="/slow", buffer=4096)
+    fast = [await owner.subscriber(callerid=f"/fast{n}") for n in range(2)]
+    for link in (slow, *fast):
+        await link.header()
+    sent = []
+    for number in range(30):
+        parts = [bytes([number]) * 150_000, bytes([255 - number]) * 100_000]
+        sent.append(b"".join(parts))
+        begin(owner.publication, sent[-1])
+        extend(owner.publication, *parts)
+        for link in fast:
+            assert await link.message() == sent[-1]
+    dropped = owner.publication.dropped
+    assert dropped > 10
+    got = [await slow.message() for _ in range(30 - dropped)]
+    assert got == [message for message in sent if message in got], "in order, none torn, none twice"
+    # The one that was on its way when the rest came may be one of the two that the queue holds.
+    assert got[-1] == sent[-1]
+    for link in (slow, *fast):
+        link.close()
+    owner.close()
+
+
+async def test_a_slow_subscriber_holds_no_more_than_its_bytes_of_parts_either() -> None:
+    owner = Owner(STRING, queue_messages=1000, queue_bytes=1_000_000)
+    slow = await owner.subscriber(buffer=4096)
+    for _ in range(20):
+        begin(owner.publication)
+        extend(owner.publication, *PARTS)
+    (inbound,) = owner.publication._open
+    assert inbound.stream.pending_bytes <= 1_000_000 + 2 * len(WHOLE)
+    slow.close()
+    owner.close()
+
+
+async def test_who_comes_in_the_middle_begins_with_the_next_one(known: Owner) -> None:
+    early = await known.subscriber(callerid="/early")
+    begin(known.publication)
+    extend(known.publication, *PARTS[:5])
+    late = await known.subscriber(callerid="/late")
+    extend(known.publication, *PARTS[5:])
+    known.publication.publish_framed(frame_message(b"next"))
+    for link, messages in ((early, [WHOLE, b"next"]), (late, [b"next"])):
+        await link.header()
+        assert [await link.message() for _ in messages] == messages
+        link.close()
+
+
+@pytest.mark.trap(10)
+async def test_who_comes_in_the_middle_of_a_latched_one_gets_it_whole_behind_the_one_before(latched: Owner) -> None:
+    """A map is published once: there is no next one to begin with."""
+    early = await latched.subscriber(callerid="/early")
+    latched.publication.publish_framed(frame_message(b"old map"))
+    begin(latched.publication)
+    extend(latched.publication, *PARTS[:5])
+    late = await latched.subscriber(callerid="/late")
+    extend(latched.publication, *PARTS[5:])
+    latest = await latched.subscriber(callerid="/latest")
+    latched.publication.publish_framed(frame_message(b"next"))
+    for link, messages in ((early, [b"old map", WHOLE]), (late, [b"old map", WHOLE]), (latest, [WHOLE])):
+        await link.header()
+        assert [await link.message() for _ in range(len(messages) + 1)] == [*messages, b"next"]
+        link.close()
+
+
+async def test_an_abort_hangs_up_on_those_who_have_the_beginning_and_on_nobody_else() -> None:
+    owner = Owner(STRING, queue_messages=100)
+    half = await owner.subscriber(callerid="/half")
+    stuck = await owner.subscriber(callerid="/stuck", buffer=4096)
+    await stuck.header()
+    (blocked,) = [link for link in owner.publication._open if link.caller_id == "/stuck"]
+    fills = 0
+    while not blocked.stream.pending_bytes:
+        owner.publication.publish_framed(frame_message(bytes(100_000)))
+        fills += 1
+    owner.publication.publish_framed(frame_message(b"last"))
+    begin(owner.publication)
+    extend(owner.publication, *PARTS[:3])
+    late = await owner.subscriber(callerid="/late")
+    assert owner.publication.abort() == 1
+    assert {link.caller_id for link in owner.publication._open} == {"/stuck", "/late"}
+    assert owner.said == ["first"]
+    await half.header()
+    assert [len(await half.message()) for _ in range(fills + 1)] == [100_000] * fills + [4]
+    with pytest.raises(EOFError):
+        await half.message()
+    assert 0 < len(half.data) < len(WHOLE)
+    owner.publication.publish_framed(frame_message(b"next"))
+    assert [len(await stuck.message()) for _ in range(fills + 2)] == [100_000] * fills + [4, 4]
+    await late.header()
+    assert await late.message() == b"next"
+    for link in (half, stuck, late):
+        link.close()
+    owner.close()
+
+
+async def test_an_abort_that_leaves_nobody_ends_the_demand(known: Owner) -> None:
+    link = await known.subscriber()
+    begin(known.publication)
+    assert known.publication.abort() == 1
+    assert known.said == ["first", "last"]
+    assert known.publication.abort() == 0
+    again = await known.subscriber()
+    known.publication.publish_framed(frame_message(b"next"))
+    await again.header()
+    assert await again.message() == b"next"
+    link.close()
+    again.close()
+
+
+async def test_what_was_aborted_is_not_latched(latched: Owner) -> None:
+    latched.publication.publish_framed(frame_message(b"old"))
+    begin(latched.publication)
+    extend(latched.publication, *PARTS[:9])
+    assert latched.publication.abort() == 0
+    link = await latched.subscriber()
+    await link.header()
+    assert await link.message() == b"old"
+    link.close()
+
+
+async def test_a_subscriber_that_leaves_in_the_middle_does_not_disturb_the_others(known: Owner) -> None:
+    leaves, stays = await known.subscriber(callerid="/leaves"), await known.subscriber(callerid="/stays")
+    begin(known.publication)
+    extend(known.publication, *PARTS[:2])
+    leaves.close()
+    await until(lambda: known.publication.subscribers == 1)
+    extend(known.publication, *PARTS[2:])
+    await stays.header()
+    assert await stays.message() == WHOLE
+    stays.close()
+
+
+async def test_withdrawn_in_the_middle_nothing_is_left(latched: Owner) -> None:
+    link = await latched.subscriber()
+    begin(latched.publication)
+    extend(latched.publication, *PARTS[:2])
+    latched.publication.withdraw()
+    extend(latched.publication, *PARTS[2:])
+    assert latched.publication.latched == ()
+    link.close()
+
+
+async def test_as_many_are_kept_as_was_said_and_each_new_subscriber_gets_them_in_order(latched: Owner) -> None:
+    latched.publication.publish_framed(frame_message(b"0"))
+    latched.publication.keep(3)
+    for n in range(1, 3):
+        latched.publication.publish_framed(frame_message(b"%d" % n))
+    begin(latched.publication)
+    extend(latched.publication, *PARTS)
+    kept = list(latched.publication.latched)
+    assert kept == [frame_message(b"1"), frame_message(b"2"), frame_message(WHOLE)]
+    link = await latched.subscriber()
+    await link.header()
+    assert [await link.message() for _ in range(3)] == [b"1", b"2", WHOLE]
+    latched.publication.keep(1)
+    assert list(latched.publication.latched) == kept[-1:]
+    link.close()
+
+
+def test_no_contract_keeps_more_than_the_limit() -> None:
+    publication = Publication("/t", "/p", LATCHED)
+    publication.keep(limits.LATCHED_MAX * 10)
+    for n in range(limits.LATCHED_MAX * 2):
+        publication.publish_framed(frame_message(b"%d" % n))
+    assert len(publication.latched) == limits.LATCHED_MAX
+
+
+@pytest.mark.trap(19)
+async def test_a_contracts_depth_bounds_what_waits_for_each_subscriber_old_and_new() -> None:
+    owner = Owner(STRING)
+    early = await owner.subscriber(callerid="/early", buffer=4096)
+    owner.publication.bound(3)
+    late = await owner.subscriber(callerid="/late", buffer=4096)
+    for _ in range(100):
+        owner.publication.publish_framed(frame_message(bytes(200_000)))
+    assert all(link.dropped > 50 and link.stream.outbox.pending_entries <= 4 for link in owner.publication._open)
+    owner.publication.bound(10**6)
+    assert owner.publication._queue_messages == limits.SUBSCRIBER_QUEUE_MESSAGES
+    early.close()
+    late.close()
+    owner.close()

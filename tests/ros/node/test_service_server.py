@@ -1,0 +1,463 @@
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import struct
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.core import limits
+from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
+from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint, responding
+from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.ros.wire.services import ServiceDescription
+from rmpa.ros.wire.tcpros import encode_header
+from tests.ros.node.peers import DEADLINE, RawSubscriber, until
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Mapping
+
+MD5 = "6a2e34150c00229791cc89ff309fff21"
+ADD = ServiceDescription("rospy_tutorials/AddTwoInts", MD5)
+
+
+@pytest.fixture
+async def node() -> AsyncIterator[SlaveNode]:
+    made = SlaveNode("/server", "127.0.0.1", "http://127.0.0.1:11311/")
+    await made.start()
+    yield made
+    await made.close()
+
+
+def add(call: ServiceCall) -> None:
+    a, b = struct.unpack("<qq", call.request)
+    call.reply(True, struct.pack("<q", a + b))
+
+
+def echo(call: ServiceCall) -> None:
+    call.reply(True, call.request)
+
+
+def serve(node: SlaveNode, *args: object, **kwargs: object) -> ServiceEndpoint:
+    kwargs.setdefault("description", ADD)
+    endpoint = ServiceEndpoint("/add", "/server", *args, **kwargs)  # type: ignore[arg-type] # handed through
+    node.add_service(endpoint)
+    return endpoint
+
+
+class RawClient(RawSubscriber):
+    """A bare client."""
+
+    @classmethod
+    async def call(cls, node: SlaveNode, **fields: str) -> RawClient:
+        """Connect and send a header."""
+        address = ("127.0.0.1", int(node.service_uri.rpartition(":")[2]))
+        header = {"topic": "", "type": "", "service": "/add", "md5sum": "*", **fields}
+        return await cls.connect(address, buffer=0, **header)
+
+    async def reply(self) -> tuple[int, bytes]:
+        """The next reply."""
+        while len(self.data) < 5 or len(self.data) < 5 + struct.unpack_from("<I", self.data, 1)[0]:
+            await self._more()
+        ok, size = struct.unpack_from("<BI", self.data)
+        body, self.data = self.data[5 : 5 + size], self.data[5 + size :]
+        return ok, body
+
+
+def framed(body: bytes) -> bytes:
+    return struct.pack("<I", len(body)) + body
+
+
+TWO = framed(struct.pack("<qq", 20, 22))
+FORTY_TWO = (1, struct.pack("<q", 42))
+
+
+async def test_a_call_is_answered_and_the_connection_closed(node: SlaveNode) -> None:
+    endpoint = serve(node, add)
+    client = await RawClient.call(node)
+    header = await client.header()
+    assert header == {
+        "callerid": "/server",
+        "md5sum": MD5,
+        "request_type": "rospy_tutorials/AddTwoIntsRequest",
+        "response_type": "rospy_tutorials/AddTwoIntsResponse",
+        "type": "rospy_tutorials/AddTwoInts",
+    }
+    await client.send(TWO)
+    assert await client.reply() == FORTY_TWO
+    assert await client.ended()
+    client.close()
+    assert (endpoint.calls, endpoint.failed, endpoint.connections) == (1, 0, 0)
+
+
+@pytest.mark.trap(24)
+@pytest.mark.parametrize("word", ["1", "true", "True"])
+async def test_a_persistent_connection_goes_on(node: SlaveNode, word: str) -> None:
+    serve(node, add)
+    client = await RawClient.call(node, persistent=word)
+    await client.header()
+    for _ in range(3):
+        await client.send(TWO)
+        assert await client.reply() == FORTY_TWO
+    client.close()
+
+
+async def test_byte_by_byte_and_all_in_one_segment(node: SlaveNode) -> None:
+    serve(node, add)
+    client = await RawClient.call(node, persistent="1")
+    for byte in TWO:
+        await client.send(bytes([byte]))
+        await asyncio.sleep(0)
+    await client.header()
+    assert await client.reply() == FORTY_TWO
+    await client.send(TWO * 3)  # no client of ROS does so: each is answered, in order
+    assert [await client.reply() for _ in range(3)] == [FORTY_TWO] * 3
+    client.close()
+    hasty = await RawClient.dial(("127.0.0.1", int(node.service_uri.rpartition(":")[2])))
+    header = {"service": "/add", "callerid": "/c", "md5sum": MD5}
+    await hasty.send(encode_header(header) + TWO)
+    await hasty.header()
+    assert await hasty.reply() == FORTY_TWO
+    hasty.close()
+
+
+async def test_a_request_that_came_before_the_description_waits_for_it(node: SlaveNode) -> None:
+    asked = 0
+    known: asyncio.Future[ServiceDescription | str] = asyncio.get_running_loop().create_future()
+
+    async def describe() -> ServiceDescription | str:
+        nonlocal asked
+        asked += 1
+        return await asyncio.shield(known)
+
+    serve(node, add, describe, description=None)
+    address = ("127.0.0.1", int(node.service_uri.rpartition(":")[2]))
+    clients = [await RawClient.dial(address) for _ in range(3)]
+    for client in clients:
+        await client.send(encode_header({"service": "/add", "callerid": "/c", "md5sum": MD5}) + TWO)
+    await until(lambda: asked)
+    known.set_result(ADD)
+    for client in clients:
+        assert (await client.header())["type"] == ADD.type
+        assert await client.reply() == FORTY_TWO
+        client.close()
+    assert asked == 1
+
+
+async def test_a_refused_description_is_asked_for_again(node: SlaveNode) -> None:
+    answers: list[ServiceDescription | str] = [ADD, "the peer is away"]
+
+    async def describe() -> ServiceDescription | str:
+        return answers.pop()
+
+    serve(node, add, describe, description=None)
+    client = await RawClient.call(node)
+    assert await client.header() == {"error": "the peer is away"}
+    assert await client.ended()
+    client.close()
+    client = await RawClient.call(node)
+    assert (await client.header())["md5sum"] == MD5
+    client.close()
+
+
+async def test_a_description_that_fails_is_an_error_to_the_client(node: SlaveNode) -> None:
+    async def describe() -> ServiceDescription | str:
+        raise UnreachableError("agent", "base")
+
+    serve(node, add, describe, description=None)
+    client = await RawClient.call(node)
+    assert await client.header() == {"error": "no agent answers at base"}
+    client.close()
+
+
+@pytest.mark.trap(23)
+async def test_probes_are_answered_and_may_leave_unread(node: SlaveNode, caplog: pytest.LogCaptureFixture) -> None:
+    endpoint = serve(node, add)
+    probe = await RawClient.call(node, probe="1")
+    assert (await probe.header())["type"] == ADD.type
+    probe.close()
+    for _ in range(20):
+        (await RawClient.call(node, probe="1")).close()
+    await until(lambda: not endpoint.connections)
+    assert endpoint.calls == 0
+    assert not caplog.records
+
+
+async def test_another_md5_sum_is_refused_loudly(node: SlaveNode) -> None:
+    told: list[str] = []
+
+    def on_mismatch(fields: Mapping[str, str], text: str) -> None:
+        told.append(f"{fields['callerid']}: {text}")
+
+    serve(node, add, on_mismatch=on_mismatch)
+    client = await RawClient.call(node, md5sum="0" * 32, callerid="/old")
+    text = (await client.header())["error"]
+    assert text.startswith("client [/old] wants service /add to have md5sum [000")
+    assert told == [f"/old: {text}"]
+    assert await client.ended()
+    client.close()
+
+
+async def test_an_unknown_service_is_a_clear_error(node: SlaveNode) -> None:
+    with pytest.raises(
+        PeerRefused, match=r"service /none: its server refused: \[/server\] does not offer .*\[/none\]"
+    ):
+        await ServiceConnection.open(node.service_uri, "/none", "/c")
+
+
+async def test_the_servers_own_error_text_comes_through(node: SlaveNode) -> None:
+    endpoint = serve(node, lambda call: call.reply(False, b"division by zero"))
+    connection = await ServiceConnection.open(node.service_uri, "/add", "/c")
+    assert await connection.call(b"") == (False, b"division by zero")
+    assert await connection.call(b"") == (False, b"division by zero")  # an error ends the call, not the connection
+    connection.close()
+    assert (endpoint.calls, endpoint.failed) == (2, 2)
+
+
+async def test_a_server_that_raises_is_an_error_to_the_client(
+    node: SlaveNode, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fails(call: ServiceCall) -> None:
+        raise RmpaError("no link to base") if call.request else ZeroDivisionError
+
+    serve(node, fails)
+    connection = await ServiceConnection.open(node.service_uri, "/add", "/c")
+    assert await connection.call(b"1") == (False, b"no link to base")
+    assert not caplog.records
+    ok, text = await connection.call(b"")
+    assert (ok, text) == (False, b"service [/add]: [/server] failed at this call; its log says why")
+    assert "ZeroDivisionError" in caplog.text
+    connection.close()
+
+
+async def test_many_connections_are_served_at_once(node: SlaveNode) -> None:
+    calls: list[ServiceCall] = []
+    serve(node, calls.append)
+    connections = [await ServiceConnection.open(node.service_uri, "/add", f"/c{i}") for i in range(50)]
+    answers = [asyncio.create_task(c.call(struct.pack("<q", i))) for i, c in enumerate(connections)]
+    await until(lambda: len(calls) == 50)
+    for call in reversed(calls):
+        call.reply(True, call.request + call.caller_id.encode())
+    for i, answer in enumerate(answers):
+        assert await answer == (True, struct.pack("<q", i) + f"/c{i}".encode())
+    for connection in connections:
+        connection.close()
+
+
+async def test_the_deadline_answers_for_a_silent_server(node: SlaveNode) -> None:
+    calls: list[ServiceCall] = []
+    gone: list[bool] = []
+
+    def silent(call: ServiceCall) -> None:
+        call.on_gone = lambda: gone.append(True)
+        calls.append(call)
+
+    endpoint = serve(node, silent, timeout=0.05)
+    connection = await ServiceConnection.open(node.service_uri, "/add", "/c")
+    assert await connection.call(b"1") == (False, b"service [/add] did not answer within 0.05 s")
+    assert gone == [True]
+    calls[0].reply(True, b"late")  # must not become the answer to the next call
+    endpoint.serve = echo
+    assert await connection.call(b"2") == (True, b"2")
+    connection.close()
+    assert (endpoint.calls, endpoint.failed) == (2, 1)
+
+
+async def test_a_client_that_leaves_in_the_middle_of_a_call_ends_it(node: SlaveNode) -> None:
+    started, cancelled = asyncio.Event(), asyncio.Event()
+
+    async def slow(_call: ServiceCall) -> tuple[bool, bytes]:
+        started.set()
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            cancelled.set()
+            raise
+        raise AssertionError
+
+    endpoint = serve(node, responding(slow))
+    client = await RawClient.call(node)
+    await client.header()
+    await client.send(TWO)
+    async with asyncio.timeout(DEADLINE):
+        await started.wait()
+        client.close()
+        await cancelled.wait()
+    assert endpoint.connections == 0
+
+
+async def test_a_coroutine_may_answer(node: SlaveNode) -> None:
+    async def respond(call: ServiceCall) -> tuple[bool, bytes]:
+        await asyncio.sleep(0)
+        if not call.request:
+            raise RmpaError("nothing asked")
+        return True, bytes(call.request)
+
+    serve(node, responding(respond))
+    connection = await ServiceConnection.open(node.service_uri, "/add", "/c")
+    assert await connection.call(b"abc") == (True, b"abc")
+    assert await connection.call(b"") == (False, b"nothing asked")
+    connection.close()
+
+
+@pytest.mark.parametrize("size", [0, 65_536, 65_537, 300_000, 5_000_000])
+async def test_bodies_of_every_size_come_back(node: SlaveNode, size: int) -> None:
+    serve(node, echo)
+    connection = await ServiceConnection.open(node.service_uri, "/add", "/c")
+    body = bytes(range(251)) * (size // 251 + 1)
+    for end in (size, size // 2):
+        ok, answer = await connection.call(body[:end], DEADLINE)
+        assert ok
+        assert answer == body[:end]
+    connection.close()
+
+
+async def test_a_request_beyond_the_limit_is_refused_and_the_connection_goes_on(
+    node: SlaveNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "SERVICE_MESSAGE_MAX", 100_000)
+    endpoint = serve(node, add)
+    client = await RawClient.call(node, persistent="1")
+    await client.header()
+    await client.send(framed(bytes(300_000)) + TWO)
+    text = b"request of 300000 bytes to service [/add] exceeds the limit of 100000"
+    assert await client.reply() == (0, text)
+    assert await client.reply() == FORTY_TWO
+    client.close()
+    assert (endpoint.calls, endpoint.failed) == (2, 1)
+    once = await RawClient.call(node)
+    await once.header()
+    await once.send(framed(bytes(300_000)))
+    assert await once.reply() == (0, text)
+    assert await once.ended()
+    once.close()
+    endpoint.serve = lambda call: call.reply(True, bytes(100_001))
+    connection = await ServiceConnection.open(node.service_uri, "/add", "/c")
+    ok, answer = await connection.call(b"")
+    assert (ok, answer) == (False, b"response of 100001 bytes of service [/add] exceeds the limit of 100000")
+    with pytest.raises(ServiceFailed, match="request of 100001 bytes exceeds the limit of 100000"):
+        await connection.call(bytes(100_001))
+    connection.close()
+
+
+async def test_a_client_that_sends_ahead_without_end_is_closed(
+    node: SlaveNode, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(limits, "SERVICE_MESSAGE_MAX", 100_000)
+    serve(node, lambda _call: None)
+    client = await RawClient.call(node, persistent="1", callerid="/flood")
+    await client.header()
+    with contextlib.suppress(ConnectionError):
+        async with asyncio.timeout(DEADLINE):
+            while True:
+                await client.send(TWO * 1000)
+    client.close()
+    assert "/flood: what was sent ahead of a reply" in caplog.text
+
+
+async def test_a_silent_client_is_closed(node: SlaveNode, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "SERVICE_STALL", 0.05)
+    endpoint = serve(node, add)
+    silent = await RawClient.call(node)
+    half = await RawClient.call(node, persistent="1")
+    idle = await RawClient.call(node, persistent="1")
+    for client in (silent, half, idle):
+        await client.header()
+    await half.send(TWO[:9])
+    assert await silent.ended()
+    assert await half.ended()
+    assert endpoint.connections == 1  # persistent ones may wait for their next call as long as they like
+    await idle.send(TWO)
+    assert await idle.reply() == FORTY_TWO
+    for client in (silent, half, idle):
+        client.close()
+
+
+async def test_a_client_that_does_not_read_is_served_no_further(node: SlaveNode) -> None:
+    endpoint = serve(node, lambda call: call.reply(True, bytes(200_000)))
+    address = ("127.0.0.1", int(node.service_uri.rpartition(":")[2]))
+    client = await RawClient.dial(address, buffer=4096)
+    await client.send(encode_header({"service": "/add", "callerid": "/c", "md5sum": "*", "persistent": "1"}))
+    await client.header()
+    await client.send(TWO * 500)
+    calls = -1
+    while calls != endpoint.calls:
+        calls = endpoint.calls
+        await asyncio.sleep(0.05)
+    assert calls < 100  # what the kernel's buffers took, some megabytes
+    client.close()
+    await until(lambda: not endpoint.connections)
+
+
+async def test_a_withdrawn_service_tells_who_waits(node: SlaveNode) -> None:
+    calls: list[ServiceCall] = []
+    serve(node, calls.append)
+    waiting = await RawClient.call(node, persistent="1")
+    idle = await RawClient.call(node, persistent="1")
+    await waiting.header()
+    await idle.header()
+    await waiting.send(TWO)
+    await until(lambda: calls)
+    gone: list[bool] = []
+    calls[0].on_gone = lambda: gone.append(True)
+    node.remove_service("/add", "peer base is gone")
+    assert await waiting.reply() == (0, b"peer base is gone")
+    assert await waiting.ended()
+    assert await idle.ended()
+    assert gone == [True]
+    with pytest.raises(PeerRefused, match="does not offer the service"):
+        await ServiceConnection.open(node.service_uri, "/add", "/c")
+    waiting.close()
+    idle.close()
+
+
+async def test_a_node_that_ends_answers_what_is_under_way() -> None:
+    node = SlaveNode("/server", "127.0.0.1", "")
+    await node.start()
+    large = bytes(3_000_000)
+    endpoint = serve(node, lambda call: call.reply(True, large) if call.request else None)
+    busy = await ServiceConnection.open(node.service_uri, "/add", "/c")
+    reading = await ServiceConnection.open(node.service_uri, "/add", "/c")
+    answers = [asyncio.create_task(busy.call(b"")), asyncio.create_task(reading.call(b"1"))]
+    await until(lambda: endpoint.calls == 2)
+    await node.close()
+    assert await answers[0] == (False, b"service [/add] is no longer offered by [/server]")
+    assert await answers[1] == (True, large)
+    busy.close()
+    reading.close()
+
+
+async def test_a_service_is_served_once(node: SlaveNode) -> None:
+    serve(node, add)
+    with pytest.raises(ValueError, match="/server serves /add already"):
+        serve(node, add)
+    node.remove_service("/none")
+
+
+async def test_junk_instead_of_a_request_hurts_nobody_else(node: SlaveNode) -> None:
+    serve(node, echo)
+    good = await ServiceConnection.open(node.service_uri, "/add", "/c")
+    junk = await RawClient.call(node)
+    await junk.header()
+    await junk.send(b"GET / HTTP/1.0\r\n\r\n")  # a length of 542 MB
+    ok, text = await junk.reply()
+    assert not ok
+    assert b"exceeds the limit" in text
+    junk.close()
+    assert await good.call(b"x") == (True, b"x")
+    good.close()
+
+
+async def test_the_server_that_does_not_speak_is_an_error() -> None:
+    async def slam(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.read(10)
+        writer.close()
+
+    server = await asyncio.start_server(slam, "127.0.0.1", 0)
+    uri = f"rosrpc://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    with pytest.raises((RemoteProtocolError, UnreachableError)):
+        await ServiceConnection.open(uri, "/add", "/c")
+    server.close()
+    await server.wait_closed()

@@ -1,0 +1,129 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.core.errors import StartError
+from rmpa.ros.http.client import call, call_api
+from rmpa.ros.node.publication import Publication
+from rmpa.ros.node.slave_node import SlaveNode
+from rmpa.ros.node.subscription import Subscription
+from rmpa.ros.wire.tcpros import frame_message
+from rmpa.ros.wire.xmlrpc import RosFault
+from tests.ros.node.peers import STRING, RawSubscriber, until
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+
+@pytest.fixture
+async def node() -> AsyncIterator[SlaveNode]:
+    made = SlaveNode("/p", "127.0.0.1", "http://127.0.0.1:11311/")
+    await made.start()
+    yield made
+    await made.close()
+
+
+async def test_a_topic_is_found_and_served(node: SlaveNode) -> None:
+    publication = Publication("/t", "/p", STRING)
+    node.add_publication(publication)
+    reply = await call_api(node.uri, "requestTopic", "/s", "/t", [["UDPROS"], ["TCPROS"]])
+    assert reply.code == 1
+    assert isinstance(reply.value, list)
+    protocol, host, port = reply.value
+    assert (protocol, host) == ("TCPROS", "127.0.0.1")
+    assert isinstance(port, int)
+    link = await RawSubscriber.connect(("127.0.0.1", port))
+    await link.header()
+    assert await call(node.uri, "getBusInfo", "/s") == [
+        1,
+        "bus info",
+        [[1, "/s", "o", "TCPROS", "/t", True, publication.connections()[0].info]],
+    ]
+    link.close()
+
+
+async def test_the_uri_bears_the_advertised_host() -> None:
+    node = SlaveNode("/p", "127.0.0.1", "", advertised_host="robot.local")
+    await node.start()
+    node.add_publication(Publication("/t", "/p", STRING))
+    assert node.uri.startswith("http://robot.local:")
+    assert node.uri.endswith("/")
+    assert node.address_of("/t") == ("robot.local", node._tcpros.address[1])
+    await node.close()
+
+
+async def test_a_topic_is_published_once(node: SlaveNode) -> None:
+    node.add_publication(Publication("/t", "/p"))
+    with pytest.raises(ValueError, match="/p publishes /t already"):
+        node.add_publication(Publication("/t", "/p"))
+    assert node.publications() == [("/t", "*")]
+
+
+async def test_a_removed_topic_is_closed_and_unknown(node: SlaveNode) -> None:
+    node.add_publication(Publication("/t", "/p", STRING))
+    link = await RawSubscriber.connect(node._tcpros.address)
+    await link.header()
+    node.remove_publication("/t")
+    node.remove_publication("/t")
+    assert await link.ended()
+    assert (await call_api(node.uri, "requestTopic", "/s", "/t", [["TCPROS"]])).code == -1
+    link.close()
+
+
+async def test_updates_reach_subscriptions_and_owner() -> None:
+    told: list[object] = []
+
+    def follow(key: str, value: object) -> bool:
+        told.append((key, value))
+        return True
+
+    node = SlaveNode(
+        "/s",
+        "127.0.0.1",
+        "",
+        on_shutdown=told.append,
+        on_publisher_update=lambda topic, uris: told.append((topic, list(uris))),
+        on_param_update=follow,
+    )
+    source = SlaveNode("/p", "127.0.0.1", "")
+    await node.start()
+    await source.start()
+    publication = Publication("/t", "/p", STRING)
+    source.add_publication(publication)
+    got: list[bytes] = []
+    node.add_subscription(Subscription("/t", "/s", on_message=lambda _, framed: got.append(bytes(framed))))
+    await call(node.uri, "publisherUpdate", "/master", "/t", [source.uri])
+    await until(lambda: publication.subscribers)
+    publication.publish_framed(frame_message(b"hello"))
+    await until(lambda: got == [b"\x05\x00\x00\x00hello"])
+    assert node.subscriptions() == [("/t", "*")]
+    assert [c.direction for c in node.connections()] == ["i"]
+    assert await call(node.uri, "paramUpdate", "/master", "/a/", 1) == [1, "", 0]
+    assert await call(node.uri, "shutdown", "/master", "replaced") == [1, "shutdown", 0]
+    assert told == [("/t", [source.uri]), ("/a", 1), "replaced"]
+    await node.remove_subscription("/t")
+    await until(lambda: not publication.subscribers)
+    await node.close()
+    await source.close()
+
+
+async def test_an_unknown_method_is_a_fault(node: SlaveNode) -> None:
+    with pytest.raises(RosFault, match="/p has no method getNothing"):
+        await call(node.uri, "getNothing", "/c")
+
+
+async def test_two_hundred_nodes_in_one_process() -> None:
+    nodes = [SlaveNode(f"/n{n}", "127.0.0.1", "") for n in range(200)]
+    for node in nodes:
+        await node.start()
+    assert len({node.uri for node in nodes}) == 200
+    for node in nodes:
+        await node.close()
+
+
+async def test_a_port_in_use_is_a_clear_error_and_leaves_nothing_open(node: SlaveNode) -> None:
+    port = int(node.uri.rsplit(":", 1)[1].strip("/"))
+    with pytest.raises(StartError, match=f"port {port} is already in use"):
+        await SlaveNode("/q", "127.0.0.1", "", port=port).start()

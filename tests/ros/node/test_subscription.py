@@ -1,0 +1,542 @@
+from __future__ import annotations
+
+import socket
+import struct
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.core import limits
+from rmpa.ros.node.subscription import PublisherConnection, Subscription
+from rmpa.ros.wire.tcpros import TopicDescription, encode_header, frame_message, publisher_header
+from tests.ros.node.peers import MD5, STRING, RawPublisher, until
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Mapping
+
+    from rmpa.ros.node.subscription import PartsTaker
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "TCPROS_RETRY_FIRST", 0.001)
+    monkeypatch.setattr(limits, "TCPROS_RETRY_MAX", 0.01)
+
+
+@pytest.fixture
+async def publisher() -> AsyncIterator[RawPublisher]:
+    async with RawPublisher() as made:
+        yield made
+
+
+class Said:
+    """One connection to one publisher, and what it said."""
+
+    def __init__(self, uri: str, *, on_parts: PartsTaker | None = None, **options: str) -> None:
+        self.headers: list[Mapping[str, str]] = []
+        self.messages: list[bytes] = []
+        self.refused: list[str] = []
+        self.lost: list[str] = []
+        self.oversized: list[int] = []
+        self.link = PublisherConnection(
+            "/t",
+            uri,
+            "/s",
+            on_header=self.headers.append,
+            on_message=lambda framed: self.messages.append(bytes(framed)),
+            on_parts=on_parts,
+            on_refused=self.refused.append,
+            on_lost=self.lost.append,
+            on_oversized=self.oversized.append,
+            type_name=options.get("type_name", "*"),
+            md5sum=options.get("md5sum", "*"),
+        )
+        self.link.start()
+
+    async def close(self) -> None:
+        self.link.close()
+        await self.link.closed()
+
+
+@pytest.mark.trap(3, 11)
+async def test_it_asks_for_tcpros_only_and_sends_its_header_at_once(publisher: RawPublisher) -> None:
+    said = Said(publisher.uri)
+    link, fields = await publisher.serve()
+    assert publisher.asked == [("/s", "/t", [["TCPROS"]])]
+    assert fields == {"callerid": "/s", "md5sum": "*", "tcp_nodelay": "1", "topic": "/t", "type": "*"}
+    await until(lambda: said.headers)
+    assert said.headers[0]["message_definition"] == "string data\n"
+    await said.close()
+    link.close()
+
+
+@pytest.mark.trap(8)
+async def test_header_and_messages_in_one_segment_or_byte_by_byte(publisher: RawPublisher) -> None:
+    wire = encode_header(publisher_header("/t", "/p", STRING)) + frame_message(b"one") + frame_message(b"")
+    for chunk in (len(wire), 1):
+        said = Said(publisher.uri)
+        link = await publisher.accept()
+        await link.header()
+        for start in range(0, len(wire), chunk):
+            await link.send(wire[start : start + chunk])
+        await until(lambda: len(said.messages) == 2)  # noqa: B023 - awaited within the turn
+        assert said.messages == [b"\x03\x00\x00\x00one", b"\x00\x00\x00\x00"]
+        await said.close()
+        link.close()
+
+
+async def test_large_messages_come_whole(publisher: RawPublisher) -> None:
+    said = Said(publisher.uri)
+    link, _ = await publisher.serve()
+    payloads = [bytes([n]) * 1_000_000 for n in range(5)]
+    for payload in payloads:
+        await link.send(frame_message(payload))
+    await until(lambda: len(said.messages) == 5)
+    assert [m[4:] for m in said.messages] == payloads
+    connection = said.link.connection()
+    assert (connection.messages, connection.bytes, connection.connected) == (5, 5_000_020, True)
+    assert (connection.direction, connection.other) == ("i", publisher.uri)
+    await said.close()
+    link.close()
+
+
+@pytest.mark.trap(14, 17)
+async def test_a_lost_publisher_is_found_again_and_half_a_message_is_dropped(publisher: RawPublisher) -> None:
+    said = Said(publisher.uri)
+    link, _ = await publisher.serve()
+    await link.send(frame_message(b"whole") + b"\x10\x00\x00\x00half")
+    link.close()
+    again, _ = await publisher.serve()
+    await again.send(frame_message(b"after"))
+    await until(lambda: len(said.messages) == 2)
+    assert [m[4:] for m in said.messages] == [b"whole", b"after"]
+    assert said.lost == ["the publisher closed the connection"]
+    assert len(said.headers) == 2
+    await said.close()
+    again.close()
+
+
+async def test_an_unreachable_publisher_is_tried_for_ever() -> None:
+    async with RawPublisher() as gone:
+        uri = gone.uri
+    said = Said(uri)
+    await until(lambda: len(said.lost) > 5)
+    assert f"no XML-RPC server answers at {uri}" in said.lost[0]
+    assert not said.refused
+    await said.close()
+
+
+@pytest.mark.trap(21)
+@pytest.mark.parametrize(
+    "answer",
+    [
+        [-1, "Not a publisher of [/t]", []],
+        [0, "no supported protocol", []],
+        [1, "ok", []],
+        [1, "ok", ["TCPROS", "127.0.0.1", "80"]],
+        [1, "ok", ["TCPROS", "127.0.0.1", 70000]],
+        [1, "ok", ["UDPROS", "127.0.0.1", 80]],
+        [1, "ok"],
+        "nonsense",
+    ],
+)
+async def test_a_publisher_that_is_not_ready_is_asked_again(
+    publisher: RawPublisher, answer: list[object] | str
+) -> None:
+    publisher.answer = answer  # type: ignore[assignment]  # what peers send has any shape
+    said = Said(publisher.uri)
+    await until(lambda: len(said.lost) > 2)
+    publisher.answer = None
+    link, _ = await publisher.serve()
+    await until(lambda: said.headers)
+    await said.close()
+    link.close()
+
+
+@pytest.mark.trap(15)
+async def test_an_error_header_is_final(publisher: RawPublisher) -> None:
+    said = Said(publisher.uri)
+    link = await publisher.accept()
+    await link.header()
+    await link.send(encode_header({"error": "go away"}) + b"junk behind")
+    await until(lambda: said.refused)
+    await until(lambda: said.link.ended)
+    assert (said.refused, said.lost, said.messages) == (["go away"], [], [])
+    assert said.link.refused == "go away"
+    await said.close()
+    link.close()
+
+
+@pytest.mark.trap(1)
+async def test_a_publisher_with_another_md5_sum_is_not_believed(publisher: RawPublisher) -> None:
+    publisher.description = TopicDescription("std_msgs/Int32", "0" * 32, "int32 data")
+    said = Said(publisher.uri, type_name="std_msgs/String", md5sum=MD5)
+    link, _ = await publisher.serve()
+    await link.send(frame_message(b"poison"))
+    await until(lambda: said.refused)
+    assert f"not [std_msgs/String/{MD5}]" in said.refused[0]
+    assert said.messages == []
+    await said.close()
+    link.close()
+
+
+@pytest.mark.parametrize("junk", [b"GET / HTTP/1.1\r\n", struct.pack("<II", 9, 5) + b"topic"])
+async def test_a_malformed_reply_is_a_loss(publisher: RawPublisher, junk: bytes) -> None:
+    said = Said(publisher.uri)
+    link = await publisher.accept()
+    await link.send(junk)
+    await until(lambda: said.lost)
+    assert "connection header" in said.lost[0]
+    assert not said.headers
+    await said.close()
+    link.close()
+
+
+@pytest.mark.trap(17)
+async def test_what_cannot_be_a_length_ends_the_connection(publisher: RawPublisher) -> None:
+    said = Said(publisher.uri)
+    link, _ = await publisher.serve()
+    await link.send(frame_message(b"before") + b"\xff\xff\xff\xff")
+    await until(lambda: said.lost)
+    assert "a message's length of 4294967295 bytes cannot be" in said.lost[0]
+    assert [m[4:] for m in said.messages] == [b"before"]
+    assert said.oversized == []
+    assert said.link.malformed
+    await said.close()
+    link.close()
+
+
+@pytest.mark.trap(17)
+@pytest.mark.parametrize("parts", [False, True])
+@pytest.mark.parametrize("chunk", [1, 7, 1000, 1 << 20])
+async def test_a_message_beyond_the_limit_is_left_out_and_others_come(
+    publisher: RawPublisher, monkeypatch: pytest.MonkeyPatch, parts: bool, chunk: int
+) -> None:
+    monkeypatch.setattr(limits, "TCPROS_MESSAGE_MAX", 1000)
+    monkeypatch.setattr(limits, "CUT_THROUGH_BYTES", 500)
+    said = InParts(publisher.uri) if parts else Said(publisher.uri)
+    link, _ = await publisher.serve()
+    sent = [b"one", bytes(1001), b"two", bytes(700), bytes(5000), bytes(1002), bytes(1000), b"3", bytes(9000), b""]
+    wire = b"".join(len(body).to_bytes(4, "little") + body for body in sent)
+    for start in range(0, len(wire), chunk):
+        await link.send(wire[start : start + chunk])
+    wanted = [body for body in sent if len(body) <= 1000]
+    await until(lambda: len(said.messages) == len(wanted))
+    assert [m[4:] for m in said.messages] == wanted
+    assert said.oversized == [1001, 5000, 1002, 9000]
+    connection = said.link.connection()
+    assert (connection.messages, connection.bytes) == (len(wanted), len(wire))
+    assert not said.lost
+    await said.close()
+    link.close()
+
+
+async def test_a_message_beyond_the_limit_takes_no_memory(
+    publisher: RawPublisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "TCPROS_MESSAGE_MAX", 1 << 20)
+    said = Said(publisher.uri)
+    link, _ = await publisher.serve()
+    await link.send((64 << 20).to_bytes(4, "little"))
+    for _ in range(64):
+        await link.send(bytes(1 << 20))
+    await link.send(frame_message(b"behind"))
+    await until(lambda: said.messages)
+    assert len(said.link._stream._buffer) <= 8 << 20  # type: ignore[union-attr] # it is connected
+    await said.close()
+    link.close()
+
+
+@pytest.mark.trap(17)
+async def test_a_publisher_that_goes_in_the_middle_of_such_a_message_is_found_again(
+    publisher: RawPublisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "TCPROS_MESSAGE_MAX", 1000)
+    said = Said(publisher.uri)
+    link, _ = await publisher.serve()
+    await link.send((1001).to_bytes(4, "little") + bytes(500))
+    await until(lambda: said.oversized)
+    link.close()
+    again, _ = await publisher.serve()
+    await again.send(frame_message(b"after"))
+    await until(lambda: said.messages)
+    assert [m[4:] for m in said.messages] == [b"after"]
+    await said.close()
+    again.close()
+
+
+@pytest.mark.trap(18)
+async def test_one_that_never_answers_is_given_up(publisher: RawPublisher, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "TCPROS_HANDSHAKE_TIMEOUT", 0.05)
+    said = Said(publisher.uri)
+    link = await publisher.accept()
+    await until(lambda: said.lost)
+    assert "no header from the publisher" in said.lost[0]
+    await said.close()
+    link.close()
+
+
+async def test_closed_from_within_a_message_no_other_comes(publisher: RawPublisher) -> None:
+    got: list[bytes] = []
+
+    def take(framed: memoryview) -> None:
+        got.append(bytes(framed))
+        connection.close()
+
+    connection = PublisherConnection("/t", publisher.uri, "/s", on_message=take)
+    connection.start()
+    link, _ = await publisher.serve()
+    await link.send(frame_message(b"one") + frame_message(b"two"))
+    await until(lambda: connection.ended)
+    assert got == [b"\x03\x00\x00\x00one"]
+    link.close()
+
+
+class Followed:
+    def __init__(self, own_uri: str = "") -> None:
+        self.messages: list[tuple[str, bytes]] = []
+        self.refused: list[str] = []
+        self.subscription = Subscription(
+            "/t",
+            "/s",
+            on_message=lambda link, framed: self.messages.append((link.uri, bytes(framed[4:]))),
+            on_refused=lambda _, text: self.refused.append(text),
+            own_uri=own_uri,
+        )
+
+    async def close(self) -> None:
+        self.subscription.close()
+        await self.subscription.closed()
+
+
+@pytest.mark.trap(16)
+async def test_a_subscription_follows_the_list_of_publishers() -> None:
+    followed = Followed(own_uri="http://127.0.0.1:1/")
+    async with RawPublisher() as one, RawPublisher() as two:
+        followed.subscription.update([one.uri, two.uri, two.uri, "http://127.0.0.1:1/"])
+        first, second = (await one.serve())[0], (await two.serve())[0]
+        await first.send(frame_message(b"1"))
+        await second.send(frame_message(b"2"))
+        await until(lambda: len(followed.messages) == 2)
+        assert set(followed.messages) == {(one.uri, b"1"), (two.uri, b"2")}
+        assert followed.subscription.publishers == 2
+        followed.subscription.update([two.uri])
+        assert await first.ended()
+        followed.subscription.update([one.uri], keep=True)
+        third, _ = await one.serve()
+        await second.send(frame_message(b"still"))
+        await until(lambda: len(followed.messages) == 3)
+        assert len(one.asked) == 2
+        assert len(two.asked) == 1
+        for link in (first, second, third):
+            link.close()
+        await followed.close()
+
+
+@pytest.mark.trap(15)
+async def test_a_publisher_that_refused_is_asked_again_when_it_is_named_again() -> None:
+    followed = Followed()
+    async with RawPublisher() as one:
+        followed.subscription.update([one.uri])
+        link = await one.accept()
+        await link.header()
+        await link.send(encode_header({"error": "not yet"}))
+        await until(lambda: followed.refused == ["not yet"])
+        followed.subscription.update([one.uri])
+        again, _ = await one.serve()
+        await again.send(frame_message(b"now"))
+        await until(lambda: followed.messages == [(one.uri, b"now")])
+        link.close()
+        again.close()
+        await followed.close()
+
+
+@pytest.mark.trap(18)
+async def test_half_a_message_holds_nobody_else_up_and_the_kernel_watches(publisher: RawPublisher) -> None:
+    async with RawPublisher() as other:
+        stuck, fine = Said(publisher.uri), Said(other.uri)
+        half, _ = await publisher.serve()
+        whole, _ = await other.serve()
+        await half.send(frame_message(b"first") + b"\x10\x00\x00\x00half")
+        await until(lambda: stuck.messages)
+        for _ in range(3):
+            await whole.send(frame_message(b"whole"))
+        await until(lambda: len(fine.messages) == 3)
+        assert len(stuck.messages) == 1
+        assert stuck.link._stream is not None
+        assert isinstance(stuck.link._stream._sock, socket.socket)
+        assert stuck.link._stream._sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
+        await half.send(b" a minute ago")
+        await stuck.close()
+        await fine.close()
+        half.close()
+        whole.close()
+
+
+# --- messages in parts ------------------------------------------------------------------------------------------
+
+LARGE = bytes(range(256)) * (limits.CUT_THROUGH_BYTES // 256 + 40)
+
+
+class InParts(Said):
+    """A connection that wants large messages in parts."""
+
+    def __init__(self, uri: str) -> None:
+        self.sizes: list[int] = []
+        self.parts: list[int] = []
+        self.aborts = 0
+        self.half = b""
+        super().__init__(uri, on_parts=self)
+
+    def begin(self, size: int) -> None:
+        assert not self.half
+        self.sizes.append(size)
+
+    def part(self, part: memoryview) -> None:
+        self.half += part
+        self.parts.append(len(part))
+        assert len(self.half) <= self.sizes[-1]
+        if len(self.half) == self.sizes[-1]:
+            self.messages.append(self.half)
+            self.half = b""
+
+    def abort(self) -> None:
+        self.aborts += 1
+        self.half = b""
+
+
+async def test_only_above_the_limit_a_message_comes_in_parts(publisher: RawPublisher) -> None:
+    said = InParts(publisher.uri)
+    link, _ = await publisher.serve()
+    payloads = [bytes(limits.CUT_THROUGH_BYTES - 4), bytes(limits.CUT_THROUGH_BYTES - 3), LARGE, b"", b"small"]
+    for payload in payloads:
+        await link.send(frame_message(payload))
+    await until(lambda: len(said.messages) == 5)
+    assert said.messages == [frame_message(payload) for payload in payloads]
+    # What came whole with one read is whole; else it is handed on as it comes.
+    assert all(size > limits.CUT_THROUGH_BYTES for size in said.sizes)
+    connection = said.link.connection()
+    assert (connection.messages, connection.bytes) == (5, sum(len(payload) + 4 for payload in payloads))
+    await said.close()
+    link.close()
+
+
+async def test_the_first_bytes_are_handed_on_before_the_last_ones_were_sent(publisher: RawPublisher) -> None:
+    said = InParts(publisher.uri)
+    link, _ = await publisher.serve()
+    wire = frame_message(LARGE)
+    await link.send(frame_message(b"one") + wire[:3])
+    await until(lambda: said.messages)
+    assert said.sizes == []
+    await link.send(wire[3:4])
+    await until(lambda: said.parts == [4])
+    await link.send(wire[4:1000])
+    await until(lambda: sum(said.parts) == 1000)
+    assert said.link.messages == 1
+    await link.send(wire[1000:] + frame_message(b"two"))
+    await until(lambda: len(said.messages) == 3)
+    assert [m[4:] for m in said.messages] == [b"one", LARGE, b"two"]
+    assert said.aborts == 0
+    await said.close()
+    link.close()
+
+
+@pytest.mark.parametrize("chunk", [1, 3, 4097, 100_003])
+async def test_any_pieces_make_the_same_messages(publisher: RawPublisher, chunk: int) -> None:
+    """Fed by hand: a socket would join the pieces again."""
+    said = InParts(publisher.uri)
+    link, _ = await publisher.serve()
+    await until(lambda: said.headers)
+    payloads = [b"one", b"", LARGE, LARGE[::-1], b"two", bytes(limits.CUT_THROUGH_BYTES - 3), b""]
+    wire = b"".join(map(frame_message, payloads))
+    assert said.link._stream is not None
+    if chunk == 1:
+        wire = wire[: len(frame_message(b"one")) + 4 + len(frame_message(LARGE))]
+        payloads = payloads[:3]
+    for start in range(0, len(wire), chunk):
+        said.link._stream.feed(wire[start : start + chunk])
+    assert [m[4:] for m in said.messages] == payloads
+    assert said.link.messages == len(payloads)
+    assert said.link.bytes == len(wire)
+    await said.close()
+    link.close()
+
+
+async def test_large_messages_in_one_read_with_small_ones_around_them(publisher: RawPublisher) -> None:
+    said = InParts(publisher.uri)
+    link, _ = await publisher.serve()
+    await until(lambda: said.headers)
+    payloads = [b"a", LARGE, b"b", b"c", LARGE, LARGE, b"d"]
+    assert said.link._stream is not None
+    said.link._stream.feed(b"".join(map(frame_message, payloads)))
+    assert [m[4:] for m in said.messages] == payloads
+    await said.close()
+    link.close()
+
+
+@pytest.mark.trap(14, 17)
+async def test_a_publisher_lost_in_the_middle_of_parts_is_an_abort_and_found_again(publisher: RawPublisher) -> None:
+    said = InParts(publisher.uri)
+    link, _ = await publisher.serve()
+    await link.send(frame_message(LARGE) + frame_message(LARGE)[:5000])
+    await until(lambda: sum(said.parts) > len(LARGE) + 4)
+    link.close()
+    again, _ = await publisher.serve()
+    await again.send(frame_message(b"after") + frame_message(LARGE))
+    await until(lambda: len(said.messages) == 3)
+    assert [m[4:] for m in said.messages] == [LARGE, b"after", LARGE]
+    assert (said.aborts, len(said.lost), said.link.messages) == (1, 1, 3)
+    await said.close()
+    assert said.aborts == 1
+    again.close()
+
+
+async def test_left_in_the_middle_of_parts_is_an_abort_too(publisher: RawPublisher) -> None:
+    said = InParts(publisher.uri)
+    link, _ = await publisher.serve()
+    await link.send(frame_message(LARGE)[:5000])
+    await until(lambda: sum(said.parts) == 5000)
+    said.link.close()
+    assert (said.aborts, said.lost) == (1, [])
+    await said.close()
+    assert said.aborts == 1
+    link.close()
+
+
+@pytest.mark.parametrize("when", ["begin", "part", "end"])
+async def test_closed_from_within_a_part_no_other_comes(publisher: RawPublisher, when: str) -> None:
+    class Closing(InParts):
+        def begin(self, size: int) -> None:
+            super().begin(size)
+            if when == "begin":
+                self.link.close()
+
+        def part(self, part: memoryview) -> None:
+            super().part(part)
+            if when == "part" or not self.half:
+                self.link.close()
+
+    said = Closing(publisher.uri)
+    link, _ = await publisher.serve()
+    await until(lambda: said.headers)
+    assert said.link._stream is not None
+    stream, wire = said.link._stream, frame_message(LARGE)
+    stream.feed(wire[:5000])
+    stream.feed(wire[5000:] + frame_message(b"two"))
+    assert said.messages == ([wire] if when == "end" else [])
+    assert said.parts == {"begin": [], "part": [5000], "end": [5000, len(wire) - 5000]}[when]
+    assert said.aborts == (when != "end")
+    await said.close()
+    link.close()
+
+
+@pytest.mark.trap(17)
+async def test_a_claim_beyond_the_limit_begins_no_parts(publisher: RawPublisher) -> None:
+    said = InParts(publisher.uri)
+    link, _ = await publisher.serve()
+    await link.send(frame_message(LARGE) + b"\xff\xff\xff\xff")
+    await until(lambda: said.lost)
+    assert said.sizes in ([], [len(LARGE) + 4])
+    assert (said.aborts, said.half) == (0, b"")
+    await said.close()
+    link.close()

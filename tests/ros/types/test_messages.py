@@ -1,0 +1,191 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rmpa.ros.types.definitions import SEPARATOR, known_types
+from rmpa.ros.types.messages import MessageError, MessageType, Plain
+
+JOY: Plain = {
+    "header": {"seq": 3, "stamp": {"secs": 1, "nsecs": 500_000_000}, "frame_id": "pad"},
+    "axes": [0.5, -1.0],
+    "buttons": [1, 0, 1],
+}
+JOY_BYTES = bytes.fromhex(
+    "03000000 01000000 0065cd1d 03000000 706164 02000000 0000003f 000080bf 03000000 010000000000000001000000"
+)
+
+
+def test_these_bytes() -> None:
+    kind = MessageType("sensor_msgs/Joy")
+    assert kind.serialize(kind.make(JOY)) == JOY_BYTES
+    assert kind.to_plain(kind.deserialize(JOY_BYTES)) == JOY
+
+
+def test_a_learnt_type_reads_the_same() -> None:
+    known = MessageType("sensor_msgs/Joy")
+    learnt = MessageType.learn(known.name, known.definition, known.md5sum)
+    assert learnt.to_plain(learnt.deserialize(JOY_BYTES)) == JOY
+    assert learnt.serialize(learnt.make(JOY)) == JOY_BYTES
+    assert MessageType.learn(known.name, known.definition) is learnt
+
+
+def test_a_learnt_type_with_all_there_is() -> None:
+    definition = (
+        "int32 lower=1\nstring TEXT=a'\"\\ # no comment\ntime[] times\nduration d\nbyte b\nchar c\nbool[2] flags\n"
+        f"string[] texts\nInner[] inner\nuint8[] data\nint64 class\nint8 self\n{SEPARATOR}\nMSG: my_msgs/Inner\n"
+        "float32 x # note\n"
+    )
+    kind = MessageType.learn("my_msgs/All", definition)
+    values: Plain = {
+        "times": [{"secs": 1, "nsecs": 2}],
+        "d": {"secs": -1, "nsecs": 5},
+        "b": 7,
+        "c": 8,
+        "flags": [True, False],
+        "texts": ["a", "ü"],
+        "inner": [{"x": 1.5}, {"x": 2.5}],
+        "data": [1, 2, 255],
+        "class": -5,
+        "self": -1,
+    }
+    raw = kind.serialize(kind.make(values))
+    assert kind.to_plain(kind.deserialize(raw)) == values
+    assert kind.to_plain(kind.make())["flags"] == [False, False]
+
+
+@pytest.mark.parametrize("name", known_types())
+def test_every_type_that_comes_with_us_can_be_made_and_read(name: str) -> None:
+    kind = MessageType(name)
+    message = kind.make()
+    assert kind.to_plain(kind.deserialize(kind.serialize(message))) == kind.to_plain(message)
+
+
+@pytest.mark.parametrize(
+    ("values", "plain"),
+    [
+        ("hello", {"data": "hello"}),
+        (["hello"], {"data": "hello"}),
+        ({"data": 7}, {"data": "7"}),
+        (None, {"data": ""}),
+    ],
+)
+def test_short_ways_to_write_a_message(values: Plain, plain: dict[str, Plain]) -> None:
+    kind = MessageType("std_msgs/String")
+    assert kind.to_plain(kind.make(values)) == plain
+
+
+def test_times_may_be_seconds_and_byte_arrays_text() -> None:
+    kind = MessageType("std_msgs/Header")
+    assert kind.to_plain(kind.make({"stamp": 1.25}))["stamp"] == {"secs": 1, "nsecs": 250_000_000}
+    array = MessageType("std_msgs/UInt8MultiArray")
+    assert array.to_plain(array.make({"data": "ab"}))["data"] == [97, 98]
+
+
+@pytest.mark.parametrize(
+    ("values", "error"),
+    [
+        ({"axs": []}, "sensor_msgs/Joy has no field 'axs'; it has header, axes, buttons"),
+        ({"header": {"stmp": 1}}, "header has no field 'stmp'"),
+        ({"axes": 1}, "axes is a list of float32, not 1"),
+        ({"axes": ["x"]}, "axes is a float32, not 'x'"),
+        ({"buttons": [1.5]}, "buttons is a int32, not 1.5"),
+        ({"buttons": [1 << 31]}, "buttons: 2147483648 does not fit int32"),
+        ({"header": {"stamp": "now"}}, "header.stamp is a time"),
+        ({"header": {"frame_id": [1]}}, "header.frame_id is a string, not [1]"),
+        ([1, 2], "sensor_msgs/Joy has 3 fields, not 2"),
+        (7, "sensor_msgs/Joy is made of the fields header, axes, buttons, not of 7"),
+    ],
+)
+def test_values_that_do_not_fit_are_named(values: Plain, error: str) -> None:
+    with pytest.raises(MessageError) as caught:
+        MessageType("sensor_msgs/Joy").make(values)
+    assert error in str(caught.value)
+
+
+def test_a_program_may_give_arrays_bytes_and_messages() -> None:
+    image, pixels = MessageType("sensor_msgs/Image"), np.arange(6, dtype=np.uint8).reshape(2, 3)
+    raw = bytes(range(6))
+    for data in (raw, bytearray(raw), memoryview(raw), tuple(raw), pixels, np.arange(6)):
+        made = image.make({"data": data})
+        assert image.to_plain(image.deserialize(image.serialize(made)))["data"] == list(range(6))
+    made = image.make({"data": pixels})
+    pixels[:] = 9  # the caller's own, again
+    assert list(made.data) == list(range(6))
+    scan = MessageType("sensor_msgs/LaserScan")
+    made = scan.make({"header": made.header, "ranges": np.array([1.5, np.inf]), "angle_min": np.float32(0.5)})
+    assert made.ranges.dtype == np.float32
+    assert made.angle_min == 0.5
+    again = scan.make({"header": {"stamp": made.header.stamp}, "intensities": made.ranges})
+    assert list(scan.deserialize(scan.serialize(again)).intensities) == [1.5, np.inf]
+    twist, vector = MessageType("geometry_msgs/Twist"), MessageType("geometry_msgs/Vector3")
+    assert twist.to_plain(twist.make({"linear": vector.make([1, 2, 3])}))["linear"] == {"x": 1.0, "y": 2.0, "z": 3.0}
+    assert MessageType("std_msgs/Int32").make({"data": np.int64(5)}).data == 5
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "error"),
+    [
+        ("sensor_msgs/Image", {"data": np.array([256])}, "data: 256 to 256 do not fit uint8"),
+        ("sensor_msgs/Image", {"data": np.array([1.0])}, "data is a list of uint8, not of float64"),
+        ("sensor_msgs/LaserScan", {"ranges": b"abcd"}, "ranges is a list of float32, not b'abcd'"),
+        ("sensor_msgs/LaserScan", {"ranges": np.array(["a"])}, "ranges is a list of float32, not of <U1"),
+        ("geometry_msgs/PoseWithCovariance", {"covariance": np.eye(5)}, "covariance has 36 elements, not 25"),
+        ("sensor_msgs/LaserScan", {"ranges": bytes(500_000)}, "…"),
+    ],
+)
+def test_what_a_program_gives_that_does_not_fit(kind: str, values: Any, error: str) -> None:
+    with pytest.raises(MessageError) as caught:
+        MessageType(kind).make(values)
+    assert error in str(caught.value)
+    assert len(str(caught.value)) < 300
+
+
+def test_fixed_arrays_have_their_size() -> None:
+    kind = MessageType("geometry_msgs/PoseWithCovariance")
+    assert kind.to_plain(kind.make())["covariance"] == [0.0] * 36
+    with pytest.raises(MessageError, match="covariance has 36 elements, not 1"):
+        kind.make({"covariance": [1.0]})
+
+
+@pytest.mark.parametrize("raw", [b"", JOY_BYTES[:-1], JOY_BYTES + b"x", b"\xff" * 40])
+def test_bytes_that_are_no_message(raw: bytes) -> None:
+    with pytest.raises(MessageError, match="bytes are not a sensor_msgs/Joy"):
+        MessageType("sensor_msgs/Joy").deserialize(raw)
+
+
+def test_an_object_that_is_no_message() -> None:
+    with pytest.raises(MessageError, match="cannot serialize a sensor_msgs/Joy"):
+        MessageType("sensor_msgs/Joy").serialize("joy")
+
+
+def test_sums_are_those_of_rosbags() -> None:
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    compared = 0
+    for name in known_types():
+        inner = name.replace("/", "/msg/")
+        if inner in store.fielddefs:
+            assert store.generate_msgdef(inner)[1] == MessageType(name).md5sum, name
+            compared += 1
+    assert compared > 150
+
+
+def test_the_agents_part_of_ros_starts_without_numpy() -> None:
+    program = (
+        "import pkgutil, sys, importlib, rmpa.ros, rmpa.ros.node\n"
+        "for room in (rmpa.ros, rmpa.ros.node):\n"
+        "    for module in pkgutil.iter_modules(room.__path__, room.__name__ + '.'):\n"
+        "        if module.name != 'rmpa.ros.types.typestore':\n"  # what the first message imports
+        "            importlib.import_module(module.name)\n"
+        "from rmpa.ros.types.messages import MessageType\n"
+        "MessageType('sensor_msgs/Joy').describe()\n"
+        "print(sorted({'numpy', 'rosbags', 'rich'} & sys.modules.keys()))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout == "[]\n"

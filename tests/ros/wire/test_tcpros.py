@@ -1,0 +1,260 @@
+from __future__ import annotations
+
+import re
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rmpa.core import limits
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.ros.wire.tcpros import (
+    MalformedHeader,
+    MalformedStream,
+    TopicDescription,
+    check_publisher,
+    check_request,
+    check_subscriber,
+    decode_header,
+    encode_header,
+    error_header,
+    frame_message,
+    parse_header,
+    printable,
+    publisher_header,
+    split_messages,
+    subscriber_header,
+)
+
+MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
+STRING = TopicDescription("std_msgs/String", MD5, "string data\n")
+GOLDEN = bytes.fromhex("19000000 09000000 746f7069633d2f7461 08000000 6d643573756d3d2a")
+
+
+def field(text: bytes) -> bytes:
+    return struct.pack("<I", len(text)) + text
+
+
+def header(*fields: bytes) -> bytes:
+    body = b"".join(map(field, fields))
+    return struct.pack("<I", len(body)) + body
+
+
+def test_a_header_is_these_bytes() -> None:
+    assert encode_header({"topic": "/ta", "md5sum": "*"}) == (
+        b"\x19\x00\x00\x00" + b"\x08\x00\x00\x00md5sum=*" + b"\x09\x00\x00\x00topic=/ta"
+    )
+    assert parse_header(GOLDEN) == ({"topic": "/ta", "md5sum": "*"}, 29, 4)
+
+
+@pytest.mark.trap(7)
+def test_a_header_is_read_byte_by_byte() -> None:
+    wire = encode_header({"topic": "/ta", "md5sum": "*"}) + b"rest"
+    for end in range(len(wire) - 4):
+        fields, consumed, wanted = parse_header(wire[:end])
+        assert (fields, consumed) == (None, 0)
+        assert end < wanted <= len(wire) - 4
+    assert parse_header(wire)[1] == len(wire) - 4
+
+
+@given(
+    st.dictionaries(
+        st.text(st.characters(exclude_characters="=", exclude_categories=["Cs"]), min_size=1).filter(
+            lambda key: key == key.strip()
+        ),
+        st.text(st.characters(exclude_categories=["Cs"])),
+    )
+)
+def test_any_header_survives_the_wire(fields: dict[str, str]) -> None:
+    wire = encode_header(fields)
+    assert parse_header(wire) == (fields, len(wire), 4)
+
+
+@given(st.binary(max_size=200))
+def test_arbitrary_bytes_are_a_header_or_an_error(data: bytes) -> None:
+    try:
+        fields = decode_header(data)
+    except MalformedHeader:
+        return
+    again = decode_header(encode_header(fields)[4:])
+    assert again == fields
+
+
+@pytest.mark.trap(7)
+def test_a_value_may_hold_equal_signs() -> None:
+    assert decode_header(header(b"message_definition=int32 X=1\n")[4:]) == {"message_definition": "int32 X=1\n"}
+
+
+@pytest.mark.trap(7)
+def test_of_two_fields_with_one_name_the_last_counts() -> None:
+    assert decode_header(header(b"topic=/a", b"topic=/b")[4:]) == {"topic": "/b"}
+
+
+@pytest.mark.trap(7)
+def test_blanks_around_a_name_are_taken_off_and_those_of_the_value_stay() -> None:
+    assert decode_header(header(b" topic = /a")[4:]) == {"topic": " /a"}
+
+
+@pytest.mark.trap(7)
+def test_bytes_that_are_not_utf8_survive() -> None:
+    wire = header(b"message_definition=# 20 \xb0C\n")
+    fields, _, _ = parse_header(wire)
+    assert fields is not None
+    assert encode_header(fields) == wire
+
+
+@pytest.mark.trap(6, 7)
+@pytest.mark.parametrize(
+    ("body", "text"),
+    [
+        (field(b""), "field of length 0"),
+        (field(b"topic"), "without '='"),
+        (b"\x09\x00\x00\x00topic=/", "field of 9 bytes where 7 are left"),
+        (b"\xff\xff\xff\xff", "field of 4294967295 bytes where 0 are left"),
+        (field(b"a=b") + b"\x01\x00", "ends within a length, 2 bytes left over"),
+    ],
+)
+def test_a_malformed_header_is_refused(body: bytes, text: str) -> None:
+    with pytest.raises(MalformedHeader, match=text):
+        decode_header(body)
+
+
+@pytest.mark.trap(6)
+def test_a_header_of_half_a_gigabyte_is_refused_from_its_length_alone() -> None:
+    with pytest.raises(LimitExceeded, match=r"connection header of 542393671 bytes exceeds the limit of 4194304"):
+        parse_header(b"GET ")
+
+
+def test_an_empty_header_has_no_fields() -> None:
+    assert parse_header(bytes(4)) == ({}, 4, 4)
+
+
+def test_messages_are_split_off_and_the_rest_is_left() -> None:
+    wire = frame_message(b"abc") + frame_message(b"") + frame_message(b"defgh")
+    messages, consumed, wanted = split_messages(memoryview(wire[:-1]))
+    assert [bytes(m) for m in messages] == [b"\x03\x00\x00\x00abc", b"\x00\x00\x00\x00"]
+    assert (consumed, wanted) == (11, 9)
+    assert split_messages(memoryview(wire))[1:] == (len(wire), 4)
+
+
+@given(st.lists(st.binary(max_size=20), max_size=8), st.integers(0, 200))
+def test_messages_come_out_however_the_stream_is_cut(payloads: list[bytes], cut: int) -> None:
+    wire = b"".join(map(frame_message, payloads))
+    first, consumed, wanted = split_messages(memoryview(wire[:cut]))
+    rest, _, _ = split_messages(memoryview(wire[consumed:]))
+    assert [bytes(m[4:]) for m in (*first, *rest)] == payloads
+    assert cut >= len(wire) or wanted > min(cut, len(wire)) - consumed
+
+
+def test_a_message_beyond_the_limit_is_refused_behind_those_before_it() -> None:
+    huge = struct.pack("<I", limits.TCPROS_MESSAGE_MAX + 1)
+    messages, consumed, _ = split_messages(memoryview(frame_message(b"ok") + huge))
+    assert (len(messages), consumed) == (1, 6)
+    with pytest.raises(LimitExceeded, match="message of"):
+        split_messages(memoryview(huge))
+
+
+@pytest.mark.parametrize("size", [limits.TCPROS_LENGTH_MAX + 1, (1 << 32) - 1])
+def test_what_cannot_be_a_length_is_told_from_a_message_that_is_too_long(size: int) -> None:
+    with pytest.raises(MalformedStream, match=f"{size} bytes cannot be.*corrupt"):
+        split_messages(memoryview(struct.pack("<I", size)))
+    with pytest.raises(LimitExceeded):
+        split_messages(memoryview(struct.pack("<I", limits.TCPROS_LENGTH_MAX)))
+
+
+SUBSCRIBER = subscriber_header("/t", "/s", type_name="std_msgs/String", md5sum=MD5)
+
+
+@pytest.mark.trap(1, 4)
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({}, None),
+        ({"md5sum": "*"}, None),
+        ({"type": "other_msgs/Type"}, None),  # the type is ignored where the md5 sum matches
+        ({"type": "*"}, None),
+        ({"md5sum": "0" * 32}, r"wants topic /t to have type/md5sum \[std_msgs/String/0{32}\], but publisher \[/p\]"),
+        ({"md5sum": None}, "required field 'md5sum' is missing"),
+        ({"callerid": None}, "required field 'callerid' is missing"),
+        ({"type": None}, None),
+        ({"topic": None}, "neither a 'topic' nor a 'service' field"),
+        ({"topic": "t"}, r"\[/p\] is not a publisher of \[t\]"),
+        ({"topic": "/t/"}, r"\[/p\] is not a publisher of \[/t/\]"),
+        ({"error": "no"}, "an error was sent where a request was expected: no"),
+    ],
+)
+def test_who_may_subscribe(change: dict[str, str | None], error: str | None) -> None:
+    merged = {**SUBSCRIBER, **change}
+    answer = check_subscriber({k: v for k, v in merged.items() if v is not None}, "/t", "/p", STRING)
+    if error is None:
+        assert answer is None
+    else:
+        assert answer is not None
+        assert re.search(error, answer)
+
+
+def test_while_the_type_is_unknown_only_the_rest_is_checked() -> None:
+    assert check_subscriber({**SUBSCRIBER, "md5sum": "0" * 32}, "/t", "/p", None) is None
+    assert check_subscriber({**SUBSCRIBER, "topic": "/u"}, "/t", "/p", None) is not None
+
+
+@pytest.mark.trap(2)
+def test_a_publisher_answers_with_all_fields() -> None:
+    assert publisher_header("/t", "/p", TopicDescription("std_msgs/String", MD5, "string data\n", latching=True)) == {
+        "callerid": "/p",
+        "latching": "1",
+        "md5sum": MD5,
+        "message_definition": "string data\n",
+        "topic": "/t",
+        "type": "std_msgs/String",
+    }
+    assert publisher_header("/t", "/p", STRING)["latching"] == "0"
+
+
+@pytest.mark.trap(2)
+@pytest.mark.parametrize(
+    "description", [TopicDescription("*", MD5, ""), TopicDescription("std_msgs/String", "*", "")]
+)
+def test_a_publisher_never_answers_with_a_wildcard(description: TopicDescription) -> None:
+    with pytest.raises(ValueError, match="cannot have the type"):
+        publisher_header("/t", "/p", description)
+
+
+@pytest.mark.trap(1)
+@pytest.mark.parametrize(
+    ("fields", "error"),
+    [
+        ({"type": "std_msgs/String", "md5sum": MD5}, None),
+        ({"error": "go away\x1b[31m"}, "go away�[31m"),
+        ({"md5sum": MD5}, "required field 'type' is missing in the publisher's reply"),
+        ({"type": "std_msgs/String"}, "required field 'md5sum' is missing in the publisher's reply"),
+        ({"type": "*", "md5sum": MD5}, "the publisher's reply has '*' where a type or md5 sum must be"),
+        ({"type": "a/B", "md5sum": "0"}, f"the publisher has [a/B/0], not [std_msgs/String/{MD5}]"),
+    ],
+)
+def test_whether_a_publisher_is_believed(fields: dict[str, str], error: str | None) -> None:
+    assert check_publisher(fields, "std_msgs/String", MD5) == error
+
+
+def test_a_description_is_read_from_a_reply() -> None:
+    assert TopicDescription.from_header({"type": "a/B", "md5sum": "0", "latching": "1"}) == TopicDescription(
+        "a/B", "0", "", True
+    )
+    assert not TopicDescription.from_header({"latching": "true"}).latching
+
+
+def test_requests_for_services_may_be_answered() -> None:
+    assert check_request({"service": "/s", "md5sum": "*", "callerid": "/c"}) is None
+
+
+def test_what_a_peer_sends_is_safe_to_print() -> None:
+    assert printable("a\nb\x1b\udcff" + "x" * 300) == "a�b��" + "x" * 195 + "…"
+
+
+def test_the_error_header_has_one_field() -> None:
+    assert error_header("no") == {"error": "no"}
+
+
+def test_malformed_headers_are_the_other_sides_fault() -> None:
+    assert issubclass(MalformedHeader, RemoteProtocolError)

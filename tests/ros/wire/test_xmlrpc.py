@@ -1,0 +1,326 @@
+from __future__ import annotations
+
+import contextlib
+import datetime as dt
+import gc
+import math
+import xmlrpc.client
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rmpa.core import limits
+from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
+from rmpa.ros.wire.xmlrpc import (
+    CallReader,
+    RosFault,
+    RosReply,
+    XmlRpcValue,
+    brief,
+    parse_call,
+    parse_response,
+    response_pieces,
+    serialize_call,
+    serialize_fault,
+    serialize_response,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+GOLDEN_CALL = b"""<?xml version='1.0'?>
+<methodCall>
+<methodName>setParam</methodName>
+<params>
+<param>
+<value><string>/n</string></value>
+</param>
+<param>
+<value><struct>
+<member>
+<name>a</name>
+<value><array><data>
+<value><int>-1</int></value>
+<value><double>2.5</double></value>
+<value><boolean>1</boolean></value>
+<value><string></string></value>
+<value><base64>
+eHk=
+</base64></value>
+<value><dateTime.iso8601>20200102T03:04:05</dateTime.iso8601></value>
+</data></array></value>
+</member>
+<member>
+<name>e</name>
+<value><struct>
+</struct></value>
+</member>
+</struct></value>
+</param>
+</params>
+</methodCall>
+"""
+GOLDEN_PARAMS: tuple[XmlRpcValue, ...] = (
+    "/n",
+    {"a": [-1, 2.5, True, "", b"xy", dt.datetime(2020, 1, 2, 3, 4, 5)], "e": {}},  # noqa: DTZ001 - XML-RPC has none
+)
+
+
+def call_with(value: str) -> bytes:
+    return f"<methodCall><methodName>m</methodName><params><param>{value}</param></params></methodCall>".encode()
+
+
+def test_golden_call() -> None:
+    assert serialize_call("setParam", GOLDEN_PARAMS) == GOLDEN_CALL
+    assert parse_call(GOLDEN_CALL) == ("setParam", GOLDEN_PARAMS)
+
+
+def test_every_prefix_of_a_call_is_refused_or_equal() -> None:
+    for end in range(len(GOLDEN_CALL.rstrip())):
+        with pytest.raises(RemoteProtocolError):
+            parse_call(GOLDEN_CALL[:end])
+
+
+@pytest.mark.parametrize("size", [1, 2, 7, 100])
+def test_a_call_is_read_piece_by_piece(size: int) -> None:
+    reader = CallReader()
+    for begin in range(0, len(GOLDEN_CALL), size):
+        reader.feed(GOLDEN_CALL[begin : begin + size])
+    assert reader.close() == ("setParam", GOLDEN_PARAMS)
+
+
+def test_a_fault_in_pieces_is_no_call() -> None:
+    reader = CallReader()
+    for byte in serialize_fault(1, "no"):
+        reader.feed(bytes([byte]))
+    with pytest.raises(RemoteProtocolError, match="fault came"):
+        reader.close()
+
+
+def test_an_endless_comment_in_pieces_is_looked_at_a_few_times_only() -> None:
+    """expat begins again at the start of an unfinished token whenever it is fed: 8 MiB would take seconds."""
+    reader = CallReader()
+    given: list[bytes] = []
+    reader._parser.feed = given.append  # type: ignore[assignment]
+    reader._expat = type("Stuck", (), {"CurrentByteIndex": 0})()
+    for _ in range(4096):
+        reader.feed(b"x" * 2048)
+    assert len(given) < 16
+
+
+def test_reading_leaves_no_garbage_for_a_collector_that_is_off() -> None:
+    bodies = [GOLDEN_CALL, *MALFORMED]
+    gc.collect()
+    gc.disable()
+    try:
+        for body in bodies:
+            with contextlib.suppress(RemoteProtocolError):
+                parse_call(body)
+        assert gc.collect() == 0
+    finally:
+        gc.enable()
+
+
+def test_much_is_written_in_many_short_pieces() -> None:
+    value: XmlRpcValue = [1, "", {"numbers": [1.5] * 5000, "text": "<a>\n" * 20000, "bytes": b"x" * 100_000}]
+    written = list(response_pieces(value))
+    assert max(map(len, written)) < 64 * limits.KIB
+    assert len(written) > 50
+    assert parse_response(b"".join(written)) == value
+
+
+@pytest.mark.parametrize("length", [0, 56, 57, 58, 7295, 7296, 7297, 20_000])
+def test_long_texts_and_bytes_are_written_as_the_standard_library_does(length: int) -> None:
+    value: list[str | bytes] = [("<é&>" * length)[:length], b"\x00\xff" * (length // 2)]
+    expected = xmlrpc.client.dumps((value,), methodresponse=True).encode()
+    assert serialize_response(value) == expected
+
+
+def test_golden_response_and_fault() -> None:
+    response = serialize_response([1, "ok", []])
+    assert response == (
+        b"<?xml version='1.0'?>\n<methodResponse>\n<params>\n<param>\n<value><array><data>\n"
+        b"<value><int>1</int></value>\n"
+        b"<value><string>ok</string></value>\n<value><array><data>\n</data></array></value>\n</data></array></value>\n"
+        b"</param>\n</params>\n</methodResponse>\n"
+    )
+    assert parse_response(response) == [1, "ok", []]
+    with pytest.raises(RosFault) as caught:
+        parse_response(serialize_fault(4, "no <such> \x01 method"))
+    assert (caught.value.code, caught.value.text) == (4, "no <such> ? method")
+
+
+@pytest.mark.trap(27)
+@pytest.mark.parametrize(
+    "trap", ["<string/>", "<value/>", "<array/>", "<data/>", "<struct/>", "<nil", "<i8>", "CDATA", "<!--"]
+)
+def test_nothing_is_written_that_xmlrpcpp_stops_at(trap: str) -> None:
+    """XmlRpc++ matches strings, and what it does not know ends its parsing without an error."""
+    written = serialize_response(
+        ["", [], {}, {"": ""}, [[]], "<string/>", "]]>", "&#10;", True, dt.datetime(1, 1, 1)]  # noqa: DTZ001
+    )
+    assert trap.encode() not in written
+    assert b"<boolean>1</boolean>" in written
+    assert b"<boolean>true" not in written
+
+
+@pytest.mark.trap(27)
+def test_untyped_strings_as_roscpp_sends_them() -> None:
+    body = call_with("<value>/talker</value>").replace(b"</params>", b"<param><value></value></param></params>")
+    assert parse_call(body) == ("m", ("/talker", ""))
+
+
+def test_empty_tags_are_read() -> None:
+    assert parse_call(call_with("<value/>"))[1] == ("",)
+    assert parse_call(call_with("<value><string/></value>"))[1] == ("",)
+    assert parse_call(call_with("<value><array><data/></array></value>"))[1] == ([],)
+    assert parse_call(call_with("<value><nil/></value>"))[1] == (None,)
+
+
+@pytest.mark.trap(27)
+@pytest.mark.parametrize("number", [2**31, -(2**31) - 1, 10**30])
+@pytest.mark.parametrize("tag", ["int", "i4", "i8"])
+def test_integers_beyond_32_bits_are_refused_with_a_remedy(number: int, tag: str) -> None:
+    with pytest.raises(RemoteProtocolError, match="32 bits; send it as a double"):
+        parse_call(call_with(f"<value><{tag}>{number}</{tag}></value>"))
+    with pytest.raises(LocalProtocolError):
+        serialize_call("m", [number])
+
+
+@pytest.mark.parametrize("number", [2**31 - 1, -(2**31), 0])
+def test_the_largest_integers_pass(number: int) -> None:
+    assert parse_call(serialize_call("m", [number])) == ("m", (number,))
+
+
+@pytest.mark.parametrize("value", [None, [None], object, "\x00", "a\x0bb", "\ud800", {1: 2}])
+def test_what_cannot_be_written_is_our_own_error(value: XmlRpcValue) -> None:
+    with pytest.raises(LocalProtocolError):
+        serialize_response(value)
+
+
+MALFORMED: list[bytes] = [
+    b"",
+    b"\x00",
+    b"GET / HTTP/1.1\r\n\r\n",
+    b"<methodCall></methodCall>",
+    b"<methodCall><params></params></methodCall>",
+    b"<methodCall><methodName></methodName></methodCall>",
+    b"<html><body>hello</body></html>",
+    b"<methodCall><methodName>m</methodName></array></methodCall>",
+    b"</value>",
+    call_with("<value><int>x</int></value>"),
+    call_with("<value><int></int></value>"),
+    call_with("<value><boolean>yes</boolean></value>"),
+    call_with("<value><struct><member><name>a</name></member></struct></value>"),
+    call_with("<value><struct><member><name>a</name><value>b</value></member>"),
+    call_with("<value><struct><member><name>a</name><value>b</value></member></value>"),
+    call_with("<value><struct><member><value><int>1</int></value><value>x</value></member></struct></value>"),
+    call_with("<value><struct><member><value><array></array></value><value>x</value></member></struct></value>"),
+    call_with("<value><bigdecimal>1e9999</bigdecimal></value>"),
+    call_with("<value><dateTime.iso8601>2020-01-02</dateTime.iso8601></value>"),
+    serialize_fault(1, "a fault is no call"),
+    GOLDEN_CALL + b"<more/>",
+]
+
+
+@pytest.mark.parametrize("body", MALFORMED)
+def test_malformed_calls_are_refused(body: bytes) -> None:
+    with pytest.raises(RemoteProtocolError):
+        parse_call(body)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        b"<methodResponse></methodResponse>",
+        b"<methodResponse><params></params></methodResponse>",
+        b"<methodResponse><fault><value><string>oops</string></value></fault></methodResponse>",
+        b"<methodResponse><fault><value><struct></struct></value></fault></methodResponse>",
+        GOLDEN_CALL,
+    ],
+)
+def test_malformed_responses_are_refused(body: bytes) -> None:
+    with pytest.raises(RemoteProtocolError):
+        parse_response(body)
+
+
+def test_entity_bombs_are_refused() -> None:
+    bomb = b'<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]>' + call_with("<value>&b;</value>")
+    with pytest.raises(RemoteProtocolError, match="entities"):
+        parse_call(bomb)
+
+
+def test_depth_and_size_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    deep = "<value><array><data>" * 100 + "</data></array></value>" * 100
+    with pytest.raises(RemoteProtocolError, match="nested deeper"):
+        parse_call(call_with(deep))
+    with pytest.raises(LimitExceeded):
+        parse_call(b" " * (limits.HTTP_BODY_MAX + 1))
+    monkeypatch.setattr(limits, "XMLRPC_ELEMENTS_MAX", 100)
+    with pytest.raises(RemoteProtocolError, match="more than 100 elements"):
+        parse_call(call_with("<value><array><data>" + "<value/>" * 100 + "</data></array></value>"))
+
+
+def test_a_deep_value_is_our_error_and_not_a_recursion() -> None:
+    value: list[XmlRpcValue] = []
+    for _ in range(5000):
+        value = [value]
+    with pytest.raises(LocalProtocolError):
+        serialize_response(value)
+
+
+@pytest.mark.parametrize("value", [5, [], [1, "x"], ["1", "", 0], [[], [], []], {"a": 1}, "abc"])
+def test_replies_are_triples(value: XmlRpcValue) -> None:
+    assert RosReply.of([1, "", value]) == (1, "", value)
+    with pytest.raises(RemoteProtocolError):
+        RosReply.of(value)
+
+
+def test_brief_is_brief() -> None:
+    assert brief("abc") == "'abc'"
+    assert len(brief("x" * 1000)) == 120
+
+
+texts = st.text(st.characters(codec="utf-8", exclude_categories=["Cs", "Cc"], exclude_characters="\ufffe\uffff"))
+values: st.SearchStrategy[XmlRpcValue] = st.recursive(
+    st.one_of(
+        st.booleans(),
+        st.integers(-(2**31), 2**31 - 1),
+        st.floats(allow_nan=False),
+        texts,
+        st.binary(),
+        st.datetimes(min_value=dt.datetime(1000, 1, 1)).map(lambda d: d.replace(microsecond=0)),  # noqa: DTZ001
+    ),
+    lambda below: st.one_of(st.lists(below), st.dictionaries(texts, below)),
+    max_leaves=20,
+)
+
+
+@given(st.lists(values, max_size=4))
+def test_calls_come_back_as_they_were(params: list[XmlRpcValue]) -> None:
+    assert parse_call(serialize_call("m", params)) == ("m", tuple(params))
+
+
+@given(values)
+def test_we_write_what_the_standard_library_writes(value: XmlRpcValue) -> None:
+    written = serialize_response(value).decode()
+    assert written == xmlrpc.client.dumps((value,), methodresponse=True)  # type: ignore[arg-type]
+    (read,), _ = xmlrpc.client.loads(written, use_builtin_types=True)
+    assert read == value
+
+
+@given(st.binary(max_size=300))
+def test_any_bytes_are_read_or_refused(data: bytes) -> None:
+    parsers: list[Callable[[bytes], object]] = [parse_call, parse_response]
+    for parse in parsers:
+        with contextlib.suppress(RemoteProtocolError, RosFault):
+            parse(data)
+
+
+def test_floats_keep_every_bit() -> None:
+    for number in (0.1, 1e300, 5e-324, math.pi, -0.0):
+        assert math.copysign(1, number) == math.copysign(1, parse_response(serialize_response(number)))  # type: ignore[arg-type]
+        assert parse_response(serialize_response(number)) == number

@@ -1,0 +1,211 @@
+from __future__ import annotations
+
+import asyncio
+import gc
+import time
+from typing import TYPE_CHECKING, ClassVar
+
+import pytest
+
+from rmpa.core import limits
+from rmpa.core.counters import Counters
+from rmpa.runtime.event_loop import AgentLoop, yielding_to_data
+from rmpa.runtime.garbage_collector import Due, GarbageCollector, what_is_due
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+class Knot:
+    """Garbage that only a collection finds."""
+
+    alive: ClassVar[int] = 0
+
+    def __init__(self) -> None:
+        self.me = self
+        self.ballast = bytearray(1000)
+        Knot.alive += 1
+
+    def __del__(self) -> None:
+        Knot.alive -= 1
+
+
+@pytest.fixture
+def counters() -> Counters:
+    return Counters()
+
+
+@pytest.fixture
+def collector(counters: Counters) -> Iterator[GarbageCollector]:
+    made = GarbageCollector(lambda: 0, counters)
+    Knot.alive = 0
+    enabled = gc.isenabled()
+    yield made
+    made.close()
+    assert gc.isenabled() == enabled
+
+
+async def until_no_more_than(knots: int) -> None:
+    async with asyncio.timeout(20):
+        while Knot.alive > knots:
+            await asyncio.sleep(0.01)
+
+
+@pytest.mark.parametrize(
+    ("young", "grown", "quiet", "due"),
+    [
+        (0, 0, True, Due.NOTHING),
+        (limits.COLLECT_YOUNG - 1, 0, True, Due.NOTHING),
+        (limits.COLLECT_YOUNG, 0, True, Due.YOUNG),
+        (limits.COLLECT_YOUNG, 0, False, Due.YOUNG),
+        (limits.COLLECT_YOUNG, -10, True, Due.YOUNG),
+        (0, limits.COLLECT_GROWTH, False, Due.NOTHING),
+        (limits.COLLECT_YOUNG, limits.COLLECT_GROWTH, False, Due.YOUNG),
+        (0, limits.COLLECT_GROWTH - 1, True, Due.NOTHING),
+        (0, limits.COLLECT_GROWTH, True, Due.FULL),
+        (0, limits.COLLECT_GROWTH_MAX, False, Due.FULL),
+    ],
+)
+def test_what_is_due(young: int, grown: int, quiet: bool, due: Due) -> None:
+    assert what_is_due(young, grown, quiet=quiet) is due
+
+
+async def test_it_takes_over_and_gives_back(collector: GarbageCollector) -> None:
+    gc.enable()
+    collector.start()
+    assert not gc.isenabled()
+    assert gc.get_freeze_count() > 0
+    collector.close()
+    assert gc.isenabled()
+    assert gc.get_freeze_count() == 0
+    collector.close()
+
+
+async def test_it_leaves_off_what_was_off(collector: GarbageCollector) -> None:
+    gc.disable()
+    try:
+        collector.start()
+        collector.close()
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
+
+
+async def test_nothing_is_collected_while_nothing_comes_to_stay(
+    collector: GarbageCollector, counters: Counters, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "COLLECT_LOOK", 0.002)
+    gc.collect()
+    collector.start()
+    for _ in range(100):
+        for _ in range(1000):
+            [[]]  # noqa: B018 - an object that is gone at once, as those of the data path are
+        await asyncio.sleep(0.001)
+    assert counters.as_dict() == {}
+
+
+async def test_cycles_of_control_work_are_collected_in_small_portions(
+    collector: GarbageCollector, counters: Counters
+) -> None:
+    pauses = Pauses()
+    gc.collect()
+    collector.start()
+    highest = 0
+    with pauses:
+        end = time.monotonic() + 2
+        while time.monotonic() < end:
+            for _ in range(20):
+                Knot()
+            highest = max(highest, Knot.alive)
+            await asyncio.sleep(0.002)
+    # 2 to 4 tracked objects a knot; some 10,000 knots a second.
+    assert counters["collector.young"] >= 5
+    assert counters["collector.full"] == 0
+    assert highest < 5000
+    assert set(pauses.generations) == {0}
+    assert collector.longest_pause < 0.1
+
+
+async def test_garbage_that_grew_old_is_collected_when_no_data_flows(
+    counters: Counters, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "COLLECT_LOOK", 0.02)
+    monkeypatch.setattr(limits, "COLLECT_GROWTH", 20_000)
+    carried, step = 0, 1_000_000
+
+    def carry() -> int:
+        nonlocal carried
+        carried += step
+        return carried
+
+    Knot.alive = 0
+    collector = GarbageCollector(carry, counters)
+    collector.start()
+    try:
+        old = [Knot() for _ in range(10_000)]  # 3 blocks each
+        gc.collect(0)
+        old.clear()
+        await asyncio.sleep(0.2)
+        assert Knot.alive == 10_000
+        assert counters["collector.full"] == 0
+        step = 0
+        await until_no_more_than(0)
+        assert counters["collector.full"] == 1
+        await asyncio.sleep(0.1)
+        assert counters["collector.full"] == 1
+    finally:
+        collector.close()
+
+
+async def test_garbage_that_grew_old_waits_no_longer_when_it_is_much(
+    counters: Counters, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(limits, "COLLECT_LOOK", 0.02)
+    monkeypatch.setattr(limits, "COLLECT_GROWTH_MAX", 20_000)
+    carried = iter(range(0, 10**9, 10**6))
+    Knot.alive = 0
+    collector = GarbageCollector(lambda: next(carried), counters)
+    collector.start()
+    try:
+        old = [Knot() for _ in range(10_000)]
+        gc.collect(0)
+        old.clear()
+        with caplog.at_level("INFO"):
+            await until_no_more_than(0)
+        assert counters["collector.full"] == 1
+        assert "objects of all ages in" in caplog.text
+    finally:
+        collector.close()
+
+
+class Pauses:
+    """The generations that were collected meanwhile."""
+
+    def __init__(self) -> None:
+        self.generations: list[int] = []
+
+    def __enter__(self) -> None:
+        gc.callbacks.append(self._note)
+
+    def __exit__(self, *_: object) -> None:
+        gc.callbacks.remove(self._note)
+
+    def _note(self, phase: str, info: dict[str, int]) -> None:
+        if phase == "start":
+            self.generations.append(info["generation"])
+
+
+def test_work_that_does_not_end_is_collected_in_its_midst(counters: Counters) -> None:
+    async def main() -> None:
+        collector = GarbageCollector(lambda: 0, counters)
+        collector.start()
+        most = 0
+        for _ in yielding_to_data(range(100_000)):
+            Knot()
+            most = max(most, gc.get_count()[0])
+        assert counters["collector.young"] > 20
+        assert most < 10 * limits.COLLECT_BURST
+        collector.close()
+
+    with asyncio.Runner(loop_factory=AgentLoop) as runner:
+        runner.run(main())

@@ -1,0 +1,358 @@
+"""The stream on a socket pair."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+import socket
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rmpa.core import limits
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.outbox import URGENT, Outbox
+from rmpa.runtime.stream import Stream
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(20):
+        while not condition():
+            await asyncio.sleep(0.001)
+
+
+class End:
+    """A stream of messages with a length of 4 bytes in front."""
+
+    def __init__(self, sock: socket.socket, outbox: Outbox | None = None) -> None:
+        sock.setblocking(False)
+        self.got: list[bytes] = []
+        self.ends: list[Exception | None] = []
+        self.offered: list[int] = []
+        self.on_message: Callable[[bytes], None] = self.got.append
+        box = Outbox(1 << 20, 1 << 30) if outbox is None else outbox
+        self.stream = Stream(sock, on_bytes=self.take, on_close=self.ends.append, outbox=box)
+
+    def take(self, view: memoryview) -> tuple[int, int]:
+        self.offered.append(len(view))
+        at = 0
+        while len(view) - at >= 4:
+            size = int.from_bytes(view[at : at + 4], "big")
+            if size == 0xFFFFFFFF:
+                raise RemoteProtocolError("no such length")
+            if len(view) - at - 4 < size:
+                return at, 4 + size
+            self.on_message(bytes(view[at + 4 : at + 4 + size]))
+            at += 4 + size
+        return at, 0
+
+    def send(self, data: bytes, key: int = 1) -> int:
+        return self.stream.send([len(data).to_bytes(4, "big"), memoryview(data)], key)
+
+
+@pytest.fixture
+def sockets() -> Iterator[tuple[socket.socket, socket.socket]]:
+    listener = socket.create_server(("127.0.0.1", 0))
+    one = socket.create_connection(listener.getsockname())
+    other, _ = listener.accept()
+    listener.close()
+    yield one, other
+    one.close()
+    other.close()
+
+
+Sockets = tuple[socket.socket, socket.socket]
+
+
+async def test_all_sizes_in_order_both_ways_through_full_buffers(sockets: Sockets) -> None:
+    one, other = End(sockets[0]), End(sockets[1])
+    sizes = [0, 1, 3, 100, 65532, 65533, 200_000, 3 * limits.MIB, 5, 9 * limits.MIB, 7] * 2
+    messages = [bytes([i]) * size for i, size in enumerate(sizes)]
+    for message in messages:
+        one.send(message)
+        other.send(message[::-1])
+    await until(lambda: len(one.got) == len(other.got) == len(messages))
+    assert other.got == one.got == messages
+    assert one.stream.bytes_out == other.stream.bytes_in == sum(sizes) + 4 * len(sizes)
+    assert not one.stream.pending_bytes
+    assert len(one.stream._buffer) <= 4 * limits.MIB, "a large buffer is given back"
+    one.stream.close()
+    other.stream.close()
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    sizes=st.lists(st.one_of(st.integers(0, 300), st.integers(60_000, 300_000)), max_size=12),
+    cut=st.integers(1, 9999),
+)
+def test_any_messages_in_any_pieces(sizes: list[int], cut: int) -> None:
+    messages = [bytes([i]) * size for i, size in enumerate(sizes)]
+    wire = b"".join(len(m).to_bytes(4, "big") + m for m in messages)
+
+    async def run() -> list[bytes]:
+        left, right = socket.socketpair()
+        end = End(right)
+        for start in range(0, len(wire), cut):
+            end.stream.feed(wire[start : start + cut])
+        end.stream.close()
+        left.close()
+        return end.got
+
+    assert asyncio.run(run()) == messages
+
+
+async def test_a_claim_is_not_allocated(sockets: Sockets) -> None:
+    end = End(sockets[1])
+    sockets[0].sendall((200 * limits.MIB).to_bytes(4, "big") + bytes(1000))
+    await until(lambda: end.stream.bytes_in == 1004)
+    assert len(end.stream._buffer) <= 64 * limits.KIB
+    before = end.stream.last_in
+    offered = len(end.offered)
+    sockets[0].sendall(bytes(10))
+    await until(lambda: end.stream.bytes_in == 1014)
+    assert end.stream.last_in > before
+    assert len(end.offered) == offered, "half a message is not offered again and again"
+    end.stream.close()
+
+
+async def test_a_slow_reader_costs_bounded_memory_and_gets_whole_messages(sockets: Sockets) -> None:
+    sockets[0].setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
+    sockets[1].setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
+    one = End(sockets[0], Outbox(10, 4 * limits.MIB))
+    dropped = sum(one.send(b"%06d" % i + bytes(100_000)) for i in range(300))
+    one.send(b"urgent", URGENT)
+    assert dropped > 100
+    assert one.stream.pending_bytes <= 4 * limits.MIB
+    other = End(sockets[1])
+    await until(lambda: not one.stream.pending_bytes and one.stream.bytes_out == other.stream.bytes_in)
+    numbers = [int(m[:6]) for m in other.got if m != b"urgent"]
+    assert numbers == sorted(numbers)
+    assert len(numbers) == 300 - dropped
+    assert numbers[-1] == 299
+    assert b"urgent" in other.got[:-5]
+    one.stream.close()
+    other.stream.close()
+
+
+async def test_ends_are_told_once_and_not_after_close(sockets: Sockets) -> None:
+    one, other = End(sockets[0]), End(sockets[1])
+    one.stream.close()
+    one.stream.close()
+    await until(lambda: other.ends == [None])
+    assert other.stream.closed
+    assert other.send(b"x") == 0
+    other.stream.feed(b"x")
+    assert one.ends == []
+
+
+async def test_finish_lets_what_waits_leave_and_reads_on(sockets: Sockets) -> None:
+    one = End(sockets[0])
+    one.send(bytes(8 * limits.MIB))
+    one.stream.finish()
+    assert one.send(b"late") == 0
+    other = End(sockets[1])
+    await until(lambda: other.ends == [None])
+    assert len(other.got) == 1
+    await until(lambda: one.ends == [None])
+
+
+async def test_a_failed_send_is_told_from_the_loop(sockets: Sockets) -> None:
+    one = End(sockets[0])
+
+    class Broken:
+        def sendmsg(self, _parts: object) -> int:
+            raise OSError(errno.EPIPE, "Broken pipe")
+
+        def close(self) -> None:
+            sockets[0].close()
+
+    one.stream._sock = Broken()  # type: ignore[assignment]
+    assert one.send(b"x") == 0
+    assert one.ends == []
+    assert one.stream.closed
+    await until(lambda: len(one.ends) == 1)
+    assert isinstance(one.ends[0], OSError)
+
+
+async def test_close_after_a_failed_send_is_silent(sockets: Sockets) -> None:
+    one = End(sockets[0])
+    one.stream._lost(OSError())
+    one.stream.close()
+    await asyncio.sleep(0)
+    assert one.ends == []
+
+
+async def test_a_protocol_error_and_a_bug_close_the_connection(
+    sockets: Sockets, caplog: pytest.LogCaptureFixture
+) -> None:
+    one, other = End(sockets[0]), End(sockets[1])
+
+    def bug(_message: bytes) -> None:
+        raise ZeroDivisionError
+
+    one.on_message = bug
+    sockets[0].setblocking(False)
+    with caplog.at_level(logging.ERROR):
+        other.send(b"x")
+        await until(lambda: len(one.ends) == 1)
+    assert isinstance(one.ends[0], ZeroDivisionError)
+    assert "a reader of bytes failed" in caplog.text
+    await until(lambda: len(other.ends) == 1)
+
+
+async def test_garbage_ends_with_its_error(sockets: Sockets) -> None:
+    one = End(sockets[0])
+    sockets[1].sendall(b"\xff" * 4)
+    await until(lambda: len(one.ends) == 1)
+    assert isinstance(one.ends[0], RemoteProtocolError)
+
+
+async def test_closing_from_within_a_callback(sockets: Sockets) -> None:
+    one = End(sockets[0])
+    one.on_message = lambda _m: one.stream.close()
+    sockets[1].sendall(b"\0\0\0\1x" * 3)
+    await until(lambda: one.stream.closed)
+    assert one.ends == []
+
+
+async def test_drained_waits_for_the_last_byte_and_not_for_ever(sockets: Sockets) -> None:
+    one = End(sockets[0])
+    await one.stream.drained()
+    one.send(bytes(16 * limits.MIB))
+    await one.stream.drained(0.01)
+    assert one.stream.pending_bytes
+    other = End(sockets[1])
+    await asyncio.gather(one.stream.drained(20), one.stream.drained(20))
+    assert not one.stream.pending_bytes
+    one.stream.close()
+    other.stream.close()
+
+
+class Counted(socket.socket):
+    """A socket that keeps how many bytes each ``sendmsg`` was given."""
+
+    calls: list[int]
+
+    def sendmsg(self, buffers, *rest):  # type: ignore[no-untyped-def]
+        parts = list(buffers)
+        self.calls.append(sum(map(len, parts)))
+        return super().sendmsg(parts, *rest)
+
+
+def counted(sock: socket.socket) -> Counted:
+    made = Counted(fileno=sock.detach())
+    made.setblocking(False)
+    made.calls = []
+    return made
+
+
+class Relay:
+    """Hands each message that ``inbound`` brings on to ``outbound``, as views of the read buffer."""
+
+    def __init__(self, inbound: socket.socket, outbound: socket.socket, outbox: Outbox | None = None) -> None:
+        inbound.setblocking(False)
+        box = Outbox(1 << 20, 1 << 30) if outbox is None else outbox
+        self.out = Stream(outbound, on_bytes=lambda view: (len(view), 0), on_close=self.ended, outbox=box)
+        self.into = Stream(inbound, on_bytes=self.take, on_close=self.ended, outbox=Outbox(1, 1))
+
+    def ended(self, error: Exception | None) -> None:
+        raise AssertionError(error)
+
+    def take(self, view: memoryview) -> tuple[int, int]:
+        at = 0
+        while len(view) - at >= 4:
+            end = at + 4 + int.from_bytes(view[at : at + 4], "big")
+            if end > len(view):
+                return at, end - at
+            self.out.send([view[at : at + 4], view[at + 4 : end]], 1)
+            at = end
+        return at, 0
+
+    def close(self) -> None:
+        self.into.close()
+        self.out.close()
+
+
+async def test_messages_of_one_read_leave_in_one_call(sockets: Sockets) -> None:
+    left, right = socket.socketpair()
+    target = counted(sockets[0])
+    relay, end = Relay(right, target), End(sockets[1])
+    messages = [b"%d" % i for i in range(100)]
+    left.send(b"".join(len(m).to_bytes(4, "big") + m for m in messages))
+    await until(lambda: len(end.got) == 100)
+    assert end.got == messages
+    assert len(target.calls) == 1
+    left.send(b"\0\0\0\1x")
+    await until(lambda: len(end.got) == 101)
+    assert target.calls[1:] == [5]
+    relay.close()
+    end.stream.close()
+    left.close()
+
+
+async def test_batches_keep_order_and_bytes_through_full_buffers(sockets: Sockets) -> None:
+    sockets[0].setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 32768)
+    left, right = socket.socketpair()
+    relay, source = Relay(right, counted(sockets[0])), End(left)
+    messages = [b"%d " % i * (i % 97) for i in range(20_000)]
+    for message in messages:
+        source.send(message)
+    await until(lambda: bool(relay.out.pending_bytes))  # nobody reads yet
+    end = End(sockets[1])
+    await until(lambda: len(end.got) == len(messages))
+    assert end.got == messages
+    assert not relay.out.pending_bytes
+    relay.close()
+    source.stream.close()
+    end.stream.close()
+
+
+async def test_what_is_sent_in_a_read_leaves_before_a_close_in_the_same_read(sockets: Sockets) -> None:
+    """As a publisher refuses a subscriber: an error header, then the end."""
+    one, other = End(sockets[0]), End(sockets[1])
+
+    def refuse(_message: bytes) -> None:
+        one.send(b"no")
+        one.send(b"never")
+        one.stream.close()
+
+    one.on_message = refuse
+    other.send(b"may I?")
+    await until(lambda: bool(other.ends))
+    assert other.got == [b"no", b"never"]
+    assert other.ends == [None]
+
+
+@pytest.mark.parametrize("size", [5, 600])
+async def test_a_read_within_a_read_moves_nothing_that_still_waits(sockets: Sockets, size: int) -> None:
+    """A reader feeds another stream whose messages go to the same target; views of both must stay whole."""
+    target, end = counted(sockets[0]), End(sockets[1])
+    (a_far, a_near), (b_far, b_near) = socket.socketpair(), socket.socketpair()
+    first = Relay(a_near, target)
+    inner: list[bytes] = [b"inner 1", b"inner 2", b"the beginning of inner 3"]
+    wire = b"".join(len(m).to_bytes(4, "big") + m for m in inner)
+    b_near.setblocking(False)
+    second = Stream(b_near, on_bytes=first.take, on_close=first.ended, outbox=Outbox(1, 1))
+    take = first.take
+
+    def both(view: memoryview) -> tuple[int, int]:
+        taken = take(view)
+        second.feed(wire[:-10])
+        second.feed(wire[-10:])
+        return taken
+
+    first.into._on_bytes = both
+    a_far.send(size.to_bytes(4, "big") + b"o" * size)
+    await until(lambda: len(end.got) == 4)
+    assert end.got == [b"o" * size, *inner]
+    second.close()
+    first.close()
+    end.stream.close()
+    a_far.close()
+    b_far.close()
