@@ -28,6 +28,9 @@ _PROBES: Final = {
     "git": probes.why_no_git,
 }
 """For each marker, why the tests that carry it cannot run here; empty where they can."""
+_TESTS: Final = Path(__file__).parent
+_ROOMS: Final = {"core", "runtime", "discovery", "mesh", "ros", "bridge", "resource"}
+"""Rooms whose coroutine tests fail when code of rmpa blocks the event loop."""
 _numbers = itertools.count(1)
 _SETTLE_ROUNDS: Final = 10
 """Turns of the loop that cancelled tasks and closed transports get before they count as leaked."""
@@ -37,7 +40,7 @@ def pytest_itemcollected(item: pytest.Item) -> None:
     """Put the guards around every coroutine test: named first, they are set up first and torn down last."""
     if not isinstance(item, pytest.Function) or not inspect.iscoroutinefunction(item.function):
         return
-    if "aio" in item.path.parts and "no_blocking" not in item.fixturenames:
+    if item.path.relative_to(_TESTS).parts[0] in _ROOMS and "no_blocking" not in item.fixturenames:
         item.fixturenames.insert(0, "no_blocking")
     item.fixturenames.insert(0, "no_leaks")
 
@@ -96,7 +99,7 @@ async def no_leaks() -> AsyncIterator[None]:
 
 @pytest.fixture
 def no_blocking() -> Iterator[None]:
-    """Raise ``BlockingError`` where code of rmpa blocks the event loop; used by itself in folders named ``aio``."""
+    """Raise ``BlockingError`` where code of rmpa blocks the event loop; used by itself in the tests of ``_ROOMS``."""
     with blockbuster_ctx("rmpa"):
         yield
 

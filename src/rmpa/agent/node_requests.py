@@ -15,7 +15,7 @@ from rmpa.config.values import did_you_mean
 from rmpa.core import limits
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.names import is_global_name, matches
-from rmpa.ros.node.calls import end_node, ping_node
+from rmpa.ros.core.node_calls import end_node, ping_node
 from rmpa.ros.node_info import NodeEnd, NodeFacts, NodeLine, NodePing, PeerNodes, describe_node, list_nodes
 from rmpa.runtime.event_loop import yielding_to_data
 

@@ -17,7 +17,7 @@ from rmpa.cli.options import agent_option, json_option, master_option
 from rmpa.cli.output import print_json, print_line, printable
 from rmpa.core import limits
 from rmpa.core.errors import ConfigError, RmpaError
-from rmpa.ros.node.calls import end_node, ping_node
+from rmpa.ros.core.node_calls import end_node, ping_node
 from rmpa.ros.node_info import NodeEnd, NodePing
 
 if TYPE_CHECKING:

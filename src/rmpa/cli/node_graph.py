@@ -14,7 +14,7 @@ from rmpa.cli.node_names import ask_peer, find_uri, module_of, peers_nodes, read
 from rmpa.cli.options import agent_option, json_option, master_option
 from rmpa.cli.output import Column, coloured, print_json, print_table, printable, warn
 from rmpa.core.errors import RmpaError
-from rmpa.ros.node.calls import ping_node
+from rmpa.ros.core.node_calls import ping_node
 from rmpa.ros.node_info import NodeFacts, NodeLine, describe_node, list_nodes
 
 if TYPE_CHECKING:

@@ -226,9 +226,8 @@ class AgentLoop(asyncio.SelectorEventLoop):
         """
         return self._direct_selector.woke_before
 
-    def breathe(self) ->
-    None:
-        """Let data that has come go first, now; for who has no loop at hand there is the function ``yield_to_data``."""
+    def breathe(self) -> None:
+        """Let data that has arrived be handled now; code without a loop at hand calls ``yield_to_data``."""
         self._poll_data()
         if self._chore is not None and not self._direct_selector.calling:
             self._breaths += 1

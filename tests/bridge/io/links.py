@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from rmpa.core import limits
 from rmpa.core.outbox import FIRST, LAST, URGENT, Outbox
-from rmpa.mesh.frames import Frame
-from rmpa.mesh.frames import FrameKind
+from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.io.lane import LaneSender
 
 if TYPE_CHECKING:

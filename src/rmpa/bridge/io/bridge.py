@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import actions as act
 from rmpa.bridge.data.io.absent_peers import Absent, AbsentPeers
-from rmpa.bridge.data.io.loss_reports import LossReports
+from rmpa.bridge.io.loss_reports import LossReports
 from rmpa.bridge.data.qos_events import shown_seconds
 from rmpa.bridge.io.node_shutdown import RemoteKills
 from rmpa.bridge.messages import (

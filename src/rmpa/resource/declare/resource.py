@@ -228,8 +228,9 @@ class Resource:
         tolerance: float | str | None = None,
         words: Sequence[str] = (),
     ) -> DeclaredAttribute:
-        """Declare a quality of its own, beside those that are measured anyway
-        (``resource.declare.attributes.MEASURED``).
+        """Declare a quality of its own.
+
+        Those in ``resource.declare.attributes.MEASURED`` are measured anyway.
 
         Args:
             name: ``accuracy``, ``energy`` …
