@@ -12,9 +12,9 @@ from urllib.parse import urlsplit
 import pytest
 
 from rmpa.agent import Agent
+from rmpa.bridge import limits
 from rmpa.bridge.proxy_names import proxied_node
 from rmpa.config.settings import PolicySettings, Settings
-from rmpa.core import limits
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.ros.http.client import call_api

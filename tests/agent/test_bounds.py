@@ -6,10 +6,11 @@ import asyncio
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from rmpa.bridge import limits as bridge_limits
 from rmpa.config.settings import LimitSettings
-from rmpa.core import limits
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.observe.why.diagnosis import Diagnosis
+from rmpa.ros import limits as ros_limits
 from tests.agent.test_agent import node, running, until
 from tests.agent.test_diagnostics import Statuses, settings
 
@@ -58,8 +59,8 @@ def stands(agent: Agent, *topics: int) -> bool:
 async def test_hidden_nodes_are_told_at_both_ends_and_come_with_a_reload(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(limits, "RECONCILE_INTERVAL", 0.2)
-    monkeypatch.setattr(limits, "NODE_CHECK_INTERVAL", 1e6)  # the nodes are made up
+    monkeypatch.setattr(bridge_limits, "RECONCILE_INTERVAL", 0.2)
+    monkeypatch.setattr(ros_limits, "NODE_CHECK_INTERVAL", 1e6)  # the nodes are made up
     few = replace(settings("near", tmp_path), limits=LimitSettings(nodes=2))
     async with running(few, settings("far", tmp_path)) as (near, far), node("watcher", near) as watcher:
         statuses = Statuses()
@@ -90,8 +91,8 @@ async def test_hidden_nodes_are_told_at_both_ends_and_come_with_a_reload(
 async def test_topics_beyond_the_limit_of_either_side_are_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(limits, "RECONCILE_INTERVAL", 0.2)
-    monkeypatch.setattr(limits, "NODE_CHECK_INTERVAL", 1e6)
+    monkeypatch.setattr(bridge_limits, "RECONCILE_INTERVAL", 0.2)
+    monkeypatch.setattr(ros_limits, "NODE_CHECK_INTERVAL", 1e6)
     few = replace(settings("near", tmp_path), limits=LimitSettings(topics=2))
     more = replace(settings("far", tmp_path), limits=LimitSettings(topics=3))
     async with running(few, more) as (near, far):

@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING
 import psutil
 import pytest
 
+from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.session import proxy_nodes
-from rmpa.core import limits
 from rmpa.core.counters import Counters
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.observe.io.control_server import ControlServer
+from rmpa.ros import limits as ros_limits
 from rmpa.ros.core import liveness
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.http.client import call_api
@@ -34,6 +35,7 @@ from rmpa.ros.node.tcpros_server import TcprosServer
 from rmpa.ros.wire.tcpros import TopicDescription, encode_header, subscriber_header
 from rmpa.ros.wire.xmlrpc import serialize_call
 from rmpa.runtime import descriptors
+from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.descriptors import DESCRIPTORS, Use
 from tests.agent.test_agent import node, running, settings, until
 from tests.runtime.descriptors_left import descriptors_left
@@ -56,8 +58,8 @@ STRING = TopicDescription("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1",
 @pytest.fixture
 def fresh(monkeypatch: pytest.MonkeyPatch) -> None:
     """Short pauses, a log that has told nothing yet, and no thread that opens and closes a socket meanwhile."""
-    monkeypatch.setattr(limits, "ACCEPT_PAUSE", 0.01)
-    monkeypatch.setattr(limits, "DESCRIPTORS_QUIET", 0.05)
+    monkeypatch.setattr(runtime_limits, "ACCEPT_PAUSE", 0.01)
+    monkeypatch.setattr(runtime_limits, "DESCRIPTORS_QUIET", 0.05)
     monkeypatch.setattr(DESCRIPTORS, "_told", {})
     monkeypatch.setattr(liveness, "listening_ports", lambda: None)
 
@@ -166,8 +168,8 @@ async def test_the_control_socket_answers_again(
 
 @pytest.mark.usefixtures("fresh")
 async def test_who_dials_says_why_it_cannot_and_tries_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "TCPROS_RETRY_FIRST", 0.01)
-    monkeypatch.setattr(limits, "TCPROS_RETRY_MAX", 0.02)
+    monkeypatch.setattr(ros_limits, "TCPROS_RETRY_FIRST", 0.01)
+    monkeypatch.setattr(ros_limits, "TCPROS_RETRY_MAX", 0.02)
     core = RosCore("127.0.0.1", 0)
     await core.start()
     lost: list[str] = []
@@ -189,7 +191,7 @@ async def test_who_dials_says_why_it_cannot_and_tries_again(monkeypatch: pytest.
 
 @pytest.mark.usefixtures("fresh")
 async def test_a_node_is_not_taken_for_dead_for_want_of_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "NODE_UNREACHABLE_AFTER", 0.0)
+    monkeypatch.setattr(ros_limits, "NODE_UNREACHABLE_AFTER", 0.0)
     core = RosCore("127.0.0.1", 0)
     await core.start()
     try:
@@ -211,14 +213,14 @@ async def test_a_topic_without_a_proxy_says_why_and_comes_later(
 ) -> None:
     """What stands for remote nodes, by sockets of its own, leaves room for those who connect to it."""
     monkeypatch.setattr(proxy_nodes, "is_loopback", lambda _: False)
-    monkeypatch.setattr(limits, "RECONCILE_INTERVAL", 0.2)
+    monkeypatch.setattr(bridge_limits, "RECONCILE_INTERVAL", 0.2)
 
     async def start(_: SharedListener) -> None:
         raise StartError("one listening socket for all proxies", "the test wants sockets for each")
 
     monkeypatch.setattr(SharedListener, "start", start)
     async with running(settings("a"), settings("b")) as (a, b), node("talker", a) as talker:
-        with descriptors_left(2 * limits.DESCRIPTORS_RESERVED - 1):
+        with descriptors_left(2 * runtime_limits.DESCRIPTORS_RESERVED - 1):
             for number in range(5):
                 await talker.advertise(f"/t{number}", "std_msgs/String")
             await until(lambda: any(at.inbound.problems for at in b.bridge.attached()))
@@ -238,7 +240,7 @@ async def test_a_topic_without_a_proxy_says_why_and_comes_later(
 @pytest.mark.usefixtures("fresh")
 async def test_proxies_at_shared_sockets_need_no_descriptor(settings: Callable[..., Settings]) -> None:
     async with running(settings("a"), settings("b")) as (a, b), node("talker", a) as talker:
-        with descriptors_left(2 * limits.DESCRIPTORS_RESERVED - 1):
+        with descriptors_left(2 * runtime_limits.DESCRIPTORS_RESERVED - 1):
             await talker.advertise("/t", "std_msgs/String")
             await until(lambda: b.core.publishers("/t"))
             assert not any(route.problem for route in routes(b))

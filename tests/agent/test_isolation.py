@@ -24,17 +24,20 @@ from urllib.parse import urlsplit
 import pytest
 
 from rmpa.agent import Agent
+from rmpa.config import limits as config_limits
 from rmpa.config.settings import PeerRule, PolicySettings, Settings
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.errors import UnreachableError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
+from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.external import ExternalCore
 from rmpa.runtime import event_loop as loop_module
+from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.event_loop import AgentLoop, DirectSelector, yield_to_data
 
 if TYPE_CHECKING:
@@ -120,8 +123,8 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(asyncio.Handle, "_run", remember)
     monkeypatch.setattr(loop_module, "DirectSelector", Watched)
     # Where no data flows a full collection may take its time; here data is only imagined.
-    monkeypatch.setattr(limits, "COLLECT_GROWTH", sys.maxsize)
-    monkeypatch.setattr(limits, "COLLECT_GROWTH_MAX", sys.maxsize)
+    monkeypatch.setattr(runtime_limits, "COLLECT_GROWTH", sys.maxsize)
+    monkeypatch.setattr(runtime_limits, "COLLECT_GROWTH_MAX", sys.maxsize)
 
 
 class World:
@@ -155,7 +158,7 @@ class World:
 
 @asynccontextmanager
 async def worlds(tmp_path: Path, master: str = "") -> AsyncIterator[World]:
-    group = (limits.MULTICAST_GROUP, 20000 + (os.getpid() + 7919) % 20000)
+    group = (config_limits.MULTICAST_GROUP, 20000 + (os.getpid() + 7919) % 20000)
     settings = Settings(core_port=0, interfaces=("lo",), group_port=group[1], runtime_dir=str(tmp_path))
     near = replace(settings, name="near")
     if master:
@@ -321,11 +324,11 @@ async def thousands_of_peers_are_invented(world: World) -> None:
         with ControlClient(path, timeout=DEADLINE) as client:
             for _ in range(4):
                 client.snapshot()
-                time.sleep(2 * limits.HEARTBEAT_INTERVAL / 4)
+                time.sleep(2 * discovery_limits.HEARTBEAT_INTERVAL / 4)
 
     await world.beside(work)
     assert world.near.station is not None
-    assert len(world.near.station.discovery.peers()) > limits.ROSTER_PEERS_MAX / 2
+    assert len(world.near.station.discovery.peers()) > core_limits.ROSTER_PEERS_MAX / 2
     assert world.near.station.discovery.counters["roster.full"] > 0
     assert world.linked()
 

@@ -11,8 +11,8 @@ import msgspec
 import pytest
 
 from rmpa.config.settings import NodeSettings
-from rmpa.core import limits
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.ros import limits
 from rmpa.ros.http.client import call_api
 from rmpa.ros.node.node import Node
 from rmpa.ros.node_info import NodeEnd, NodeFacts, NodePing, PeerNodes

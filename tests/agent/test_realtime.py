@@ -11,10 +11,11 @@ import pytest
 
 from rmpa.agent import Agent
 from rmpa.config.settings import Settings
-from rmpa.core import limits
 from rmpa.observe.io.control_client import ControlClient
+from rmpa.ros import limits as ros_limits
 from rmpa.ros.http.client import call_api
 from rmpa.ros.node.node import Node
+from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.realtime import SchedulingRequest
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ def collections() -> Iterator[list[int]]:
 async def test_no_collection_runs_while_messages_flow(
     pair: tuple[Agent, Agent], collections: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(limits, "NODE_MASTER_CHECK", DEADLINE)  # two XML-RPC calls a second of our own nodes
+    monkeypatch.setattr(ros_limits, "NODE_MASTER_CHECK", DEADLINE)  # two XML-RPC calls a second of our own nodes
     a, b = pair
     async with Node("talker", master_uri=a.core.uri) as talker, Node("hearer", master_uri=b.core.uri) as hearer:
         heard = sent = 0
@@ -105,7 +106,7 @@ async def test_no_collection_runs_while_messages_flow(
         made = gc.get_count()[0]
         await send(MESSAGES)
         assert collections == []
-        assert gc.get_count()[0] - made < limits.COLLECT_YOUNG
+        assert gc.get_count()[0] - made < runtime_limits.COLLECT_YOUNG
         assert gc.collect() < 200  # keepalives and timers; the messages left nothing
         assert not gc.isenabled()
 
@@ -120,8 +121,8 @@ async def test_garbage_of_control_work_is_collected_while_the_agent_runs(
     for _ in range(10):
         for _ in range(100):
             await call_api(a.core.uri, "getPid", "/somebody")  # a connection each: a cycle of asyncio's own
-        await asyncio.sleep(limits.COLLECT_LOOK_AGAIN)
-    await until(lambda: len(gc.get_objects()) < objects + 5 * limits.COLLECT_YOUNG)
+        await asyncio.sleep(runtime_limits.COLLECT_LOOK_AGAIN)
+    await until(lambda: len(gc.get_objects()) < objects + 5 * runtime_limits.COLLECT_YOUNG)
     assert 2 <= len(collections) < 40
     assert set(collections) == {0}
     # Both live on one loop here, and either one's collector may come first.

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.config.settings import PeerRule, ServiceRule, ServiceSettings, Settings
-from rmpa.core import limits
 from rmpa.core.errors import PeerRefused
+from rmpa.mesh import limits
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.node.slave_node import SlaveNode

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core import limits
+from rmpa.bridge import limits as bridge_limits
 from rmpa.core.errors import UnreachableError
+from rmpa.ros import limits as ros_limits
 from rmpa.ros.http import client
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.slave_node import SlaveNode
@@ -46,9 +47,9 @@ class Resolver:
 def resolver(monkeypatch: pytest.MonkeyPatch) -> Resolver:
     made = Resolver()
     monkeypatch.setattr(client, "_resolve", made)
-    monkeypatch.setattr(limits, "NODE_CHECK_INTERVAL", 0.05)
-    monkeypatch.setattr(limits, "NODE_UNREACHABLE_AFTER", 0.3)
-    monkeypatch.setattr(limits, "RECONCILE_INTERVAL", 0.1)
+    monkeypatch.setattr(ros_limits, "NODE_CHECK_INTERVAL", 0.05)
+    monkeypatch.setattr(ros_limits, "NODE_UNREACHABLE_AFTER", 0.3)
+    monkeypatch.setattr(bridge_limits, "RECONCILE_INTERVAL", 0.1)
     return made
 
 

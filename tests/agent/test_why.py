@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.bridge import limits
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings, Settings
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError
 from rmpa.observe.why.diagnosis import Diagnosis, StageResult
 from tests.agent.test_agent import DEADLINE, node, running, settings, until  # noqa: F401 - a fixture among them

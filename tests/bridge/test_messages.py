@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.bridge import messages
+from rmpa.bridge import limits, messages
 from rmpa.bridge.messages import (
     Advertise,
     AdvertiseServices,
@@ -34,9 +34,11 @@ from rmpa.bridge.messages import (
     decode,
     encode,
 )
-from rmpa.core import limits
+from rmpa.config import limits as config_limits
+from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, Durability, History, Liveliness, Priority, Reliability
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.mesh import limits as mesh_limits
 
 DEFAULT = (
     b'"contract":{"reliability":"best_effort","durability":"volatile","history":"keep_last","depth":1000,'
@@ -315,7 +317,7 @@ def test_a_contract_that_no_file_could_have_is_the_peers_error(beginning: bytes,
 def test_a_release_that_knows_no_outage_goes_on_with_the_usual_one() -> None:
     message = decode(OPEN + b',"contract":{"reliability":"reliable"}}')
     assert isinstance(message, OpenRoute)
-    assert message.contract.outage == limits.RESUME_WINDOW
+    assert message.contract.outage == core_limits.RESUME_WINDOW
 
 
 @pytest.mark.parametrize(
@@ -363,7 +365,7 @@ def test_a_peer_of_before_contracts_gets_the_default_one() -> None:
 
 
 def test_a_message_beyond_the_limit_is_not_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "CONTROL_PAYLOAD_MAX", 10)
+    monkeypatch.setattr(mesh_limits, "CONTROL_PAYLOAD_MAX", 10)
     with pytest.raises(LimitExceeded, match="control message of 24 bytes"):
         decode(b'{"op":"close","route":1}')
 
@@ -384,19 +386,19 @@ _types = st.from_regex(r"[a-z][a-z_]{0,8}/[A-Z][A-Za-z]{0,8}", fullmatch=True)
 _md5s = st.from_regex(r"[0-9a-f]{32}", fullmatch=True)
 _routes = st.integers(1, (1 << 31) - 1)
 _numbers = st.integers(0, (1 << 32) - 1)
-_times = st.none() | st.floats(limits.CONTRACT_TIME_MIN, limits.CONTRACT_TIME_MAX)
+_times = st.none() | st.floats(config_limits.CONTRACT_TIME_MIN, config_limits.CONTRACT_TIME_MAX)
 _contracts = st.builds(
     Contract,
     st.sampled_from(Reliability),
     st.sampled_from(Durability),
     st.sampled_from(History),
-    st.integers(1, limits.CONTRACT_DEPTH_MAX),
+    st.integers(1, config_limits.CONTRACT_DEPTH_MAX),
     _times,
     _times,
     st.sampled_from(Liveliness),
     _times,
     st.sampled_from(Priority),
-    st.none() | st.floats(limits.CONTRACT_RATE_MIN, limits.CONTRACT_RATE_MAX),
+    st.none() | st.floats(config_limits.CONTRACT_RATE_MIN, config_limits.CONTRACT_RATE_MAX),
 )
 _service_routes = st.integers(1 << 31, (1 << 32) - 1)
 _services = st.builds(ServiceOffer, _names, _names)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from rmpa.bridge import limits
 from rmpa.bridge.actions import Send
 from rmpa.bridge.pacing import Pacing
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.config.settings import PolicySettings
-from rmpa.core import limits
 
 
 def test_a_portion_waits_while_the_lane_is_busy_but_not_for_ever() -> None:

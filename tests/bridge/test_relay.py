@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from rmpa.bridge import limits
 from rmpa.bridge.actions import Action, Publish, Retract, Send
 from rmpa.bridge.messages import Advertise, AdvertiseServices, Origin, Source, decode, encode
 from rmpa.bridge.policy import Policy
@@ -20,7 +21,6 @@ from rmpa.bridge.services.rules import ServiceRules
 from rmpa.bridge.topics.exports import Exports, LocalSource
 from rmpa.bridge.topics.imports import Imports
 from rmpa.config.settings import PolicySettings, ServiceSettings
-from rmpa.core import limits
 from rmpa.core.guid import Guid
 
 if TYPE_CHECKING:

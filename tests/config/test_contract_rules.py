@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rmpa.config import limits
 from rmpa.config.contract_rules import read_duration, read_rate
 from rmpa.config.file import LISTS, line_of
 from rmpa.config.settings import Settings
 from rmpa.config.sources import Flags, Loaded, load_settings
 from rmpa.config.values import BadValue
-from rmpa.core import limits
 from rmpa.core.contract import (
     KEYS,
     Contract,

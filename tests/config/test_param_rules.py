@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.config import limits
 from rmpa.config.param_rules import overlap, untouchable
 from rmpa.config.settings import FollowRule, ParamSettings, TimeSettings
 from rmpa.config.sources import Flags, Loaded, load_settings
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rmpa.config import limits
 from rmpa.config.file import LISTS, known_keys, line_of, parse_config
 from rmpa.config.settings import HostPort, LaneSettings, LimitSettings, PolicySettings, RealtimeSettings, Settings
 from rmpa.config.sources import Flags, Loaded, find_config_file, load_settings
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.contract import ContractRule
 from rmpa.core.errors import ConfigError
 from tests.core.example import EXAMPLE, uncommented
@@ -432,7 +433,10 @@ def test_a_mistake_in_the_file_is_told_even_where_a_flag_outweighs_it(refuse: Re
                 "did you mean --name robot_1?"
             ),
         ),
-        (Flags(name="x" * 65), f"--name: a peer's name has at most {limits.PEER_NAME_MAX} characters; did you mean"),
+        (
+            Flags(name="x" * 65),
+            f"--name: a peer's name has at most {core_limits.PEER_NAME_MAX} characters; did you mean",
+        ),
         (Flags(port="x"), "--port: 'x' is not a whole number; a port (0: any) is between 0 and 65535"),
         (Flags(port="-1"), "--port: -1 is out of range"),
         (Flags(port="1_0"), "--port: '1_0' is not a whole number"),

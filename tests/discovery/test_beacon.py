@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
+from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind, BeaconMalformed, BeaconOtherDomain, BeaconOtherVersion
 from tests.fuzz import target_beacon
 
@@ -69,7 +70,7 @@ def test_every_shorter_packet_is_malformed(length: int) -> None:
 
 def test_the_largest_beacon_fits_a_packet() -> None:
     identity = Identity(
-        Guid.of("10.0.0.1", 1), bytes(16), "n" * limits.PEER_NAME_MAX, 0, (IPv4Address("10.0.0.2"),) * 8
+        Guid.of("10.0.0.1", 1), bytes(16), "n" * core_limits.PEER_NAME_MAX, 0, (IPv4Address("10.0.0.2"),) * 8
     )
     most = limits.BEACON_GOSSIP_MAX
     largest = Beacon(BeaconKind.ANSWER, identity, 1, 1, (Guid.of("10.0.0.3", 1),) * most, (("10.0.0.3", 1),) * most)
@@ -151,7 +152,7 @@ identities = st.builds(
     guids,
     st.binary(min_size=16, max_size=16),
     names,
-    st.integers(0, limits.DOMAIN_MAX),
+    st.integers(0, core_limits.DOMAIN_MAX),
     st.lists(unicast, max_size=8).map(tuple),
 )
 beacons = st.builds(

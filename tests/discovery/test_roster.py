@@ -8,9 +8,10 @@ from ipaddress import IPv4Address
 
 import pytest
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
+from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.events import (
     ConflictCleared,
@@ -599,14 +600,14 @@ def test_a_change_of_interfaces_gives_a_shorter_burst_with_the_new_addresses(one
 
 
 def test_the_roster_is_bounded_and_links_go_first(one: Harness) -> None:
-    for i in range(2 * limits.ROSTER_PEERS_MAX):
+    for i in range(2 * core_limits.ROSTER_PEERS_MAX):
         guid = Guid.of(IPv4Address(0x0A010000 + i), 4000)
         one.hear(Speaker(replace(who(2), guid=guid, instance=i.to_bytes(16, "big"), name=f"n{i}"))())
-    assert len(one.roster.peers()) == limits.ROSTER_PEERS_MAX - 1
+    assert len(one.roster.peers()) == core_limits.ROSTER_PEERS_MAX - 1
     assert one.roster.counters["roster.full"]
     one.roster.link_up(who(3), one.now)
     assert "peer3" in one.present()
-    assert len(one.roster.peers()) == limits.ROSTER_PEERS_MAX - 1
+    assert len(one.roster.peers()) == core_limits.ROSTER_PEERS_MAX - 1
 
 
 def test_sequence_numbers_wrap(one: Harness) -> None:
@@ -643,7 +644,7 @@ def flood(one: Harness, count: int, *, first: int = 0) -> None:
 
 
 def test_peers_without_a_link_that_do_not_hear_us_share_a_few_heartbeats(one: Harness) -> None:
-    flood(one, limits.ROSTER_PEERS_MAX - 2)
+    flood(one, core_limits.ROSTER_PEERS_MAX - 2)
     one.hear(Speaker(who(2))(BeaconKind.ANNOUNCE), multicast=False)
     one.roster.link_up(who(2), one.now)
     one.run(limits.MULTICAST_SILENCE + limits.HEARTBEAT_INTERVAL)
@@ -652,7 +653,7 @@ def test_peers_without_a_link_that_do_not_hear_us_share_a_few_heartbeats(one: Ha
     assert sent.count(linked) >= 11, "who is linked gets each heartbeat"
     others = [address for address in sent if address != linked]
     assert len(others) <= (60 + limits.HEARTBEAT_INTERVAL) * limits.WHISPERS_PER_SECOND
-    assert len(set(others)) == limits.ROSTER_PEERS_MAX - 2, "each in turn"
+    assert len(set(others)) == core_limits.ROSTER_PEERS_MAX - 2, "each in turn"
     assert one.roster.counters["beacon.whisper_limited"]
 
 
@@ -679,14 +680,14 @@ def test_greetings_of_many_invented_addresses_are_few(one: Harness) -> None:
 
 
 def test_in_a_full_roster_who_missed_a_heartbeat_gives_way_but_not_to_many(one: Harness) -> None:
-    flood(one, limits.ROSTER_PEERS_MAX - 1)
+    flood(one, core_limits.ROSTER_PEERS_MAX - 1)
     one.hear(Speaker(who(3))())
     assert "peer3" not in one.present(), "all spoke a moment ago"
     one.run(limits.HEARTBEAT_LATE)
     one.hear(Speaker(who(4))())
     assert "peer4" in one.present()
     flood(one, 1000, first=1000)
-    assert len(one.present()) == limits.ROSTER_PEERS_MAX - 1
+    assert len(one.present()) == core_limits.ROSTER_PEERS_MAX - 1
     new = [name for name in one.present() if name.startswith("n1") and len(name) > 4]
     assert len(new) <= limits.ROSTER_EVICTIONS_PER_SECOND
     assert one.roster.counters["roster.full"] >= 1000 - limits.ROSTER_EVICTIONS_PER_SECOND
@@ -694,12 +695,12 @@ def test_in_a_full_roster_who_missed_a_heartbeat_gives_way_but_not_to_many(one: 
 
 def test_a_linked_peer_gives_way_to_nobody(one: Harness) -> None:
     one.roster.link_up(who(3), one.now)
-    flood(one, limits.ROSTER_PEERS_MAX - 2)
+    flood(one, core_limits.ROSTER_PEERS_MAX - 2)
     for second in range(60):
         one.run(1.0)
         flood(one, 100, first=1000 + 100 * second)
     assert "peer3" in one.present()
-    assert len(one.roster.peers()) == limits.ROSTER_PEERS_MAX - 1
+    assert len(one.roster.peers()) == core_limits.ROSTER_PEERS_MAX - 1
 
 
 def test_a_beacon_that_was_forged_while_its_place_was_linked_takes_no_seat_when_the_link_falls(one: Harness) -> None:

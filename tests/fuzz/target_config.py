@@ -7,12 +7,11 @@ from pathlib import Path
 
 from rmpa.bridge.messages import OpenRoute, decode, encode
 from rmpa.bridge.naming import PeerNames
-from rmpa.config import values
+from rmpa.config import limits, values
 from rmpa.config.contract_rules import read_contracts, read_duration, read_rate
 from rmpa.config.file import known_keys, parse_config
 from rmpa.config.param_rules import overlap, read_follow_rules, untouchable
 from rmpa.config.peer_rules import read_peers
-from rmpa.core import limits
 from rmpa.core.contract import Contracts
 from rmpa.core.errors import ConfigError
 from rmpa.core.names import is_global_name

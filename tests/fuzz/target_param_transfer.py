@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from rmpa.bridge import limits
 from rmpa.bridge.params import transfer
 from rmpa.bridge.params.rules import key_problem, leaves
-from rmpa.core import limits
 from rmpa.core.errors import RmpaError
 
 SEEDS: list[bytes] = [

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 from rmpa.bridge.data.io.flows import ImportFlow
 from rmpa.bridge.data.io.link_time import LinkTime
-from rmpa.core import limits
 from rmpa.core.contract import Contract, Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.guid import Guid
@@ -15,6 +14,7 @@ from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh.frames import WHOLE, Frame, FrameKind
 from rmpa.mesh.handshake import Hello
 from rmpa.mesh.link import HelloReceived, LinkProtocol, LinkRole
+from rmpa.ros import limits
 from tests.simulation.network import World
 from tests.simulation.process import Process
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from rmpa.core import limits
 from rmpa.core.errors import RemoteProtocolError, RmpaError
+from rmpa.ros import limits
 from rmpa.ros.types.definitions import DefinitionError
 from rmpa.ros.types.service_types import ServiceType
 from rmpa.ros.wire.services import (

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded
+from rmpa.ros import limits
 from rmpa.ros.types.definitions import SEPARATOR
 from rmpa.ros.types.messages import MessageError, MessageType
 from rmpa.ros.wire.tcpros import MalformedStream, frame_message, split_messages

@@ -10,7 +10,7 @@ from collections import deque
 from dataclasses import dataclass
 from itertools import pairwise
 
-from rmpa.core import limits
+from rmpa.mesh import limits
 from rmpa.mesh.reliable import Outgoing, ReliableReceiver, ReliableSender
 
 MASK = 0xFFFFFFFF

@@ -6,9 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST, QueuedMessage
+from rmpa.mesh import limits
 from rmpa.mesh.frames import (
     PAYLOAD_MAX,
     WHOLE,
@@ -126,7 +127,7 @@ def test_flags_of_a_later_version_are_ignored(flags: int) -> None:
 
 
 def test_the_longest_fragment_that_is_sent_is_read_and_one_byte_more_than_may_be_is_not() -> None:
-    check_header(limits.FRAGMENT_BYTES, FrameKind.DATA, 0)
+    check_header(core_limits.FRAGMENT_BYTES, FrameKind.DATA, 0)
     check_header(limits.DATA_PAYLOAD_MAX, FrameKind.DATA, WHOLE)
     with pytest.raises(LimitExceeded, match="data"):
         check_header(limits.DATA_PAYLOAD_MAX + 1, FrameKind.DATA, 0)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
+from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pong
 from rmpa.mesh.handshake import Hello, Refusal, Refuse
 from rmpa.mesh.link import ControlReceived, HelloReceived, LinkClosed, LinkRole, LinkState, Refused, Up
+from rmpa.runtime import limits as runtime_limits
 from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, exchange, pair, pass_time, side
 
 
@@ -283,7 +284,7 @@ def test_what_comes_while_leaving_is_ignored_and_the_drain_ends_in_time() -> Non
     dialler.link.close("again", time.now)
     deliver(acceptor.link.control(b"{}") + b"\xff" * 40, dialler.link, time.now)
     assert not any(isinstance(e, ControlReceived) for e in dialler.events)
-    time.now += limits.DRAIN_TIMEOUT
+    time.now += runtime_limits.DRAIN_TIMEOUT
     dialler.link.handle_timer(time.now)
     assert dialler.last() == LinkClosed("done", orderly=True)
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.mesh import limits
 from rmpa.mesh.frames import WHOLE, Frame, FrameKind, pack_data_header
 from rmpa.mesh.handshake import Lane
 from rmpa.mesh.link import ControlReceived, HelloReceived, LinkClosed, LinkRole, LinkState, Marked, Up
@@ -47,7 +48,7 @@ def test_a_large_frame_is_handed_on_while_it_arrives(flags: int, chunk: int) -> 
     time = Time()
     _, acceptor = pair(time)
     payload = bytes(range(251)) * 1000
-    assert limits.CUT_THROUGH_BYTES < len(payload) <= limits.DATA_PAYLOAD_MAX
+    assert core_limits.CUT_THROUGH_BYTES < len(payload) <= limits.DATA_PAYLOAD_MAX
     wire = Frame(FrameKind.DATA, payload, 7, 1, 99, flags).serialize()
     half = len(wire) // 2
     consumed, wanted = acceptor.link.receive(memoryview(wire[:half]), time.now)
@@ -66,7 +67,7 @@ def test_a_large_frame_is_handed_on_while_it_arrives(flags: int, chunk: int) -> 
 def test_a_frame_up_to_the_bound_comes_in_one_piece_however_it_arrives() -> None:
     time = Time()
     _, acceptor = pair(time)
-    payload = bytes(limits.CUT_THROUGH_BYTES)
+    payload = bytes(core_limits.CUT_THROUGH_BYTES)
     deliver(pack_data_header(len(payload), 7, 1, 99) + payload, acceptor.link, time.now, 50_000)
     assert acceptor.data == [(7, 1, 99, payload)]
     assert acceptor.parts == []

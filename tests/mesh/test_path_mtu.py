@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core import limits
+from rmpa.mesh import limits
 from rmpa.mesh.path_mtu import PathState, PathTable, Progress, StallWatch, TcpSample, smaller
 
 FIRST, LEAST = limits.SEGMENT_BYTES

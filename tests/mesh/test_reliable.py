@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
+from rmpa.mesh import limits
 from rmpa.mesh.reliable import DELIVER, DUPLICATE, ReceiveResult, ReliableReceiver, ReliableSender, ResumeTable
 from tests.mesh.reliable_pair import MASK, Bounds, Pair, number_of, payload
 

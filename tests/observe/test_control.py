@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
+from rmpa.observe import limits
 from rmpa.observe.control import ControlReply, ControlRequest
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from rmpa.core import limits
+from rmpa.observe import limits
 from rmpa.observe.health import HERE, Health
 from rmpa.observe.snapshot import EventInfo, FilesInfo, PeerInfo, RouteInfo, ServiceInfo, Snapshot, UnreachableInfo
 from rmpa.ros.types.diagnostic_array import DiagnosticLevel, DiagnosticStatus

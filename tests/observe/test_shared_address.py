@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from rmpa.core import limits
+from rmpa.discovery import limits
 from rmpa.observe.shared_address import mark_shared_addresses
 from rmpa.observe.snapshot import PeerInfo
 

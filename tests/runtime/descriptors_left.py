@@ -8,7 +8,7 @@ import resource
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
+from rmpa.runtime import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

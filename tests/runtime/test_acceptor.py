@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.core import limits
+from rmpa.runtime import limits
 from rmpa.runtime.acceptor import Acceptor
 from rmpa.runtime.descriptors import Descriptors, Use
 from tests.runtime.descriptors_left import descriptors_left

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import pytest
 
-from rmpa.core import limits
 from rmpa.core.counters import Counters
+from rmpa.runtime import limits
 from rmpa.runtime.event_loop import AgentLoop, yielding_to_data
 from rmpa.runtime.garbage_collector import Due, GarbageCollector, what_is_due
 

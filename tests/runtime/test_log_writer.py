@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core import limits
 from rmpa.core.log import configure_logging
+from rmpa.runtime import limits
 from rmpa.runtime.log_writer import LogWriter
 
 if TYPE_CHECKING:

@@ -25,8 +25,8 @@ NOBODY: Final = 65534
 
 CHILD: Final = """
 import dataclasses, json, os, resource, sys, threading
-from rmpa.core.aio import realtime
-from rmpa.core.config import RealtimeSettings
+from rmpa.runtime import realtime
+from rmpa.config.settings import RealtimeSettings
 
 def who(tid=0):
     return os.sched_getscheduler(tid) & ~os.SCHED_RESET_ON_FORK, os.sched_getparam(tid).sched_priority

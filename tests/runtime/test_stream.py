@@ -12,9 +12,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rmpa.core import limits
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import URGENT, Outbox
+from rmpa.core.sizes import KIB, MIB
 from rmpa.runtime.stream import Stream
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ Sockets = tuple[socket.socket, socket.socket]
 
 async def test_all_sizes_in_order_both_ways_through_full_buffers(sockets: Sockets) -> None:
     one, other = End(sockets[0]), End(sockets[1])
-    sizes = [0, 1, 3, 100, 65532, 65533, 200_000, 3 * limits.MIB, 5, 9 * limits.MIB, 7] * 2
+    sizes = [0, 1, 3, 100, 65532, 65533, 200_000, 3 * MIB, 5, 9 * MIB, 7] * 2
     messages = [bytes([i]) * size for i, size in enumerate(sizes)]
     for message in messages:
         one.send(message)
@@ -81,7 +81,7 @@ async def test_all_sizes_in_order_both_ways_through_full_buffers(sockets: Socket
     assert other.got == one.got == messages
     assert one.stream.bytes_out == other.stream.bytes_in == sum(sizes) + 4 * len(sizes)
     assert not one.stream.pending_bytes
-    assert len(one.stream._buffer) <= 4 * limits.MIB, "a large buffer is given back"
+    assert len(one.stream._buffer) <= 4 * MIB, "a large buffer is given back"
     one.stream.close()
     other.stream.close()
 
@@ -109,9 +109,9 @@ def test_any_messages_in_any_pieces(sizes: list[int], cut: int) -> None:
 
 async def test_a_claim_is_not_allocated(sockets: Sockets) -> None:
     end = End(sockets[1])
-    sockets[0].sendall((200 * limits.MIB).to_bytes(4, "big") + bytes(1000))
+    sockets[0].sendall((200 * MIB).to_bytes(4, "big") + bytes(1000))
     await until(lambda: end.stream.bytes_in == 1004)
-    assert len(end.stream._buffer) <= 64 * limits.KIB
+    assert len(end.stream._buffer) <= 64 * KIB
     before = end.stream.last_in
     offered = len(end.offered)
     sockets[0].sendall(bytes(10))
@@ -124,11 +124,11 @@ async def test_a_claim_is_not_allocated(sockets: Sockets) -> None:
 async def test_a_slow_reader_costs_bounded_memory_and_gets_whole_messages(sockets: Sockets) -> None:
     sockets[0].setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
     sockets[1].setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
-    one = End(sockets[0], Outbox(10, 4 * limits.MIB))
+    one = End(sockets[0], Outbox(10, 4 * MIB))
     dropped = sum(one.send(b"%06d" % i + bytes(100_000)) for i in range(300))
     one.send(b"urgent", URGENT)
     assert dropped > 100
-    assert one.stream.pending_bytes <= 4 * limits.MIB
+    assert one.stream.pending_bytes <= 4 * MIB
     other = End(sockets[1])
     await until(lambda: not one.stream.pending_bytes and one.stream.bytes_out == other.stream.bytes_in)
     numbers = [int(m[:6]) for m in other.got if m != b"urgent"]
@@ -153,7 +153,7 @@ async def test_ends_are_told_once_and_not_after_close(sockets: Sockets) -> None:
 
 async def test_finish_lets_what_waits_leave_and_reads_on(sockets: Sockets) -> None:
     one = End(sockets[0])
-    one.send(bytes(8 * limits.MIB))
+    one.send(bytes(8 * MIB))
     one.stream.finish()
     assert one.send(b"late") == 0
     other = End(sockets[1])
@@ -224,7 +224,7 @@ async def test_closing_from_within_a_callback(sockets: Sockets) -> None:
 async def test_drained_waits_for_the_last_byte_and_not_for_ever(sockets: Sockets) -> None:
     one = End(sockets[0])
     await one.stream.drained()
-    one.send(bytes(16 * limits.MIB))
+    one.send(bytes(16 * MIB))
     await one.stream.drained(0.01)
     assert one.stream.pending_bytes
     other = End(sockets[1])

@@ -6,8 +6,9 @@ import asyncio
 import math
 import socket
 
-from rmpa.core import limits
 from rmpa.core.outbox import Outbox
+from rmpa.mesh import limits as mesh_limits
+from rmpa.runtime import limits
 from rmpa.runtime.event_loop import AgentLoop
 from rmpa.runtime.stream import Stream
 
@@ -43,11 +44,11 @@ def run(silence: float, tick: float | None) -> float:
 
 
 def test_a_silence_that_was_watched_ends_with_the_next_bytes() -> None:
-    assert run(3 * limits.STALE_AGE, limits.STALE_TICK) > 0.0
+    assert run(3 * limits.STALE_AGE, mesh_limits.STALE_TICK) > 0.0
 
 
 def test_a_pause_is_none() -> None:
-    assert run(0.0, limits.STALE_TICK) == -math.inf
+    assert run(0.0, mesh_limits.STALE_TICK) == -math.inf
 
 
 def test_a_silence_that_was_watched_until_a_pause_ends_where_the_pause_began() -> None:
@@ -67,7 +68,7 @@ def test_a_silence_that_was_watched_until_a_pause_ends_where_the_pause_began() -
         try:
             until = loop.time() + 2 * limits.STALE_AGE
             while loop.time() < until:
-                await asyncio.sleep(limits.STALE_TICK)
+                await asyncio.sleep(mesh_limits.STALE_TICK)
             paused = loop.time()
             while loop.time() < paused + 2 * limits.STALE_AGE:
                 pass  # as a process that gets no CPU

@@ -7,8 +7,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 from unittest import mock
 
-from rmpa.core import limits
 from rmpa.core.contract import Reliability
+from rmpa.mesh import limits
 from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.scenario import CALM
 from tests.simulation.traffic import Courier

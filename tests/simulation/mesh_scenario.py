@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 from unittest import mock
 
-from rmpa.core import limits
+from rmpa.mesh import limits
 from rmpa.mesh.handshake import Lane
 from tests.simulation.mesh_peer import MeshPeer
 from tests.simulation.scenario import Outcome, Scenario

@@ -8,9 +8,10 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 from unittest import mock
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, Priority, Reliability
 from rmpa.core.outbox import Outbox
+from rmpa.mesh import limits as mesh_limits
 from tests.simulation.lanes_scenario import LanesScenario
 from tests.simulation.mesh_scenario import socket_of
 
@@ -77,7 +78,8 @@ class PointScenario(LanesScenario):
         with (
             super().simulated(),
             mock.patch("rmpa.mesh.io.lane.Outbox", partial(Outbox, fragment=_FRAGMENT)),
-            mock.patch.multiple(limits, FRAGMENT_BYTES=_FRAGMENT, EXPRESS_MESSAGE_MAX=50),
+            mock.patch.object(core_limits, "FRAGMENT_BYTES", _FRAGMENT),
+            mock.patch.object(mesh_limits, "EXPRESS_MESSAGE_MAX", 50),
         ):
             yield
 

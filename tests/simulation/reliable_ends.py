@@ -6,9 +6,10 @@ import json
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import frames
+from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.reliable import ReliableReceiver, ReliableSender, ResumeTable
 
@@ -92,7 +93,7 @@ class Wire:
 
     def _read(self, data: bytes) -> None:
         self._buffer += data
-        header = limits.FRAME_HEADER_BYTES
+        header = mesh_limits.FRAME_HEADER_BYTES
         while len(self._buffer) >= header and not self.end.closed:
             length, kind, flags, _, route, sequence, stamp_ns = frames.unpack_header(self._buffer, 0)
             if len(self._buffer) < header + length:
@@ -204,7 +205,7 @@ class Exporter:
 
     def _park(self) -> None:
         assert self.sender is not None
-        assert self.table.park(IMPORTER, self.sender, self.world.now + limits.RESUME_WINDOW) == []
+        assert self.table.park(IMPORTER, self.sender, self.world.now + core_limits.RESUME_WINDOW) == []
         self.wire = self.sender = None
 
     def _expire(self) -> None:

@@ -9,16 +9,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
+from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from tests.simulation.network import Network, Weather, World
 from tests.simulation.roster_peer import RosterPeer, stranger
 
-CALM: Final = limits.ROSTER_LEASE + 2 * limits.HEARTBEAT_INTERVAL + 2.0
+CALM: Final = core_limits.ROSTER_LEASE + 2 * discovery_limits.HEARTBEAT_INTERVAL + 2.0
 """Seconds after healing within which all rosters agree: a lease for the dead, two heartbeats for the found."""
-AFTER_FORGERY: Final = limits.ROSTER_LEASE_MAX + CALM
+AFTER_FORGERY: Final = discovery_limits.ROSTER_LEASE_MAX + CALM
 """The same where forged beacons asked for the longest lease."""
 
 MakePeer = Callable[..., Any]

@@ -12,7 +12,8 @@ from collections import deque
 from itertools import count
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
+from rmpa.core.sizes import KIB
+from rmpa.mesh import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -52,7 +53,7 @@ class SimSocket:
         """What happens when the other end has got so many more bytes, and not one beyond them."""
         self._network = network
         self._fd = next(_descriptors)
-        self._window = network.world.rng.choice([16 * limits.KIB, 64 * limits.KIB, 400 * limits.KIB])
+        self._window = network.world.rng.choice([16 * KIB, 64 * KIB, 400 * KIB])
         self._slower = network.world.rng.choice(network.slowness)
         self._under_way: deque[tuple[float, bytes]] = deque()
         self._pumping = False

@@ -10,7 +10,7 @@ import os
 
 import pytest
 
-from rmpa.core import limits
+from rmpa.mesh import limits
 from tests.simulation.mesh_scenario import MeshScenario
 from tests.simulation.network import Weather
 

@@ -10,7 +10,8 @@ import os
 
 import pytest
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
+from rmpa.mesh import limits as mesh_limits
 from tests.simulation.reliable_ends import Bounds
 from tests.simulation.reliable_scenario import ReliableScenario
 
@@ -39,7 +40,7 @@ def short(seed: int) -> ReliableScenario:
     for _ in range(2):
         for size in (0, 50, 8):
             scenario.exporter.publish(size)
-        scenario.world.run(scenario.world.now + 3 * limits.ACK_DELAY)
+        scenario.world.run(scenario.world.now + 3 * mesh_limits.ACK_DELAY)
     return scenario
 
 
@@ -94,7 +95,7 @@ def test_an_outage_longer_than_the_buffer_is_reported_with_its_exact_count() -> 
     assert life.receiver.gap_total == lost == 600
 
 
-@pytest.mark.parametrize("seconds", [limits.RESUME_WINDOW + 1, 600.0])
+@pytest.mark.parametrize("seconds", [core_limits.RESUME_WINDOW + 1, 600.0])
 @pytest.mark.parametrize("goes_on", [True, False])
 def test_an_outage_longer_than_the_window_is_counted_exactly(seconds: float, goes_on: bool) -> None:
     scenario = ReliableScenario(3, Bounds())

@@ -25,11 +25,12 @@ from rmpa.bridge.policy import Policy
 from rmpa.bridge.services.io.part import Services
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.config.values import did_you_mean
-from rmpa.core import limits
 from rmpa.core.contract import Contracts
 from rmpa.core.counters import Counters
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, StartError, UnreachableError
 from rmpa.core.open_files import remedy
+from rmpa.mesh import limits as mesh_limits
+from rmpa.observe import limits as observe_limits
 from rmpa.observe.io.control_server import ControlServer
 from rmpa.observe.io.diagnostics import Diagnostics
 from rmpa.observe.io.peer_clocks import PeerClocks
@@ -39,6 +40,7 @@ from rmpa.observe.io.snapshot_builder import SnapshotBuilder
 from rmpa.observe.io.why import WhyService
 from rmpa.observe.snapshot import FollowedInfo, PingReply, Snapshot
 from rmpa.ros.node.logger_services import LoggerServices
+from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime import realtime
 from rmpa.runtime.descriptors import is_shortage, raise_file_limit
 from rmpa.runtime.event_loop import AgentLoop
@@ -200,7 +202,7 @@ class Agent:
                     await self._join(port)
                 except RmpaError as error:
                     _log.warning("! cannot join with the new address yet: %s", error)
-                    await asyncio.sleep(limits.JOIN_RETRY)
+                    await asyncio.sleep(mesh_limits.JOIN_RETRY)
         finally:
             self._moving = None
 
@@ -224,8 +226,8 @@ class Agent:
     async def _ping(self, args: dict[str, object]) -> PingReply:
         link = self._link(str(args.get("peer", "")))
         count = args.get("count", 1)
-        if not isinstance(count, int) or not 1 <= count <= limits.CONTROL_PINGS_MAX:
-            raise ConfigError("count", f"{count!r} is not between 1 and {limits.CONTROL_PINGS_MAX}")
+        if not isinstance(count, int) or not 1 <= count <= observe_limits.CONTROL_PINGS_MAX:
+            raise ConfigError("count", f"{count!r} is not between 1 and {observe_limits.CONTROL_PINGS_MAX}")
         times = [await link.ping() for _ in range(count)]
         host, port = link.remote_endpoint
         return PingReply(times=tuple(times), remote=f"{host}:{port}")
@@ -294,7 +296,7 @@ def run(settings: Settings, load: Callable[[], Loaded] | None = None) -> int:
         StartError: It cannot start on this machine as asked.
     """
     raise_file_limit()
-    sys.setswitchinterval(limits.THREAD_SWITCH)
+    sys.setswitchinterval(runtime_limits.THREAD_SWITCH)
     wishes = realtime.apply(settings.realtime)
     try:
         with asyncio.Runner(loop_factory=AgentLoop) as runner:

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
+from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.io.node_shutdown import KILL
 from rmpa.bridge.policy import OWN_NODE, is_own
 from rmpa.bridge.proxy_names import proxied_node
+from rmpa.config import limits as config_limits
 from rmpa.config.values import did_you_mean
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.names import is_global_name, matches
 from rmpa.ros.core.node_calls import end_node, ping_node
@@ -84,7 +85,7 @@ class NodeRequests:
         if what == LIST:
             return [await self._list_of(attached)]
         question = {"node": str(args.get("node", "")), "by": OWN_NODE, "reason": "user request"}
-        return await self._bridge.asks.ask(attached, what, question, limits.NODE_KILL_TIMEOUT)
+        return await self._bridge.asks.ask(attached, what, question, bridge_limits.NODE_KILL_TIMEOUT)
 
     async def _list_of(self, attached: PeerSession) -> PeerNodes:
         peer = attached.link.name
@@ -120,7 +121,7 @@ class NodeRequests:
 
     async def _kill(self, asker: PeerSession, args: dict[str, Any]) -> NodeEnd:
         node, uri = self._own(args)
-        who = f"{asker.link.name}'s {str(args.get('by', ''))[: limits.ASK_NAME_MAX]}"
+        who = f"{asker.link.name}'s {str(args.get('by', ''))[: bridge_limits.ASK_NAME_MAX]}"
         here = self._settings.name
         if not any(matches(glob, node) for glob in self._settings.nodes.kill):
             _log.warning("! %s may not end %s: no glob of nodes.kill fits", who, node)
@@ -138,7 +139,7 @@ class NodeRequests:
         """
         here = self._settings.name
         node = args.get("node")
-        if not isinstance(node, str) or len(node) > limits.CROSSING_NAME_MAX or not is_global_name(node):
+        if not isinstance(node, str) or len(node) > config_limits.CROSSING_NAME_MAX or not is_global_name(node):
             raise RmpaError("the question names no node")
         if is_own(node):
             origin = proxied_node(node)

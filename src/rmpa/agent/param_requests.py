@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from rmpa.bridge import limits
 from rmpa.bridge.params.transfer import QUESTIONS
 from rmpa.config.values import did_you_mean
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError
 from rmpa.observe.snapshot import FollowedInfo
 

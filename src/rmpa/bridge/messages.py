@@ -12,12 +12,14 @@ from typing import Any, Final
 
 import msgspec
 
-from rmpa.core import limits
+from rmpa.bridge import limits
+from rmpa.config import limits as config_limits
 from rmpa.core.contract import Contract
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import peer_name_problem
 from rmpa.core.names import is_global_name, is_type_name
+from rmpa.mesh import limits as mesh_limits
 
 
 class Source(msgspec.Struct, frozen=True, order=True):
@@ -246,7 +248,7 @@ class OpenService(msgspec.Struct, frozen=True, tag_field="op", tag="service_open
 
     route: int
     service: str
-    timeout: float = limits.SERVICE_TIMEOUT
+    timeout: float = config_limits.SERVICE_TIMEOUT
 
 
 class ServiceOpened(msgspec.Struct, frozen=True, tag_field="op", tag="service_opened"):
@@ -336,12 +338,12 @@ _ROUTE_MAX: Final = (1 << 32) - 1
 
 def is_crossing_name(name: str) -> bool:
     """Whether a topic's or node's name may be in a message: a global one that is not too long."""
-    return len(name) <= limits.CROSSING_NAME_MAX and is_global_name(name)
+    return len(name) <= config_limits.CROSSING_NAME_MAX and is_global_name(name)
 
 
 def is_crossing_type(name: str) -> bool:
     """Whether a type's name may be in a message."""
-    return len(name) <= limits.CROSSING_NAME_MAX and is_type_name(name)
+    return len(name) <= config_limits.CROSSING_NAME_MAX and is_type_name(name)
 
 
 def encode(message: Message) -> bytes:
@@ -356,8 +358,8 @@ def decode(payload: bytes | bytearray | memoryview) -> Message:
         LimitExceeded: It is longer than ``limits.CONTROL_PAYLOAD_MAX``, or offers too many topics.
         RemoteProtocolError: It is not a message of this version, or holds what is not a ROS name or type.
     """
-    if len(payload) > limits.CONTROL_PAYLOAD_MAX:
-        raise LimitExceeded("control message", len(payload), limits.CONTROL_PAYLOAD_MAX)
+    if len(payload) > mesh_limits.CONTROL_PAYLOAD_MAX:
+        raise LimitExceeded("control message", len(payload), mesh_limits.CONTROL_PAYLOAD_MAX)
     try:
         message: Message = _DECODER.decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -442,7 +444,7 @@ def _validate_service(message: ServiceMessage) -> None:
     _check_service_route(message.route)
     if isinstance(message, OpenService):
         _check_names(message.service)
-        if not limits.CONTRACT_TIME_MIN <= message.timeout <= limits.SERVICE_TIMEOUT_MAX:
+        if not config_limits.CONTRACT_TIME_MIN <= message.timeout <= config_limits.SERVICE_TIMEOUT_MAX:
             raise RemoteProtocolError(f"calls of {message.service} that may take {message.timeout} s")
     elif isinstance(message, ServiceClosed):
         _check_text(message.reason)
@@ -477,15 +479,15 @@ def _check_terms(message: OpenRoute | RouteOpened) -> None:
     if isinstance(message, RouteOpened):
         numbers += [n for n in (message.following, message.lost) if not isinstance(n, msgspec.UnsetType)]
     times = (contract.deadline, contract.lifespan, contract.liveliness_lease)
-    lowest, highest = limits.CONTRACT_TIME_MIN, limits.CONTRACT_TIME_MAX
-    lowest_rate = limits.CONTRACT_RATE_MIN
-    if not 1 <= contract.depth <= limits.CONTRACT_DEPTH_MAX:
+    lowest, highest = config_limits.CONTRACT_TIME_MIN, config_limits.CONTRACT_TIME_MAX
+    lowest_rate = config_limits.CONTRACT_RATE_MIN
+    if not 1 <= contract.depth <= config_limits.CONTRACT_DEPTH_MAX:
         problem = f"a depth of {contract.depth}"
     elif any(t is not None and not (math.isfinite(t) and lowest <= t <= highest) for t in times):
         problem = f"times of {times} seconds"
-    elif contract.max_rate is not None and not lowest_rate <= contract.max_rate <= limits.CONTRACT_RATE_MAX:
+    elif contract.max_rate is not None and not lowest_rate <= contract.max_rate <= config_limits.CONTRACT_RATE_MAX:
         problem = f"a rate of {contract.max_rate}"
-    elif not limits.OUTAGE_MIN <= contract.outage <= limits.OUTAGE_MAX:
+    elif not config_limits.OUTAGE_MIN <= contract.outage <= config_limits.OUTAGE_MAX:
         problem = f"an outage of {contract.outage} seconds"
     elif any(not 0 <= number <= _ROUTE_MAX for number in numbers):
         problem = f"the numbers {numbers}"

@@ -14,9 +14,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from rmpa.config import limits
 from rmpa.config.param_rules import CLOCK
 from rmpa.config.peer_rules import PEER
-from rmpa.core import limits
 from rmpa.core.names import matches
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from rmpa.core import limits
+from rmpa.bridge import limits
 
 
 class Pacing:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
+from rmpa.config import limits
 from rmpa.config.param_rules import CLOCK
 from rmpa.config.peer_rules import PEER
 from rmpa.config.settings import TimeSettings
-from rmpa.core import limits
 from rmpa.core.names import NEVER_CROSSING, matches
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from rmpa.core import limits
+from rmpa.bridge import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -10,8 +10,9 @@ import click
 from rmpa.cli.lazy import LazyGroup
 from rmpa.cli.options import json_option
 from rmpa.cli.output import print_json, print_line, printable, warn
-from rmpa.core import limits
+from rmpa.config import limits as config_limits
 from rmpa.core.errors import ConfigError, RmpaError
+from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.io.interfaces import choose, list_interfaces
 
 if TYPE_CHECKING:
@@ -43,11 +44,13 @@ _interface = click.option(
     multiple=True,
     help="Only this one; repeatable. [default: all usable]",
 )
-_group = click.option("--group", default=limits.MULTICAST_GROUP, show_default=True, help="The multicast group.")
+_group = click.option(
+    "--group", default=config_limits.MULTICAST_GROUP, show_default=True, help="The multicast group."
+)
 _port = click.option(
     "--port",
     type=click.IntRange(1, 65535),
-    default=limits.MULTICAST_TEST_PORT,
+    default=discovery_limits.MULTICAST_TEST_PORT,
     show_default=True,
     help="The UDP port.",
 )

@@ -15,8 +15,8 @@ from rmpa.cli.master import choose_master, read_graph
 from rmpa.cli.node_names import ask_peer, find_uri, nodes_of, read_node
 from rmpa.cli.options import agent_option, json_option, master_option
 from rmpa.cli.output import print_json, print_line, printable
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError, RmpaError
+from rmpa.ros import limits
 from rmpa.ros.core.node_calls import end_node, ping_node
 from rmpa.ros.node_info import NodeEnd, NodePing
 

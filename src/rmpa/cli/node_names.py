@@ -9,8 +9,8 @@ from rmpa.bridge.proxy_names import proxied_node
 from rmpa.cli.master import TopicName, read_topic
 from rmpa.cli.output import printable, warn
 from rmpa.config.values import did_you_mean
-from rmpa.core import limits
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.observe import limits
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.observe.snapshot import Snapshot, UnreachableInfo
 from rmpa.ros.http.client import call, call_api

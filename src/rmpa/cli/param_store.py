@@ -12,9 +12,9 @@ from rmpa.bridge.params import transfer
 from rmpa.bridge.params.rules import key_problem, leaves
 from rmpa.cli.master import Master, choose_master
 from rmpa.config.values import did_you_mean
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.names import is_legal_name
+from rmpa.observe import limits
 from rmpa.observe.io.control_client import ControlClient, choose_agent
 
 if TYPE_CHECKING:

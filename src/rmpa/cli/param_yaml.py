@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import yaml
 
-from rmpa.core import limits
 from rmpa.core.errors import RmpaError
+from rmpa.ros import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Final, NoReturn, Self
 import click
 
 from rmpa.cli.output import printable
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError, RmpaError, StartError, UnreachableError
+from rmpa.runtime import limits
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

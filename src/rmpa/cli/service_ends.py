@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge.proxy_names import proxied_node
 from rmpa.config.values import did_you_mean
-from rmpa.core import limits
 from rmpa.core.errors import RmpaError, UnreachableError
+from rmpa.ros import limits
 from rmpa.ros.http.client import call_api
 from rmpa.ros.types.find import find_service_type
 

@@ -6,10 +6,10 @@ import contextlib
 from typing import TYPE_CHECKING
 
 from rmpa.cli.output import duration, printable, size
-from rmpa.core import limits
 from rmpa.core.errors import RmpaError
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.observe.snapshot import Snapshot
+from rmpa.ros import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -10,7 +10,7 @@ import click
 from rmpa.cli.master import read_topic
 from rmpa.cli.options import agent_option, json_option
 from rmpa.cli.output import coloured, print_json, printable
-from rmpa.core import limits
+from rmpa.observe import limits
 from rmpa.observe.io.control_client import ControlClient, choose_agent
 from rmpa.observe.why.diagnosis import Diagnosis, PathStage, StageResult
 

@@ -7,8 +7,8 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeVar
 
+from rmpa.config import limits
 from rmpa.config.values import BadValue, did_you_mean, read_list, read_topic_glob, read_type_glob, read_whole
-from rmpa.core import limits
 from rmpa.core.contract import ContractRule, Durability, History, Liveliness, Priority, Reliability
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final, get_args
 import msgspec
 from msgspec import UNSET, UnsetType
 
+from rmpa.config import limits
 from rmpa.config.values import did_you_mean
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Final
 
+from rmpa.config import limits
 from rmpa.config.settings import FollowRule
 from rmpa.config.values import BadValue, read_name, read_text, read_topic_glob
-from rmpa.core import limits
 from rmpa.core.names import is_global_name, is_legal_name, matches
 
 if TYPE_CHECKING:

@@ -12,10 +12,10 @@ from functools import partial
 from itertools import combinations
 from typing import TYPE_CHECKING, Final, TypeVar
 
+from rmpa.config import limits
 from rmpa.config.contract_rules import ConfigWarning
 from rmpa.config.settings import PeerRule, PolicySettings, Remap
 from rmpa.config.values import BadValue, did_you_mean, read_list, read_text, read_topic_glob, read_type_glob
-from rmpa.core import limits
 from rmpa.core.names import NEVER_CROSSING, is_global_name, matches
 
 if TYPE_CHECKING:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rmpa.config import limits
 from rmpa.config.contract_rules import read_duration
 from rmpa.config.settings import ServiceRule
 from rmpa.config.values import BadValue, read_list, read_topic_glob
-from rmpa.core import limits
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

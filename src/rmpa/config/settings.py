@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
+from rmpa.config import limits
 
 if TYPE_CHECKING:
     from pathlib import Path

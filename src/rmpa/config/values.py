@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from ipaddress import AddressValueError, IPv4Address
 from typing import TYPE_CHECKING, Final, TypeVar
 
+from rmpa.config import limits
 from rmpa.config.settings import HostPort
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.identity import peer_name_from, peer_name_problem
 
 if TYPE_CHECKING:
@@ -114,7 +115,7 @@ def read_whole(raw: object, low: int, high: int, what: str) -> int:
 
 def read_domain(raw: object) -> int:
     """A domain id."""
-    return read_whole(raw, 0, limits.DOMAIN_MAX, "a domain id")
+    return read_whole(raw, 0, core_limits.DOMAIN_MAX, "a domain id")
 
 
 def read_port(raw: object) -> int:

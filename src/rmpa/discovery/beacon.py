@@ -19,10 +19,10 @@ from enum import IntEnum
 from ipaddress import IPv4Address
 from typing import Final
 
-from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.guid import Guid, dialable
 from rmpa.core.identity import Identity
+from rmpa.discovery import limits
 
 Endpoint = tuple[str, int]
 """A numeric address and a port."""

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
+from rmpa.discovery import limits
 from rmpa.discovery.beacon import BeaconKind
 from rmpa.discovery.events import HeardBy
 
@@ -118,7 +119,7 @@ class Endpoint:
         """A link's handshake proves that this run is alive: it gets the seat."""
         voice = self._find(identity.instance)
         if voice is None:
-            voice = PeerInstance(identity, now, now, limits.ROSTER_LEASE, HeardBy.LINK, HeardBy.LINK)
+            voice = PeerInstance(identity, now, now, core_limits.ROSTER_LEASE, HeardBy.LINK, HeardBy.LINK)
         previous = voice.identity
         # A handshake carries no further addresses; those of the beacons stay.
         voice.identity = identity if identity.addresses else replace(identity, addresses=previous.addresses)
@@ -223,7 +224,7 @@ class Endpoint:
 
 def _voice(beacon: Beacon, now: float, source: Address, *, multicast: bool) -> PeerInstance:
     how = HeardBy.MULTICAST if multicast else HeardBy.UNICAST
-    voice = PeerInstance(beacon.identity, now, now, limits.ROSTER_LEASE, how, how)
+    voice = PeerInstance(beacon.identity, now, now, core_limits.ROSTER_LEASE, how, how)
     voice.heed(beacon, now, source, multicast=multicast)
     voice.multicast_at = now if multicast else _NEVER
     return voice

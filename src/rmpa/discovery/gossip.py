@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
 from rmpa.core.token_bucket import TokenBucket
+from rmpa.discovery import limits
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -6,10 +6,10 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
 from rmpa.core.backoff import Backoff
 from rmpa.core.timer_queue import TimerQueue
 from rmpa.core.token_bucket import TokenBucket
+from rmpa.discovery import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable

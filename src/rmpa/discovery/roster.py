@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.clock import earliest
 from rmpa.core.counters import Counters
 from rmpa.core.identity import Identity
 from rmpa.core.token_bucket import TokenBucket
+from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.endpoint import Endpoint, EndpointChange, PeerInstance
 from rmpa.discovery.endpoint_table import EndpointTable
@@ -62,7 +63,7 @@ class Roster:
         *,
         rng: Callable[[], float],
         multicast: bool = True,
-        lease: float = limits.ROSTER_LEASE,
+        lease: float = core_limits.ROSTER_LEASE,
         counters: Counters | None = None,
     ) -> None:
         self.counters = counters if counters is not None else Counters()
@@ -92,7 +93,7 @@ class Roster:
 
     def start(self, now: float) -> None:
         """Announce ourselves: a burst, then silence but for the heartbeat."""
-        own = PeerInstance(self._own, now, now, limits.ROSTER_LEASE, HeardBy.LINK, HeardBy.LINK, linked=True)
+        own = PeerInstance(self._own, now, now, core_limits.ROSTER_LEASE, HeardBy.LINK, HeardBy.LINK, linked=True)
         self._seats.add(self._own.guid.place, Endpoint(own, own=True))
         self._burst = self._burst_times(now, limits.BURST_OFFSETS)
         self._heartbeat_at = self._next_heartbeat(now)
@@ -114,7 +115,7 @@ class Roster:
         key = identity.guid.place
         seat = self._seats.get(key)
         if seat is None:
-            if len(self._seats) >= limits.ROSTER_PEERS_MAX and not self._evict_silent(now):
+            if len(self._seats) >= core_limits.ROSTER_PEERS_MAX and not self._evict_silent(now):
                 self.counters.add("roster.full")
                 return
             seat = self._seats.add(key, Endpoint())
@@ -146,7 +147,7 @@ class Roster:
         key = identity.guid.place
         seat = self._seats.get(key)
         if seat is None:
-            if len(self._seats) >= limits.ROSTER_PEERS_MAX and not self._evict():
+            if len(self._seats) >= core_limits.ROSTER_PEERS_MAX and not self._evict():
                 self.counters.add("roster.full")
                 return
             seat = self._seats.add(key, Endpoint())

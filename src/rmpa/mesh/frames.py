@@ -12,9 +12,9 @@ from enum import IntEnum
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.mesh import limits
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -19,14 +19,15 @@ from enum import Enum, auto
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.clock import earliest
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.core.outbox import FIRST, LAST
-from rmpa.mesh import frames
+from rmpa.mesh import frames, limits
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import HandshakeError, Hello, Lane, Refuse, judge_welcome
 from rmpa.mesh.timing import LinkClock
+from rmpa.runtime import limits as runtime_limits
 
 if TYPE_CHECKING:
     from rmpa.core.guid import Guid
@@ -293,7 +294,7 @@ class LinkProtocol:
                 start = offset + _HEADER
                 end = start + length
                 if end > size:
-                    if kind != _DATA or length <= limits.CUT_THROUGH_BYTES or size - start < _FIRST_PART:
+                    if kind != _DATA or length <= core_limits.CUT_THROUGH_BYTES or size - start < _FIRST_PART:
                         return offset, end - offset
                     # Handed on as it comes: nobody waits for the end of a large frame, and none is moved about.
                     self._left = end - size
@@ -525,7 +526,7 @@ class LinkProtocol:
     def _leave(self, act: _Act, reason: str, now: float) -> None:
         self._state = _NEXT[self._state, act]
         self._reason = reason
-        self._deadline = now + limits.DRAIN_TIMEOUT
+        self._deadline = now + runtime_limits.DRAIN_TIMEOUT
         _log.debug("= %s: closing: %s", self._name, reason)
 
     def _end(self, reason: str, *, orderly: bool = False) -> None:

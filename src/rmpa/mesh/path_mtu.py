@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Final
 
-from rmpa.core import limits
+from rmpa.mesh import limits
 
 _REMEDY: Final = (
     "give the interface or tunnel on the way its true MTU (`ip link set dev NAME mtu N`), or let ICMP 'fragmentation "

@@ -14,11 +14,12 @@ import logging
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Literal
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.backoff import Backoff
 from rmpa.core.clock import earliest
 from rmpa.core.timer_queue import TimerQueue
 from rmpa.core.token_bucket import TokenBucket
+from rmpa.mesh import limits
 from rmpa.mesh.handshake import Hello, KnownLink, Refusal, Refuse, Verdict, judge
 
 if TYPE_CHECKING:
@@ -283,7 +284,7 @@ class Peering:
         peer.last_error = reason
         if silent or now - link.since >= limits.LINK_STABLE:
             peer.backoff.reset()
-        if not peer.announced and len(self._peers) > limits.ROSTER_PEERS_MAX:
+        if not peer.announced and len(self._peers) > core_limits.ROSTER_PEERS_MAX:
             peer.gone = True  # invented identities must not fill the memory, nor make us dial for them
         if peer.gone:
             self._forget_if_idle(peer)

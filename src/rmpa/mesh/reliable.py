@@ -23,8 +23,8 @@ from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import Final, Generic, NamedTuple, TypeVar
 
-from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
+from rmpa.mesh import limits
 
 _MASK: Final = 0xFFFFFFFF
 _HALF: Final = 1 << 31

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from rmpa.core import limits
+from rmpa.mesh import limits
 
 
 @dataclass(frozen=True, slots=True)

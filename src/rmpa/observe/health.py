@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.open_files import remedy
+from rmpa.observe import limits
 from rmpa.observe.health_values import agent_values, link_values, number, route_values, service_values
 from rmpa.ros.types.diagnostic_array import DiagnosticLevel, DiagnosticStatus
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from rmpa.core import limits
+from rmpa.discovery import limits
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence

@@ -13,8 +13,8 @@ import os
 import select
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.core import limits
 from rmpa.core.counters import RefusalLog
+from rmpa.runtime import limits
 from rmpa.runtime.descriptors import DESCRIPTORS, OUT_OF_DESCRIPTORS, Descriptors, Use
 
 if TYPE_CHECKING:

@@ -23,10 +23,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.counters import Counters
 from rmpa.core.errors import OutOfDescriptors
 from rmpa.core.open_files import remedy
+from rmpa.runtime import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable

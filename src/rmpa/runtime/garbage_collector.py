@@ -23,7 +23,7 @@ import time
 from enum import Enum, auto
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
+from rmpa.runtime import limits
 from rmpa.runtime.event_loop import AgentLoop
 
 if TYPE_CHECKING:

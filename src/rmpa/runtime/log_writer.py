@@ -8,7 +8,7 @@ import threading
 import time
 from collections import deque
 
-from rmpa.core import limits
+from rmpa.runtime import limits
 
 _log = logging.getLogger(__name__)
 

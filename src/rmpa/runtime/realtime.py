@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
+from rmpa.core.sizes import KIB
 
 if TYPE_CHECKING:
     import ctypes
@@ -216,7 +216,7 @@ def _lock_memory() -> SchedulingRequest:
         return SchedulingRequest(
             name, False, f"{failed}, although nothing limits it: a filter forbids it, or RAM is short"
         )
-    text = f"{failed}; {soft // limits.KIB} KiB may be locked (ulimit -l), and it takes unlimited"
+    text = f"{failed}; {soft // KIB} KiB may be locked (ulimit -l), and it takes unlimited"
     remedy = _ways(
         "LimitMEMLOCK=infinity",
         login="memlock unlimited",

@@ -5,8 +5,8 @@ from __future__ import annotations
 import errno
 import socket
 
-from rmpa.core import limits
 from rmpa.core.errors import StartError
+from rmpa.runtime import limits
 
 
 def open_mesh_port(port: int = 0) -> tuple[socket.socket, socket.socket]:

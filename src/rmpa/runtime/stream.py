@@ -18,22 +18,24 @@ import termios
 from collections.abc import Callable, Sequence
 from typing import Final, cast
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST, URGENT, Framer, Outbox, QueuedMessage
+from rmpa.core.sizes import KIB, MIB
+from rmpa.runtime import limits
 from rmpa.runtime.segments import SegmentedSocket
 
 _log = logging.getLogger(__name__)
 
-_FIRST_BUFFER: Final = 64 * limits.KIB
-_BUSY_BUFFER: Final = 256 * limits.KIB
-_KEPT_BUFFER: Final = 4 * limits.MIB
+_FIRST_BUFFER: Final = 64 * KIB
+_BUSY_BUFFER: Final = 256 * KIB
+_KEPT_BUFFER: Final = 4 * MIB
 _IOV: Final = 512
 _WRITES: Final = 16
 _CORK_ABOVE: Final = 512
 _CORK_MESSAGES: Final = 128
-_CORK_BYTES: Final = 512 * limits.KIB
-_PART: Final = limits.MIB
+_CORK_BYTES: Final = 512 * KIB
+_PART: Final = MIB
 
 Buffer = bytes | bytearray | memoryview
 OnBytes = Callable[[memoryview], tuple[int, int]]
@@ -302,8 +304,8 @@ class Stream:
         frame = cast("Framer", self._frame)
         parts: list[Buffer] = []
         size = len(view)
-        for start in range(0, size, limits.FRAGMENT_BYTES):
-            part = view[start : start + limits.FRAGMENT_BYTES]
+        for start in range(0, size, core_limits.FRAGMENT_BYTES):
+            part = view[start : start + core_limits.FRAGMENT_BYTES]
             first = FIRST if parcel.sent + start == 0 else 0
             last = LAST if parcel.sent + start + len(part) == parcel.size else 0
             parts += (frame(parcel, len(part), first | last), part)

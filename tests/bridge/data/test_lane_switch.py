@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from rmpa.bridge.data.lane_switch import BULK, EXPRESS, LaneSwitch
-from rmpa.core import limits
 from rmpa.core.contract import Contract, Priority
+from rmpa.mesh import limits
 from rmpa.mesh.handshake import Lane
 
 SMALL = limits.EXPRESS_MESSAGE_MAX

@@ -5,8 +5,9 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rmpa.bridge import limits
 from rmpa.bridge.data.peer_clock import ClockEstimate, PeerClock
-from rmpa.core import limits
+from rmpa.mesh import limits as mesh_limits
 
 
 def test_estimates_are_kept_in_order() -> None:
@@ -29,7 +30,7 @@ def test_a_clock_that_was_set_makes_all_before_void() -> None:
 def test_drift_is_no_setting() -> None:
     clock = PeerClock()
     clock.told(0.0, 0.0, 0.0)
-    clock.told(3600 * limits.CLOCK_DRIFT, 0.0, 3600.0)
+    clock.told(3600 * mesh_limits.CLOCK_DRIFT, 0.0, 3600.0)
     assert len(list(clock)) == 2
 
 

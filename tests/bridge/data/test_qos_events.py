@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rmpa.bridge import limits
 from rmpa.bridge.data.qos_events import QosEvent, QosEventKind, QosWatch
-from rmpa.core import limits
+from rmpa.config import limits as config_limits
 from rmpa.core.contract import Contract, Liveliness
 
 TICKS = st.lists(st.integers(0, 40), max_size=40).map(lambda gaps: [sum(gaps[: n + 1]) / 8 for n in range(len(gaps))])
@@ -105,7 +106,11 @@ def test_late_timers_invent_no_miss_and_tell_all_that_still_last(
     assert watch.counts[QosEventKind.DEADLINE_MISSED] - missed_before == 10
 
 
-@given(st.floats(limits.CONTRACT_TIME_MIN, 100.0), st.floats(0.0, 1e9), st.lists(st.floats(0.0, 50.0), max_size=20))
+@given(
+    st.floats(config_limits.CONTRACT_TIME_MIN, 100.0),
+    st.floats(0.0, 1e9),
+    st.lists(st.floats(0.0, 50.0), max_size=20),
+)
 def test_rounding_neither_stops_nor_spins_the_timer(deadline: float, start: float, pauses: list[float]) -> None:
     watch = QosWatch(Contract(deadline=deadline), start)
     now = start

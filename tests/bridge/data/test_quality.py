@@ -10,10 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rmpa.bridge import limits
 from rmpa.bridge.data.peer_clock import PeerClock
 from rmpa.bridge.data.quality import Quality
-from rmpa.core import limits
 from rmpa.core.stats import SampleSummary
+from rmpa.mesh import limits as mesh_limits
 
 SECOND = 1_000_000_000
 WALL = 1_700_000_000 * SECOND
@@ -72,7 +73,7 @@ def test_a_clock_that_is_ahead_is_taken_off() -> None:
     s = quality.summary(clock(-7200.0, 0.0002, 1.1), 1.1)
     assert s.latency is not None
     assert s.latency.maximum == pytest.approx(0.003, abs=1e-6)
-    assert s.latency_error == pytest.approx(0.0002 + 0.1 * limits.CLOCK_DRIFT)
+    assert s.latency_error == pytest.approx(0.0002 + 0.1 * mesh_limits.CLOCK_DRIFT)
 
 
 def test_without_the_other_clock_there_is_no_latency() -> None:
@@ -129,7 +130,7 @@ def test_each_latency_is_corrected_by_what_was_known_at_its_time() -> None:
     assert s.latency.count == 51
     assert s.latency.minimum == pytest.approx(0.001, abs=2e-5)
     assert s.latency.maximum == pytest.approx(0.001, abs=2e-5)
-    assert s.latency_error == pytest.approx(0.0001 + 0.5 * limits.CLOCK_DRIFT)
+    assert s.latency_error == pytest.approx(0.0001 + 0.5 * mesh_limits.CLOCK_DRIFT)
 
 
 def test_latencies_of_before_a_clock_was_set_are_forgotten() -> None:

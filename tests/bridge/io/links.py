@@ -6,10 +6,12 @@ import asyncio
 import math
 from typing import TYPE_CHECKING, Any, cast
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.outbox import FIRST, LAST, URGENT, Outbox
+from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.io.lane import LaneSender
+from rmpa.runtime import limits as runtime_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -23,7 +25,7 @@ class Wire:
     """One direction of one connection: the lane's stream, the kernel's buffers and the other end's parser."""
 
     def __init__(self, deliver: Callable[[Frame], None]) -> None:
-        self.outbox = Outbox(1, limits.LINK_URGENT_BYTES)
+        self.outbox = Outbox(1, mesh_limits.LINK_URGENT_BYTES)
         self.lost = False
         self._deliver = deliver
         self._flying = bytearray()
@@ -108,7 +110,7 @@ class LinkEnd:
         self.far: LinkEnd | None = None
         self.express, self.bulk = LaneSender("express"), LaneSender("bulk")
         for lane in (self.express, self.bulk):
-            lane.outbox._fragment = limits.FRAGMENT_BYTES
+            lane.outbox._fragment = core_limits.FRAGMENT_BYTES
         self.wires: dict[str, Wire] = {}
 
     def __repr__(self) -> str:
@@ -146,7 +148,7 @@ class LinkEnd:
         if self.gone:
             return
         now = self._loop.time()
-        if now - self._heard > limits.STALE_AGE:
+        if now - self._heard > runtime_limits.STALE_AGE:
             self.resumed_at = now
         self._heard = now
         bridge, link = self.side.bridge, cast("MeshLink", self)

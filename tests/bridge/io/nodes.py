@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol, cast
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.outbox import QueuedMessage
+from rmpa.ros import limits as ros_limits
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
 
 if TYPE_CHECKING:
@@ -251,7 +252,7 @@ class PublisherConnection:
 
     def take(self, framed: bytes) -> None:
         """The speaker has said something."""
-        if len(framed) - 4 > limits.TCPROS_MESSAGE_MAX:
+        if len(framed) - 4 > ros_limits.TCPROS_MESSAGE_MAX:
             self._on_oversized(len(framed) - 4)
             return
         self._queue.append(framed)
@@ -263,7 +264,7 @@ class PublisherConnection:
         while not self._closed and (self._rest is not None or self._queue):
             if self._rest is None:
                 framed = self._queue.popleft()
-                if len(framed) <= limits.CUT_THROUGH_BYTES:
+                if len(framed) <= core_limits.CUT_THROUGH_BYTES:
                     self._on_message(memoryview(bytearray(framed)))
                     continue
                 self._rest = memoryview(framed)

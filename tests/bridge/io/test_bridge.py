@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, cast
 
 import pytest
 
+from rmpa.bridge import limits
 from rmpa.bridge.actions import Describe, Disconnect, Warn
 from rmpa.bridge.io.bridge import Bridge
 from rmpa.bridge.messages import Advertise, Description, Source, TopicOffer, encode
 from rmpa.bridge.policy import Policy
+from rmpa.config import limits as config_limits
 from rmpa.config.settings import PolicySettings
-from rmpa.core import limits
 from rmpa.core.contract import Contract
 from rmpa.core.errors import LimitExceeded
 
@@ -76,8 +77,8 @@ async def test_an_action_that_fails_does_not_hold_up_the_next_ones(
 
 
 def test_the_longest_advertisement_of_ours_is_within_the_limit_of_one() -> None:
-    longest = "/" + "x" * (limits.CROSSING_NAME_MAX - 1)
-    kind = f"a/{'x' * (limits.CROSSING_NAME_MAX - 2)}"
+    longest = "/" + "x" * (config_limits.CROSSING_NAME_MAX - 1)
+    kind = f"a/{'x' * (config_limits.CROSSING_NAME_MAX - 2)}"
     offers = tuple(TopicOffer(longest, longest, kind) for _ in range(limits.ADVERTISED_AT_ONCE))
     assert len(encode(Advertise(added=offers, full=True, more=True))) < limits.ADVERTISEMENT_MAX
 

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.bridge import limits
 from rmpa.bridge.data.qos_events import QosEventKind
 from rmpa.bridge.messages import Source
-from rmpa.core import limits
 from rmpa.core.contract import ContractRule, History, Reliability
+from rmpa.mesh import limits as mesh_limits
 from tests.bridge.io.two_bridges import World, made_up
 from tests.bridge.io.virtual import VirtualLoop, run
 
@@ -96,7 +97,7 @@ async def settled(world: World) -> None:
 async def outage(world: World, speaker: Speaker, seconds: float) -> None:
     """The cable is out, the publisher goes on; each side notices by its lease, or a little before."""
     world.cut()
-    noticed = [min(seconds / 2, limits.LINK_LEASE * world.rng.uniform(0.3, 1.0)) for _ in world.sides]
+    noticed = [min(seconds / 2, mesh_limits.LINK_LEASE * world.rng.uniform(0.3, 1.0)) for _ in world.sides]
     for index, when in enumerate(noticed):
         silent = world.rng.random() < 0.7
         asyncio.get_running_loop().call_later(when, lambda i=index, s=silent: world.notice(i, silent=s))  # type: ignore[misc] # bound here
@@ -155,7 +156,7 @@ def test_beyond_the_depth_the_oldest_are_lost_and_counted(seconds: float) -> Non
 
 
 def test_beyond_the_bytes_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "REPLAY_BYTES", 50 * 14)
+    monkeypatch.setattr(mesh_limits, "REPLAY_BYTES", 50 * 14)
 
     async def scene(world: World) -> None:
         assert 20 / PERIOD - 55 <= await one_outage(world, 20.0) <= 20 / PERIOD - 25
@@ -164,7 +165,7 @@ def test_beyond_the_bytes_too(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_beyond_the_bytes_of_all_routes_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "RESUME_BYTES_MAX", 50 * 14)
+    monkeypatch.setattr(mesh_limits, "RESUME_BYTES_MAX", 50 * 14)
 
     async def scene(world: World) -> None:
         lost = await one_outage(world, 20.0)
@@ -283,12 +284,12 @@ def waits(side: Side) -> bool:
 def test_what_is_kept_waits_until_the_peer_was_told_of_its_topic() -> None:
     async def scene(world: World) -> None:
         a, b = world.sides
-        speaker, listener = await begin_at_the_end(world, 1.5 * limits.RESUME_CLAIM)
+        speaker, listener = await begin_at_the_end(world, 1.5 * mesh_limits.RESUME_CLAIM)
         await back_on_a_busy_lane(world, speaker)
-        await world.rest(1.2 * limits.RESUME_CLAIM)
+        await world.rest(1.2 * mesh_limits.RESUME_CLAIM)
         assert waits(a)
         assert SURE not in [offer.source for offer in told(a)]
-        await world.rest(0.5 * limits.RESUME_CLAIM)
+        await world.rest(0.5 * mesh_limits.RESUME_CLAIM)
         await settled(world)
         assert accounted(world, speaker, listener) == 0
         assert not waits(a)
@@ -300,13 +301,13 @@ def test_what_is_kept_waits_until_the_peer_was_told_of_its_topic() -> None:
 def test_what_nobody_asks_for_after_it_was_told_goes_the_usual_time_later() -> None:
     async def scene(world: World) -> None:
         a, _ = world.sides
-        speaker, listener = await begin_at_the_end(world, 1.5 * limits.RESUME_CLAIM)
+        speaker, listener = await begin_at_the_end(world, 1.5 * mesh_limits.RESUME_CLAIM)
         world.cut()
         world.leave(listener)
         await back_on_a_busy_lane(world, speaker)
-        await world.rest(2.4 * limits.RESUME_CLAIM, step=0.1)
+        await world.rest(2.4 * mesh_limits.RESUME_CLAIM, step=0.1)
         assert waits(a), "it was told a while ago only"
-        await world.rest(0.3 * limits.RESUME_CLAIM, step=0.1)
+        await world.rest(0.3 * mesh_limits.RESUME_CLAIM, step=0.1)
         assert not waits(a)
 
     play(12, scene, outage=600.0, depth=100_000)
@@ -318,7 +319,7 @@ def test_a_peer_that_is_never_told_everything_is_not_waited_for_without_end(monk
         speaker, _ = await begin_at_the_end(world, 1.0)
         monkeypatch.setattr(limits, "TELL_PATIENCE", 1e9)
         await back_on_a_busy_lane(world, speaker)
-        await world.rest(limits.RESUME_CLAIM_MAX - 1.0, step=0.1)
+        await world.rest(mesh_limits.RESUME_CLAIM_MAX - 1.0, step=0.1)
         assert waits(a)
         await world.rest(2.0, step=0.1)
         assert not waits(a)
@@ -338,7 +339,7 @@ def test_the_links_end_ends_the_waiting_for_its_claims(monkeypatch: pytest.Monke
         for index in (0, 1):
             world.notice(index, silent=True)
         assert timer.cancelled()
-        await asyncio.sleep(2 * limits.RESUME_CLAIM_MAX)
+        await asyncio.sleep(2 * mesh_limits.RESUME_CLAIM_MAX)
         assert waits(a), "its outage goes on"
 
     play(14, scene, outage=6000.0, depth=100_000)
@@ -366,7 +367,7 @@ def test_a_subscriber_that_left_meanwhile_misses_nothing() -> None:
         assert lost_at_receiver(b) == 0
         assert unknown_at_receiver(b) == 0
         world.leave(late)
-        await world.rest(2 * limits.RESUME_CLAIM, step=0.1)
+        await world.rest(2 * mesh_limits.RESUME_CLAIM, step=0.1)
         world.check_nothing_is_left()
 
     play(9, scene, outage=5.0)
@@ -418,7 +419,7 @@ def test_a_publisher_that_restarts_takes_what_was_not_received_along_and_that_is
 
 
 def test_what_is_only_counted_takes_no_memory_and_ends_after_a_day(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "OUTAGE_COUNTED", 3600.0)
+    monkeypatch.setattr(mesh_limits, "OUTAGE_COUNTED", 3600.0)
 
     async def scene(world: World) -> None:
         a, b = world.sides
@@ -446,7 +447,7 @@ def test_what_is_only_counted_takes_no_memory_and_ends_after_a_day(monkeypatch: 
 
 
 def test_peers_that_never_come_back_are_forgotten_beyond_their_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "ABSENT_PEERS_MAX", 0)
+    monkeypatch.setattr(mesh_limits, "ABSENT_PEERS_MAX", 0)
 
     async def scene(world: World) -> None:
         a, b = world.sides

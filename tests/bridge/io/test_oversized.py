@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.bridge.messages import Notification, Source, encode
-from rmpa.core import limits
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.mesh.frames import Frame, FrameKind
+from rmpa.ros import limits
 from tests.bridge.io.two_bridges import World, made_up
 from tests.bridge.io.virtual import VirtualLoop, run
 

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.bridge import limits
 from rmpa.bridge.messages import OpenRoute, encode
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, ContractRule, Durability, Priority, Reliability
+from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import Frame, FrameKind
 from tests.bridge.io.two_bridges import World, made_up
 from tests.bridge.io.virtual import VirtualLoop, run
@@ -76,7 +78,7 @@ async def outages(world: World) -> None:
             case 8:
                 world.notice_bulk(rng.randint(0, 1))
             case 9:
-                await world.outage(rng.choice([0.0, 0.4, 0.6, 1.5, 5.0, limits.RESUME_WINDOW * 0.9]))
+                await world.outage(rng.choice([0.0, 0.4, 0.6, 1.5, 5.0, core_limits.RESUME_WINDOW * 0.9]))
     world.link()
     await world.rest(8.0)
     for speaker in speakers:
@@ -171,7 +173,7 @@ async def a_lie(world: World) -> None:
     await world.rest(0.5)
     assert numbers(listener, speaker) == [1, 2]
     world.leave(listener)
-    await world.rest(2 * limits.RESUME_CLAIM)
+    await world.rest(2 * mesh_limits.RESUME_CLAIM)
     world.check_nothing_is_left()
 
 
@@ -230,7 +232,7 @@ async def something_about_links(world: World, rng: random.Random) -> None:
         case 8:
             world.mend_bulk()
         case 9 if rng.random() < 0.5:
-            await world.outage(rng.choice([0.0, 0.3, 0.7, 4.0, limits.RESUME_WINDOW + 2]))
+            await world.outage(rng.choice([0.0, 0.3, 0.7, 4.0, core_limits.RESUME_WINDOW + 2]))
 
 
 async def come_to_rest(world: World) -> None:
@@ -249,7 +251,7 @@ async def come_to_rest(world: World) -> None:
     for side in world.sides:
         for listener in list(side.listeners):
             world.leave(listener)
-    await world.rest(limits.ROUTE_LINGER + limits.RESUME_WINDOW + 10.0, step=0.1)
+    await world.rest(limits.ROUTE_LINGER + core_limits.RESUME_WINDOW + 10.0, step=0.1)
     world.check_nothing_is_left()
 
 

@@ -9,13 +9,15 @@ from types import MappingProxyType, SimpleNamespace
 from typing import TYPE_CHECKING, Final, Self, cast
 from unittest import mock
 
+from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.io.bridge import Bridge
 from rmpa.bridge.policy import Policy
 from rmpa.config.settings import PolicySettings
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contracts
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
+from rmpa.mesh import limits as mesh_limits
 from tests.bridge.io.links import LinkEnd
 from tests.bridge.io.nodes import Core, Listener, Node, PublisherConnection, Speaker, stages
 
@@ -185,11 +187,13 @@ class World:
         began = asyncio.get_running_loop().time()
         for index in self.rng.sample((0, 1), 2):
             if self.rng.random() < 0.8:
-                await asyncio.sleep(min(seconds, limits.LINK_LEASE) * self.rng.random() / 2)
+                await asyncio.sleep(min(seconds, mesh_limits.LINK_LEASE) * self.rng.random() / 2)
                 self.notice(index, silent=self.rng.random() < 0.6)
         self.cut()
-        await asyncio.sleep(max(0.0, began + min(seconds, limits.LINK_LEASE) - asyncio.get_running_loop().time()))
-        if seconds > limits.LINK_LEASE:
+        await asyncio.sleep(
+            max(0.0, began + min(seconds, mesh_limits.LINK_LEASE) - asyncio.get_running_loop().time())
+        )
+        if seconds > mesh_limits.LINK_LEASE:
             for index in (0, 1):
                 self.notice(index, silent=True)
         await asyncio.sleep(max(0.0, began + seconds - asyncio.get_running_loop().time()))
@@ -270,8 +274,8 @@ class World:
     async def wait(self, seconds: float) -> None:
         """Let time go on; a link that nothing came over for as long as a lease would be no link."""
         while seconds > 0:
-            await asyncio.sleep(min(seconds, limits.LINK_LEASE / 2))
-            seconds -= limits.LINK_LEASE / 2
+            await asyncio.sleep(min(seconds, mesh_limits.LINK_LEASE / 2))
+            seconds -= mesh_limits.LINK_LEASE / 2
             if seconds > 0:
                 self._carry_all()
 
@@ -313,9 +317,10 @@ def made_up(loop: VirtualLoop) -> Iterator[None]:
     """Doubles in place of sockets, small limits, and one clock for all."""
     with ExitStack() as stack:
         for name, value in SMALL_LIMITS.items():
-            stack.enter_context(mock.patch.object(limits, name, value))
-        for where in ("proxy_nodes", "bridge"):
-            stack.enter_context(mock.patch(f"rmpa.bridge.io.{where}.SlaveNode", Node))
+            module = next(room for room in (core_limits, mesh_limits, bridge_limits) if hasattr(room, name))
+            stack.enter_context(mock.patch.object(module, name, value))
+        for where in ("session.proxy_nodes", "io.bridge"):
+            stack.enter_context(mock.patch(f"rmpa.bridge.{where}.SlaveNode", Node))
         stack.enter_context(mock.patch("rmpa.bridge.session.proxy_nodes.is_loopback", return_value=False))
         stack.enter_context(
             mock.patch("rmpa.bridge.topics.io.local_subscriptions.PublisherConnection", PublisherConnection)

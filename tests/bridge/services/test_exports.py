@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from rmpa.bridge import limits
 from rmpa.bridge.actions import Send
 from rmpa.bridge.messages import (
     AdvertiseServices,
@@ -22,8 +23,8 @@ from rmpa.bridge.services.exports import (
     ServiceAbout,
     ServiceExports,
 )
+from rmpa.config import limits as config_limits
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings
-from rmpa.core import limits
 from rmpa.core.errors import RemoteProtocolError
 from tests.bridge.services.test_rules import obey, rules
 
@@ -117,7 +118,7 @@ def test_a_service_is_opened_at_once_when_its_server_is_known(exports: ServiceEx
     serve, send = exports.opened(2, OpenService(ROUTE, "/add"))
     assert isinstance(serve, ServeRoute)
     assert isinstance(send, Send)
-    assert (serve.peer, serve.timeout, send.peer) == (2, limits.SERVICE_TIMEOUT, 2)
+    assert (serve.peer, serve.timeout, send.peer) == (2, config_limits.SERVICE_TIMEOUT, 2)
     assert exports.callers("/add") == (1, 2)
     assert exports.closed(1, CloseService(ROUTE)) == [EndRoute(1, ROUTE, first)]
     assert exports.closed(1, CloseService(ROUTE)) == [], "words that crossed"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from rmpa.bridge import limits
 from rmpa.bridge.actions import Send
 from rmpa.bridge.messages import (
     AdvertiseServices,
@@ -24,7 +25,6 @@ from rmpa.bridge.services.imports import (
     Withdraw,
 )
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings
-from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from tests.bridge.services.test_rules import obey, rules
 

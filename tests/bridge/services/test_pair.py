@@ -8,6 +8,7 @@ from collections import deque
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rmpa.bridge import limits
 from rmpa.bridge.actions import Send, Warn
 from rmpa.bridge.messages import (
     AdvertiseServices,
@@ -41,7 +42,6 @@ from rmpa.bridge.services.imports import (
     Withdraw,
 )
 from rmpa.config.settings import ServiceSettings
-from rmpa.core import limits
 from rmpa.core.errors import RemoteProtocolError
 from tests.bridge.services.test_rules import obey, rules
 

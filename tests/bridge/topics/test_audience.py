@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
+from rmpa.bridge import limits
 from rmpa.bridge.topics.audience import audience, is_watched
-from rmpa.core import limits
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from rmpa.bridge import limits
 from rmpa.bridge.actions import Action, Describe, Detach, Publish, Retract, Send, Warn
 from rmpa.bridge.messages import (
     Advertise,
@@ -19,7 +20,6 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.topics.imports import TRANSITIONS, Imports, RouteState
 from rmpa.config.settings import PolicySettings
-from rmpa.core import limits
 from rmpa.core.contract import Contract, ContractRule, Contracts, Reliability
 
 CMD = Source("/cmd", "/joy")

@@ -1,8 +1,8 @@
 from __future__ import annotations
 
+from rmpa.bridge import limits
 from rmpa.bridge.messages import Source
 from rmpa.bridge.topics.mismatches import Mismatches
-from rmpa.core import limits
 
 CMD = Source("/cmd", "/joy")
 POSE = Source("/pose", "/base")

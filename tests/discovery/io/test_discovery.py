@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.config.settings import HostPort, Settings
-from rmpa.core import limits
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
+from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.events import Event, HeardBy, LossReason, PeerConflict, PeerFound, PeerLost, PeerRestarted
 from rmpa.discovery.io.discovery import Discovery

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 
-from rmpa.core import limits
 from rmpa.core.counters import Counters
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
+from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
 from rmpa.discovery.io.packet_filter import PacketFilter
 

@@ -18,10 +18,12 @@ from collections.abc import Callable, Iterator
 import psutil
 
 from rmpa.bridge.messages import Advertise, Description, OpenRoute, RouteOpened, TopicOffer, encode
-from rmpa.core import limits
+from rmpa.config import limits as config_limits
+from rmpa.core import limits as core_limits
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.discovery.beacon import Beacon, BeaconKind
+from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Hello
 
@@ -40,7 +42,7 @@ def say(**fields: object) -> None:
 def beacon(guid: Guid, name: str, kind: BeaconKind = BeaconKind.ANNOUNCE, domain: int = 0) -> bytes:
     """A valid beacon of somebody."""
     gossip = tuple(Guid.of(f"10.77.9.{RNG.randrange(1, 255)}", RNG.randrange(1, 65536)) for _ in range(8))
-    identity = Identity(guid, RNG.randbytes(limits.INSTANCE_ID_BYTES), name, domain)
+    identity = Identity(guid, RNG.randbytes(core_limits.INSTANCE_ID_BYTES), name, domain)
     return Beacon(kind, identity, 120_000, RNG.getrandbits(32), gossip).serialize()
 
 
@@ -78,7 +80,7 @@ def group(real: list[Guid]) -> None:
     count = 0
     for data in packets(real):
         count += 1
-        senders[count % len(senders)].sendto(data, (limits.MULTICAST_GROUP, limits.MULTICAST_PORT))
+        senders[count % len(senders)].sendto(data, (config_limits.MULTICAST_GROUP, config_limits.MULTICAST_PORT))
         if count % 100 == 0:
             time.sleep(0.03)
     say(packets=count, senders=len(senders))
@@ -94,7 +96,7 @@ class Link:
         self.sock = socket.create_connection(there.endpoint, 5.0)
         self.sock.settimeout(5.0)
         self.data = b""
-        identity = Identity(Guid.of(here, port), os.urandom(limits.INSTANCE_ID_BYTES), "eve", 0)
+        identity = Identity(Guid.of(here, port), os.urandom(core_limits.INSTANCE_ID_BYTES), "eve", 0)
         self.send(FrameKind.HELLO, Hello.of(identity, lease=60.0, expected=there).serialize())
         answer = self.frame()
         assert answer.kind is FrameKind.WELCOME, answer.payload
@@ -196,7 +198,7 @@ ATTACKS: tuple[tuple[Callable[[Link], None], bool | None], ...] = (
     (wrong_length, False),
     (control(b"[" * 100_000), False),
     (control(b"{" + RNG.randbytes(100_000)), False),
-    (control(b'"' + b"x" * (limits.CONTROL_PAYLOAD_MAX - 2) + b'"'), False),
+    (control(b'"' + b"x" * (mesh_limits.CONTROL_PAYLOAD_MAX - 2) + b'"'), False),
     (offer("/" + "x" * 1_000_000), False),
     (offer("no_slash"), False),
     (offer("/a//b"), False),

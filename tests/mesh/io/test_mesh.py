@@ -16,13 +16,15 @@ from typing import Any
 import pytest
 
 from rmpa.config.settings import LaneSettings
-from rmpa.core import limits
 from rmpa.core.counters import Counters
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
+from rmpa.core.sizes import KIB, MIB
+from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Lane, Refusal, Refuse
 from rmpa.mesh.io.sockets import tune_express
+from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.descriptors import DESCRIPTORS
 from tests.mesh.io.meshes import DEADLINE, Peer, peers, raw, until
 from tests.runtime.descriptors_left import descriptors_left
@@ -183,7 +185,7 @@ async def test_small_and_large_messages_in_order_and_byte_exact() -> None:
             sent.append((1, i, i, b"%064d" % i))
             assert link.express.send(*sent[-1]) == 0
             if i % 500 == 0:
-                large = hashlib.sha256(bytes([i // 500])).digest() * (limits.MIB // 32)
+                large = hashlib.sha256(bytes([i // 500])).digest() * (MIB // 32)
                 sent.append((2, i, i, large))
                 assert link.express.send(*sent[-1]) == 0
             if link.queue_bytes or i % 500 == 0:
@@ -255,7 +257,7 @@ async def test_another_domain_is_refused_with_what_to_do(caplog: pytest.LogCaptu
 async def test_a_stopped_peer_is_down_after_its_lease_and_its_memory_is_bounded(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(limits, "LINK_QUEUE_BYTES", 4 * limits.MIB)
+    monkeypatch.setattr(limits, "LINK_QUEUE_BYTES", 4 * MIB)
     async with peers(1) as (one,):
         stopped = Identity(Guid.of("127.0.0.1", 9), b"s" * 16, "stopped")
         sock, answer = await raw(one, stopped, lease=0.5)
@@ -266,10 +268,10 @@ async def test_a_stopped_peer_is_down_after_its_lease_and_its_memory_is_bounded(
         began = asyncio.get_running_loop().time()
         await asyncio.get_running_loop().sock_sendall(sock, Frame(FrameKind.PING, stamp_ns=1).serialize())
         await until(lambda: link.bytes_in > got, "its first word, from which on the lease counts")
-        block = bytes(limits.MIB)
+        block = bytes(MIB)
         for i in range(64):
             link.express.send(5, i, i, block)
-            assert link.queue_bytes <= 6 * limits.MIB
+            assert link.queue_bytes <= 6 * MIB
         assert link.dropped >= 50
         assert link.close_route(5) <= 4
         await until(lambda: bool(one.downs), "the lease is over")
@@ -279,12 +281,12 @@ async def test_a_stopped_peer_is_down_after_its_lease_and_its_memory_is_bounded(
 
 
 async def test_control_that_nobody_reads_closes_the_link_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "LINK_URGENT_BYTES", limits.MIB)
+    monkeypatch.setattr(limits, "LINK_URGENT_BYTES", MIB)
     async with peers(1) as (one,):
         sock, _ = await raw(one, Identity(Guid.of("127.0.0.1", 9), b"s" * 16, "deaf"), lease=60.0)
         await until(lambda: bool(one.ups), "a link")
         for _ in range(64):
-            one.ups[0].send_control(bytes(limits.MIB // 2))
+            one.ups[0].send_control(bytes(MIB // 2))
         await until(lambda: bool(one.downs), "closed")
         assert "deaf does not read" in one.downs[0][1]
         sock.close()
@@ -299,7 +301,7 @@ def test_little_waits_in_the_kernel_for_a_peer_that_is_slow() -> None:
         with server.accept()[0]:  # reads nothing
             with contextlib.suppress(BlockingIOError):
                 while True:
-                    sock.send(bytes(16 * limits.KIB))
+                    sock.send(bytes(16 * KIB))
             unsent = fcntl.ioctl(sock, _SIOCOUTQNSD, bytes(4))
     assert int.from_bytes(unsent, sys.byteorder) <= 2 * limits.LINK_UNSENT_BYTES
     assert counters.as_dict() == {}
@@ -324,7 +326,7 @@ async def test_what_waits_for_a_link_that_ends_is_counted() -> None:
     async with peers(2) as (one, other):
         await until(lambda: one.linked(other) and other.linked(one), "a link")
         lane = one.link(other).express
-        dropped = sum(lane.send(1, number, 0, bytes(limits.MIB // 8)) for number in range(200))
+        dropped = sum(lane.send(1, number, 0, bytes(MIB // 8)) for number in range(200))
         waiting = lane.outbox.waiting_entries
         assert (waiting > 50, dropped) == (True, 0)
         other.kill()
@@ -349,7 +351,7 @@ async def test_a_peer_that_is_not_there_says_why_it_is_not_linked() -> None:
 
 
 async def test_no_file_descriptors_left_pauses_and_recovers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "ACCEPT_PAUSE", 0.01)
+    monkeypatch.setattr(runtime_limits, "ACCEPT_PAUSE", 0.01)
     async with peers(2, found=False) as (one, other):
         before = DESCRIPTORS.counters["descriptors.refused.link"]
         with descriptors_left(1):  # for the socket that dials

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.config.settings import LaneSettings
-from rmpa.core import limits
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.core.outbox import FIRST, LAST
+from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, unpack_header
 from rmpa.mesh.handshake import Lane, Refusal, Refuse
 from tests.mesh.io.meshes import DEADLINE, Peer, linked_pair, peers, raw, until

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core import limits
 from rmpa.core.counters import Counters
+from rmpa.mesh import limits
 from rmpa.mesh.io import path_monitor
 from rmpa.mesh.io.sockets import limit_segments, packet_bytes, reset_at_close, sample
 from rmpa.mesh.path_mtu import TcpSample

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import msgspec
 import pytest
 
-from rmpa.core import limits
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, StartError, UnreachableError
+from rmpa.observe import limits
 from rmpa.observe.control import ControlReply
 from rmpa.observe.io.control_client import ControlClient, choose_agent, find_agents, same_core
 from rmpa.observe.io.control_server import ControlServer, Handler

@@ -18,7 +18,7 @@ from rmpa.observe.io.runtime_dir import NameLock, make_runtime_dir, runtime_dir,
 HOLD = """
 import sys, signal
 from pathlib import Path
-from rmpa.monitor.aio.runtime_dir import NameLock
+from rmpa.observe.io.runtime_dir import NameLock
 lock = NameLock(Path(sys.argv[1]), "base")
 print("held", flush=True)
 sys.stdin.read()

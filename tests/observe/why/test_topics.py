@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core import limits
+from rmpa.bridge import limits as bridge_limits
+from rmpa.config import limits as config_limits
 from rmpa.observe.snapshot import FilesInfo, LatencySpread, LinkInfo, PeerInfo, RouteInfo, Snapshot, TopicInfo
 from rmpa.observe.why.diagnosis import (
     BothSides,
@@ -245,7 +246,7 @@ FAILURES: dict[str, tuple[Case, str, str, str]] = {
         Case(source=msgspec.structs.replace(SOURCE, offered=False), route=None),
         "offer",
         "does not offer it: its name or type",
-        str(limits.CROSSING_NAME_MAX),
+        str(config_limits.CROSSING_NAME_MAX),
     ),
     "no place for its node": (
         Case(**route(state="hidden", problem="joystick has more nodes than limits.nodes = 2", limit="nodes")),
@@ -488,9 +489,9 @@ def test_each_publisher_has_a_way_of_its_own() -> None:
 
 
 def test_no_more_ways_are_walked_than_a_user_reads() -> None:
-    many = tuple(msgspec.structs.replace(SOURCE, node=f"/n{i}") for i in range(10 * limits.WHY_SOURCES_MAX))
+    many = tuple(msgspec.structs.replace(SOURCE, node=f"/n{i}") for i in range(10 * bridge_limits.WHY_SOURCES_MAX))
     found = Case(far=FarTopic(sources=many), source=None, source_later=None).walk()
-    assert len(found) == limits.WHY_SOURCES_MAX
+    assert len(found) == bridge_limits.WHY_SOURCES_MAX
 
 
 def test_a_peer_is_found_by_its_guid_and_a_wrong_name_by_the_nearest() -> None:

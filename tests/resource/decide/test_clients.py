@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError
+from rmpa.resource import limits
 from rmpa.resource.decide.clients import Clients
 from rmpa.resource.declare.attributes import LATENCY, RATE
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError
+from rmpa.resource import limits
 from rmpa.resource.declare.context_rules import Chooser, ContextRule, Reference, Scalar, parse_rule
 from rmpa.resource.declare.resource import Resource
 

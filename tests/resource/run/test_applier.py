@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError, PeerRefused
+from rmpa.resource import limits
 from rmpa.resource.declare.resource import Output, Resource, at_least
 from rmpa.resource.run.fenced_call import Call
 from rmpa.resource.run.member import Member

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError, PeerRefused
+from rmpa.resource import limits
 from rmpa.resource.declare.resource import Resource, at_least
 from rmpa.resource.run.dynamic_reconfigure import CONFIG_TYPE, DESCRIPTION_TYPE, SERVICE_TYPE, read_config
 from rmpa.resource.run.member import Member

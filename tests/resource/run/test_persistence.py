@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.core import limits
+from rmpa.resource import limits
 from rmpa.resource.declare.resource import Resource, at_least, at_most
 from rmpa.resource.run.client import ResourceClient
 from rmpa.resource.run.member import Member

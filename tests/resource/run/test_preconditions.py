@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core import limits
+from rmpa.resource import limits
 from rmpa.resource.declare.resource import Resource, at_most
 from rmpa.resource.run.member import Member
 from rmpa.resource.run.preconditions import Preconditions

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core import limits
+from rmpa.resource import limits
 from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.descriptor import describe
 from rmpa.resource.run.member import Member, run_all

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core import limits
 from rmpa.core.errors import RmpaError
+from rmpa.resource import limits
 from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.descriptor import describe
 from rmpa.resource.run.resource_registry import DESCRIPTOR, SEEN, ResourceRegistry

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core import limits
+from rmpa.resource import limits
 from rmpa.resource.run import store as store_module
 from rmpa.resource.run.store import ResourceStore, module_dir, state_dir
 

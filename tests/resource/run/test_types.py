@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
-from rmpa.core import limits
 from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.member import Member, run_all
+from rmpa.ros import limits
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, UnknownTypeError

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Final, Self
 
 import pytest
 
-from rmpa.core import limits
 from rmpa.core.errors import StartError
+from rmpa.ros import limits
 from rmpa.ros.core import identify, liveness
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.rosout import AGGREGATED, LOG_MD5, LOG_TYPE

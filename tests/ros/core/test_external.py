@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
-from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError, StartError, UnreachableError
+from rmpa.ros import limits
 from rmpa.ros.core import liveness
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.external import ExternalCore

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, Self
 
 import pytest
 
-from rmpa.core import limits
+from rmpa.ros import limits
 from rmpa.ros.core import store
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.core.store import CoreStore

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, UnreachableError
+from rmpa.ros import limits
 from rmpa.ros.http.client import call, call_api, connect, split_uri
 from rmpa.ros.wire.xmlrpc import RosFault, serialize_fault, serialize_response
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.core import limits
 from rmpa.core.errors import StartError
+from rmpa.ros import limits
 from rmpa.ros.http.client import call
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.wire.xmlrpc import RosFault, XmlRpcValue, parse_response, serialize_call, serialize_response

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core import limits
+from rmpa.ros import limits
 from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.effects import (
     Effect,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core import limits
+from rmpa.ros import limits
 from rmpa.ros.master.awaited import NodeRecord
 from rmpa.ros.master.kept import NODE, PARAM, UnkeepableError, changed_params, packed, param_key, read
 from rmpa.ros.master.parameters import Parameters

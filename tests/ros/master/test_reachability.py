@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rmpa.core import limits
+from rmpa.ros import limits
 from rmpa.ros.master.reachability import Reachability, Unreachable
 
 AT = "http://10.9.9.9:1234/"

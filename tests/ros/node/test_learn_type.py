@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.core import limits
 from rmpa.core.errors import PeerRefused, UnreachableError
+from rmpa.ros import limits
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.learn_type import find_or_learn, learn_type

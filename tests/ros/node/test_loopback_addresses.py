@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core import limits
+from rmpa.ros import limits
 from rmpa.ros.node.loopback_addresses import LoopbackAddresses
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError, PeerRefused, UnreachableError
+from rmpa.ros import limits
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.http.client import call

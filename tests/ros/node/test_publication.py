@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core import limits
+from rmpa.ros import limits
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.tcpros_server import TcprosServer
 from rmpa.ros.wire.tcpros import TopicDescription, frame_message

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core import limits
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.ros import limits
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint, responding
 from rmpa.ros.node.slave_node import SlaveNode

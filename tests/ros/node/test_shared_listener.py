@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import psutil
 import pytest
 
-from rmpa.core import limits
 from rmpa.core.counters import Counters
 from rmpa.core.errors import StartError
+from rmpa.ros import limits
 from rmpa.ros.core.identify import name_at
 from rmpa.ros.http.client import call_api
 from rmpa.ros.node import shared_listener

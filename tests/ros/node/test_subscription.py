@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
+from rmpa.ros import limits
 from rmpa.ros.node.subscription import PublisherConnection, Subscription
 from rmpa.ros.wire.tcpros import TopicDescription, encode_header, frame_message, publisher_header
 from tests.ros.node.peers import MD5, STRING, RawPublisher, until
@@ -213,7 +214,7 @@ async def test_a_message_beyond_the_limit_is_left_out_and_others_come(
     publisher: RawPublisher, monkeypatch: pytest.MonkeyPatch, parts: bool, chunk: int
 ) -> None:
     monkeypatch.setattr(limits, "TCPROS_MESSAGE_MAX", 1000)
-    monkeypatch.setattr(limits, "CUT_THROUGH_BYTES", 500)
+    monkeypatch.setattr(core_limits, "CUT_THROUGH_BYTES", 500)
     said = InParts(publisher.uri) if parts else Said(publisher.uri)
     link, _ = await publisher.serve()
     sent = [b"one", bytes(1001), b"two", bytes(700), bytes(5000), bytes(1002), bytes(1000), b"3", bytes(9000), b""]
@@ -375,7 +376,7 @@ async def test_half_a_message_holds_nobody_else_up_and_the_kernel_watches(publis
 
 # --- messages in parts ------------------------------------------------------------------------------------------
 
-LARGE = bytes(range(256)) * (limits.CUT_THROUGH_BYTES // 256 + 40)
+LARGE = bytes(range(256)) * (core_limits.CUT_THROUGH_BYTES // 256 + 40)
 
 
 class InParts(Said):
@@ -408,13 +409,19 @@ class InParts(Said):
 async def test_only_above_the_limit_a_message_comes_in_parts(publisher: RawPublisher) -> None:
     said = InParts(publisher.uri)
     link, _ = await publisher.serve()
-    payloads = [bytes(limits.CUT_THROUGH_BYTES - 4), bytes(limits.CUT_THROUGH_BYTES - 3), LARGE, b"", b"small"]
+    payloads = [
+        bytes(core_limits.CUT_THROUGH_BYTES - 4),
+        bytes(core_limits.CUT_THROUGH_BYTES - 3),
+        LARGE,
+        b"",
+        b"small",
+    ]
     for payload in payloads:
         await link.send(frame_message(payload))
     await until(lambda: len(said.messages) == 5)
     assert said.messages == [frame_message(payload) for payload in payloads]
     # What came whole with one read is whole; else it is handed on as it comes.
-    assert all(size > limits.CUT_THROUGH_BYTES for size in said.sizes)
+    assert all(size > core_limits.CUT_THROUGH_BYTES for size in said.sizes)
     connection = said.link.connection()
     assert (connection.messages, connection.bytes) == (5, sum(len(payload) + 4 for payload in payloads))
     await said.close()
@@ -447,7 +454,7 @@ async def test_any_pieces_make_the_same_messages(publisher: RawPublisher, chunk:
     said = InParts(publisher.uri)
     link, _ = await publisher.serve()
     await until(lambda: said.headers)
-    payloads = [b"one", b"", LARGE, LARGE[::-1], b"two", bytes(limits.CUT_THROUGH_BYTES - 3), b""]
+    payloads = [b"one", b"", LARGE, LARGE[::-1], b"two", bytes(core_limits.CUT_THROUGH_BYTES - 3), b""]
     wire = b"".join(map(frame_message, payloads))
     assert said.link._stream is not None
     if chunk == 1:

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.core import limits
 from rmpa.core.counters import Counters
 from rmpa.core.errors import StartError
+from rmpa.ros import limits
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.tcpros_server import TcprosServer
 from rmpa.ros.wire.tcpros import encode_header, frame_message

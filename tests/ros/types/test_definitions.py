@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded
+from rmpa.ros import limits
 from rmpa.ros.types.definitions import (
     SEPARATOR,
     DefinitionError,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.core import limits
+from rmpa.ros import limits
 from rmpa.ros.types import header_types, installed, packages
 from rmpa.ros.types.definitions import SEPARATOR, DefinitionError, UnknownTypeError
 from rmpa.ros.types.find import find_message_type, find_service_type

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core import limits
+from rmpa.core.sizes import KIB
+from rmpa.ros import limits
 from rmpa.ros.wire.call_body import CallBody, call_name, too_large, too_many
 from rmpa.ros.wire.xmlrpc import serialize_call
 
@@ -21,7 +22,7 @@ from rmpa.ros.wire.xmlrpc import serialize_call
     ],
 )
 def test_the_beginning_says_what_it_was(method: str, params: list[object], name: str) -> None:
-    assert call_name(serialize_call(method, params)[: 4 * limits.KIB]) == name  # type: ignore[arg-type]
+    assert call_name(serialize_call(method, params)[: 4 * KIB]) == name  # type: ignore[arg-type]
 
 
 def test_roscpps_untyped_strings_are_read_too() -> None:
@@ -49,7 +50,7 @@ def test_any_parts_within_the_bound_come_out_whole(parts: list[bytes], limit: in
         body = CallBody(lambda _: room)
         for part in parts:
             body.add(part)
-            assert len(body._data) <= max(limit, 4 * limits.KIB)
+            assert len(body._data) <= max(limit, 4 * KIB)
         whole = b"".join(parts)
         assert len(body) == len(whole)
         data, refusal = body.end()

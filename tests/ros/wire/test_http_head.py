@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core import limits
+from rmpa.ros import limits
 from rmpa.ros.wire.http_head import Head, plain_head
 
 ROSCPP = b"POST / HTTP/1.1\r\nUser-Agent: XMLRPC++ 0.7\r\nHost: 10.0.0.1:11311\r\nContent-Type: text/xml\r\n"

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.ros import limits
 from rmpa.ros.wire.tcpros import (
     MalformedHeader,
     MalformedStream,

@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
+from rmpa.core.sizes import KIB
+from rmpa.ros import limits
 from rmpa.ros.wire.xmlrpc import (
     CallReader,
     RosFault,
@@ -126,7 +127,7 @@ def test_reading_leaves_no_garbage_for_a_collector_that_is_off() -> None:
 def test_much_is_written_in_many_short_pieces() -> None:
     value: XmlRpcValue = [1, "", {"numbers": [1.5] * 5000, "text": "<a>\n" * 20000, "bytes": b"x" * 100_000}]
     written = list(response_pieces(value))
-    assert max(map(len, written)) < 64 * limits.KIB
+    assert max(map(len, written)) < 64 * KIB
     assert len(written) > 50
     assert parse_response(b"".join(written)) == value
 

@@ -16,8 +16,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.contract import Priority
+from rmpa.mesh import limits
 from rmpa.mesh.handshake import Lane
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import msgspec
 
-from rmpa.core import limits
+from rmpa.mesh import limits
 
 if TYPE_CHECKING:
     from collections import Counter

@@ -7,7 +7,8 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
+from rmpa.bridge import limits
+from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -49,7 +50,7 @@ class PeerClock:
         estimate = ClockEstimate(now, offset, error)
         if self._estimates:
             last = self._estimates[-1]
-            bound = error + last.error + limits.CLOCK_DRIFT * (now - last.now)
+            bound = error + last.error + mesh_limits.CLOCK_DRIFT * (now - last.now)
             if abs(offset - last.offset) > bound:
                 self._estimates.clear()
                 self.trusted_from = now

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
+from rmpa.bridge import limits
 from rmpa.core.contract import Liveliness
 
 if TYPE_CHECKING:

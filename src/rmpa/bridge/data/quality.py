@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from operator import sub
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
-from rmpa.core import limits
+from rmpa.bridge import limits
 from rmpa.core.stats import SampleSummary
+from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
     from rmpa.bridge.data.peer_clock import PeerClock
@@ -202,7 +203,7 @@ class Quality:
                 continue
             found += [delay * _NS + estimate.offset for delay in delays[begin:end]]
             apart = max(abs(estimate.now - times[begin]), abs(estimate.now - times[end - 1]))
-            worst = max(worst, estimate.error + limits.CLOCK_DRIFT * apart)
+            worst = max(worst, estimate.error + mesh_limits.CLOCK_DRIFT * apart)
             begin = end
         return found, worst
 

@@ -11,9 +11,10 @@ from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import actions as act
+from rmpa.bridge import limits
 from rmpa.bridge.data.io.absent_peers import Absent, AbsentPeers
-from rmpa.bridge.io.loss_reports import LossReports
 from rmpa.bridge.data.qos_events import shown_seconds
+from rmpa.bridge.io.loss_reports import LossReports
 from rmpa.bridge.io.node_shutdown import RemoteKills
 from rmpa.bridge.messages import (
     Advertise,
@@ -44,12 +45,12 @@ from rmpa.bridge.topics.io.proxies import PeerProxies
 from rmpa.bridge.topics.io.remote_subscribers import RemoteSubscribers
 from rmpa.bridge.topics.mismatches import Mismatches
 from rmpa.config.settings import LimitSettings
-from rmpa.core import limits
 from rmpa.core.contract import Contracts, Priority
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
+from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import FrameKind
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
 from rmpa.ros.node.slave_node import SlaveNode
@@ -354,7 +355,7 @@ class Bridge:
         attached.away_since = self._loop.time()
         if link.silent:
             # Most silences end soon, by a new link: until then nobody need notice.
-            attached.away = self._loop.call_later(limits.AWAY_GRACE, self._stay_away, attached)
+            attached.away = self._loop.call_later(mesh_limits.AWAY_GRACE, self._stay_away, attached)
             imports, _ = self._imports.link_away(attached.peer, briefly=True)
             self._act(imports)
         else:
@@ -389,14 +390,14 @@ class Bridge:
     def _await_claims(self, attached: PeerSession) -> None:
         """A peer is back: it can ask for what waits for it as soon as it was told of it."""
         attached.untold = True
-        attached.back = self._loop.call_later(limits.RESUME_CLAIM_MAX, self._unclaimed, attached)
+        attached.back = self._loop.call_later(mesh_limits.RESUME_CLAIM_MAX, self._unclaimed, attached)
 
     def _told(self, attached: PeerSession) -> None:
         """A peer may have been told everything: then it asks soon. A large graph takes long on a busy lane."""
         if attached.back is not None and attached.untold and not self._exports.beginning(attached.peer):
             attached.untold = False
             attached.back.cancel()
-            attached.back = self._loop.call_later(limits.RESUME_CLAIM, self._unclaimed, attached)
+            attached.back = self._loop.call_later(mesh_limits.RESUME_CLAIM, self._unclaimed, attached)
 
     def _unclaimed(self, attached: PeerSession) -> None:
         """A peer has known everything for a while: what it has not asked for is not wanted any more."""
@@ -700,7 +701,7 @@ class Bridge:
         """Wake up now and then while data comes: a link that was silent is told from an agent that slept."""
         self._ticker = None
         if not self._closed and any(attached.inbound.flows for attached in self._by_number.values()):
-            self._ticker = self._loop.call_later(limits.STALE_TICK, self._tick)
+            self._ticker = self._loop.call_later(mesh_limits.STALE_TICK, self._tick)
 
     def _mismatched(self, peer: int, source: Source, subscriber: str, text: str) -> None:
         self._mismatches.add(source, subscriber, text)
@@ -805,7 +806,7 @@ class Bridge:
                 # This link: of the next one the same number is another source's route.
                 route, link = action.route, attached.link
                 if self._ticker is None:
-                    self._ticker = self._loop.call_later(limits.STALE_TICK, self._tick)
+                    self._ticker = self._loop.call_later(mesh_limits.STALE_TICK, self._tick)
                 attached.inbound.describe(action, lambda last: link.mark(FrameKind.ACK, route, last))
                 self._presence.changed(action.peer, action.source)
             case act.Detach():

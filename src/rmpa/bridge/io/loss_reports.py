@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.bridge.data.qos_events import shown_seconds
 from rmpa.bridge.messages import Source
-from rmpa.core import limits
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.mesh import limits as mesh_limits
+from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -85,7 +86,7 @@ class LossReports:
             text += (
                 f"of {shown}; further ones are only counted (the contract's outage is for how long they are kept, "
             )
-            text += f"at most {limits.RESUME_BYTES_MAX >> 20} MiB over all)"
+            text += f"at most {mesh_limits.RESUME_BYTES_MAX >> 20} MiB over all)"
             self._counters.add("route.given_up", len(sources) - 1)
             self._say("route.given_up", name, text)
 
@@ -98,15 +99,16 @@ class LossReports:
 
     def uncounted(self, source: Source) -> None:
         """Too many routes are counted for peers that are away."""
-        text = f"what peers that are away miss is counted for {limits.RESUMES_COUNTED_MAX} routes, and no more for"
+        text = (
+            f"what peers that are away miss is counted for {mesh_limits.RESUMES_COUNTED_MAX} routes, and no more for"
+        )
         self._say("route.uncounted", str(source), f"{text} {source}")
 
     def oversized(self, source: Source, flow: ExportFlow) -> None:
         """A local publisher sends messages that are too long: say it here, and to those that listen to it."""
-        text = (
-            f"{source}: a message of {flow.oversized_bytes} bytes is left out, at most {limits.TCPROS_MESSAGE_MAX} "
-        )
-        self._say("message.oversized", str(source), text + "cross; others do: send it in parts, or compressed")
+        bound = ros_limits.TCPROS_MESSAGE_MAX
+        text = f"{source}: a message of {flow.oversized_bytes} bytes is left out, at most {bound} cross"
+        self._say("message.oversized", str(source), f"{text}; others do: send it in parts, or compressed")
         for peer in self._exports.flowing(source):
             self.tell_oversized(source, flow, peer)
 

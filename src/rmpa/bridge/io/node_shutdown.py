@@ -6,8 +6,9 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
+from rmpa.bridge import limits
 from rmpa.core.errors import RmpaError
+from rmpa.ros import limits as ros_limits
 from rmpa.ros.core.notifier import MASTER_ID
 from rmpa.ros.wire.xmlrpc import RosReply
 
@@ -88,4 +89,4 @@ class RemoteKills:
             self._under_way -= 1
         if isinstance(answer, dict) and answer.get("gone"):
             return ""
-        return f"it was asked, and is still there after {limits.NODE_KILL_WAIT:g} s"
+        return f"it was asked, and is still there after {ros_limits.NODE_KILL_WAIT:g} s"

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from rmpa.config import limits as config_limits
 from rmpa.config.param_rules import SIM_TIME, overlap, untouchable
 from rmpa.config.settings import FollowRule, ParamSettings, TimeSettings
-from rmpa.core import limits
 from rmpa.core.names import matches
+from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -33,7 +34,7 @@ def key_problem(key: object) -> str:
     """Why a peer's word is no parameter's name, or empty."""
     if not isinstance(key, str) or not key.startswith("/"):
         return f"{str(key)[:100]!r} is not the global name of a parameter"
-    if len(key) > limits.CROSSING_NAME_MAX or key.count("/") > limits.PARAM_DEPTH_MAX:
+    if len(key) > config_limits.CROSSING_NAME_MAX or key.count("/") > ros_limits.PARAM_DEPTH_MAX:
         return f"the name of a parameter has {len(key)} characters, or too many namespaces"
     # Masters take any characters, and parameters have been called joint-1 for long.
     if "//" in key or not key.isprintable() or any(c.isspace() for c in key):

@@ -23,7 +23,7 @@ import itertools
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.core import limits
+from rmpa.bridge import limits
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
 
 if TYPE_CHECKING:

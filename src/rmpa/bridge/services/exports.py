@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Final
 
+from rmpa.bridge import limits
 from rmpa.bridge.actions import Send, Warn
 from rmpa.bridge.bounds import Beyond
 from rmpa.bridge.messages import (
@@ -29,7 +30,6 @@ from rmpa.bridge.messages import (
 )
 from rmpa.bridge.relay import may_have
 from rmpa.config.settings import LimitSettings
-from rmpa.core import limits
 from rmpa.core.errors import RemoteProtocolError
 
 if TYPE_CHECKING:

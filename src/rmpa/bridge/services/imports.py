@@ -21,7 +21,7 @@ from enum import Enum, auto
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Final
 
-from rmpa.bridge import bounds
+from rmpa.bridge import bounds, limits
 from rmpa.bridge.actions import Send, Warn
 from rmpa.bridge.messages import (
     AdvertiseServices,
@@ -35,7 +35,6 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.relay import LinkedPeer, RelayPaths
 from rmpa.bridge.services.exports import ServiceAbout
 from rmpa.config.settings import LimitSettings
-from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.core.guid import Guid
 

@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from rmpa.bridge import limits
 from rmpa.bridge.messages import Notification, Request, Response, encode
 from rmpa.bridge.session.part import Part
-from rmpa.core import limits
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
     from rmpa.bridge.io.bridge import PeerSession
@@ -161,7 +162,7 @@ class PeerRpc(Part):
 
     def _send(self, attached: PeerSession, answer: Response) -> None:
         payload = encode(answer)
-        if len(payload) > limits.CONTROL_PAYLOAD_MAX:
-            text = f"the answer has {len(payload)} bytes, more than {limits.CONTROL_PAYLOAD_MAX}"
+        if len(payload) > mesh_limits.CONTROL_PAYLOAD_MAX:
+            text = f"the answer has {len(payload)} bytes, more than {mesh_limits.CONTROL_PAYLOAD_MAX}"
             payload = encode(Response(answer.number, ok=False, error=text))
         attached.link.send_control(payload)

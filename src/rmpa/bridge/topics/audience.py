@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from rmpa.bridge import limits
 from rmpa.bridge.messages import is_crossing_name
 from rmpa.bridge.policy import OWN_NODE
-from rmpa.core import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

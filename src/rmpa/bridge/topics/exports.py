@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
+from rmpa.bridge import limits
 from rmpa.bridge.actions import Action, AddRoute, Connect, Disconnect, RemoveRoute, Send, SuspendRoute, Warn
 from rmpa.bridge.bounds import Beyond
 from rmpa.bridge.data.losses import NOTHING_KEPT, beginning_anew, going_on
@@ -47,7 +48,6 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.naming import Names, PeerNames
 from rmpa.bridge.relay import may_have
 from rmpa.config.settings import LimitSettings
-from rmpa.core import limits
 from rmpa.core.contract import Contract, Contracts, Durability, Reliability, combine
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec import UnsetType
 
-from rmpa.bridge import bounds
+from rmpa.bridge import bounds, limits
 from rmpa.bridge.actions import Action, Describe, Detach, Publish, Retract, Send, Warn
 from rmpa.bridge.messages import (
     Advertise,
@@ -43,10 +43,11 @@ from rmpa.bridge.naming import Names, PeerNames
 from rmpa.bridge.relay import LinkedPeer, RelayPaths
 from rmpa.config.param_rules import CLOCK
 from rmpa.config.settings import LimitSettings
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.backoff import Backoff
 from rmpa.core.contract import Contract, Contracts, Reliability
 from rmpa.core.errors import LocalProtocolError
+from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping
@@ -563,7 +564,7 @@ class Imports:
             name = self._peers[peer].name
             self._peers[peer].surplus.add(source, offer)
             return [Warn("topics.too_many", name, bounds.warning(name, "topics", self._most.topics))]
-        backoff = Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng)
+        backoff = Backoff(mesh_limits.BACKOFF_FIRST, mesh_limits.BACKOFF_MAX, self._rng)
         topic = self._names_of(self._peers[peer], offer.origin).local_name(source.topic, offer.type)
         entry = known[source] = RemoteTopic(offer.type, topic, backoff, origin=offer.origin)
         self._peers[peer].topics.setdefault(topic, {})[source] = None
@@ -774,7 +775,7 @@ def _outage(entry: RemoteTopic) -> float:
     """For how many seconds a source stays that outlives its link: latched ones wait as by default."""
     if entry.contract is not None and entry.contract.reliability is Reliability.RELIABLE:
         return entry.contract.outage
-    return limits.RESUME_WINDOW
+    return core_limits.RESUME_WINDOW
 
 
 def _gone(peer: int, sources: dict[Source, RemoteTopic]) -> Iterator[Action]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
+from rmpa.bridge import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -8,8 +8,8 @@ import random
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.counters import Counters, RefusalLog
+from rmpa.discovery import limits
 from rmpa.discovery.events import PeerConflict, SendMulticast
 from rmpa.discovery.io import sockets
 from rmpa.discovery.io.interfaces import (

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 
-from rmpa.core import limits
+from rmpa.core.sizes import KIB
+from rmpa.discovery import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -146,7 +147,7 @@ class InterfaceWatcher:
         # What they say does not matter; an ENOBUFS says that some were lost: all the more reason to look.
         with contextlib.suppress(OSError):
             while self._netlink is not None:
-                self._netlink.recv(64 * limits.KIB)
+                self._netlink.recv(64 * KIB)
         if self._timer is None:
             self._look_in(limits.INTERFACE_SETTLE)
 

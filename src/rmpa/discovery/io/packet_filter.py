@@ -6,10 +6,10 @@ import logging
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.counters import RefusalLog
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.token_bucket import TokenBucket
+from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconOtherDomain, BeaconOtherVersion, sender_of
 
 if TYPE_CHECKING:

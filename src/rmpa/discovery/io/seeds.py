@@ -11,8 +11,8 @@ import threading
 from ipaddress import AddressValueError, IPv4Address
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
 from rmpa.core.backoff import Backoff
+from rmpa.discovery import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable

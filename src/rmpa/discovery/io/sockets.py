@@ -8,7 +8,7 @@ import socket
 import struct
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
+from rmpa.discovery import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

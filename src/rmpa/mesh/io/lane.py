@@ -8,8 +8,9 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.outbox import FIRST, LAST, Outbox, QueuedMessage
+from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pack_fragment_header
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ class LaneSender:
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.outbox = Outbox(limits.ROUTE_QUEUE_MESSAGES, limits.LINK_QUEUE_BYTES, frame=pack_fragment_header)
+        self.outbox = Outbox(core_limits.ROUTE_QUEUE_MESSAGES, limits.LINK_QUEUE_BYTES, frame=pack_fragment_header)
         self.ended = False
         """Whether the link is leaving: nothing is sent, nothing waits."""
         self._stream: Stream | None = None
@@ -74,7 +75,7 @@ class LaneSender:
             How many older messages were dropped to make room. Without effect (0) once the link is leaving.
         """
         size = len(payload)
-        if size > limits.FRAGMENT_BYTES:
+        if size > core_limits.FRAGMENT_BYTES:
             return self.extend(self._parcel(route, size, sequence, stamp_ns), payload)
         header = pack_data_header(size, route, sequence, stamp_ns)
         if self._stream is not None:

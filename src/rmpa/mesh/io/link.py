@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final, Protocol
 
-from rmpa.core import limits
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.outbox import URGENT, Outbox
+from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import Lane
 from rmpa.mesh.io.lane import LaneSender

@@ -13,9 +13,9 @@ from itertools import count
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config.settings import LaneSettings
-from rmpa.core import limits
 from rmpa.core.backoff import Backoff
 from rmpa.core.counters import Counters, RefusalLog
+from rmpa.mesh import limits
 from rmpa.mesh.handshake import Lane, Refusal
 from rmpa.mesh.io.link import LinkHandlers, MeshLink
 from rmpa.mesh.io.path_monitor import PathMonitor
@@ -23,6 +23,7 @@ from rmpa.mesh.io.sockets import limit_segments, tune_bulk, tune_express, unackn
 from rmpa.mesh.io.status import LinkStatus, link_status
 from rmpa.mesh.link import LinkRole
 from rmpa.mesh.peering import REPLACED, CloseLink, Dial, LinkDown, LinkRefused, LinkUp, Output, Peering, PeerStatus
+from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.acceptor import Acceptor
 from rmpa.runtime.descriptors import DESCRIPTORS, Use
 from rmpa.runtime.system_clock import SystemClock
@@ -136,7 +137,7 @@ class Mesh:
             link.close(f"{self.identity.name} ends")
         ends = [asyncio.ensure_future(link.ended()) for link in links]
         if ends:
-            _, late = await asyncio.wait(ends, timeout=limits.DRAIN_TIMEOUT)
+            _, late = await asyncio.wait(ends, timeout=runtime_limits.DRAIN_TIMEOUT)
             for link in list(self._links.values()):
                 link.abort("the bye was not answered in time")
             if late:

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
+from rmpa.mesh import limits
 from rmpa.mesh.io.sockets import packet_bytes, sample
 from rmpa.mesh.path_mtu import PathState, PathTable, Progress
 

@@ -10,7 +10,7 @@ import sys
 import termios
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
+from rmpa.mesh import limits
 from rmpa.mesh.path_mtu import TcpSample
 
 if TYPE_CHECKING:

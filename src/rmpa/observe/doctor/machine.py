@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rmpa.core import limits
+from rmpa.core.sizes import KIB
+from rmpa.observe import limits
 from rmpa.observe.doctor.finding import Finding, FindingLevel
 
 
@@ -85,7 +86,7 @@ def judge_rights(rights: KernelRights) -> list[Finding]:
     if rights.fifo:
         missing.append(f"no SCHED_FIFO ({rights.fifo})")
     if rights.memlock is not None:
-        missing.append(f"only {rights.memlock // limits.KIB} KiB may be locked in memory")
+        missing.append(f"only {rights.memlock // KIB} KiB may be locked in memory")
     if not missing:
         found = [Finding("realtime", "", FindingLevel.OK, "SCHED_FIFO and locked memory are allowed")]
     else:

@@ -13,8 +13,9 @@ from urllib.parse import urlsplit
 
 import msgspec
 
-from rmpa.core import limits
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.core.sizes import KIB
+from rmpa.observe import limits
 from rmpa.observe.control import ControlReply, ControlRequest
 from rmpa.observe.io.runtime_dir import runtime_dir, runtime_dirs
 from rmpa.observe.snapshot import Snapshot
@@ -105,7 +106,7 @@ class ControlClient:
         parts = [self._rest]
         size = len(self._rest)
         while b"\n" not in parts[-1]:
-            part = self._sock.recv(256 * limits.KIB)
+            part = self._sock.recv(256 * KIB)
             if not part:
                 raise UnreachableError("agent", f"{self.path}: it hung up", "its log says why")
             parts.append(part)

@@ -13,9 +13,9 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config.values import did_you_mean
-from rmpa.core import limits
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import RemoteProtocolError, RmpaError, StartError
+from rmpa.observe import limits
 from rmpa.observe.control import ControlReply, ControlRequest
 from rmpa.observe.io.runtime_dir import NameLock
 from rmpa.runtime.acceptor import Acceptor

@@ -9,7 +9,7 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
+from rmpa.observe import limits
 from rmpa.observe.health import Health
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.types.diagnostic_array import ARRAY_DEFINITION, ARRAY_MD5, ARRAY_TYPE, frame_array

@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
+from rmpa.bridge import limits
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import OWN_NODE, Policy, is_own
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.config.values import did_you_mean
-from rmpa.core import limits
 from rmpa.core.errors import RmpaError
 from rmpa.observe.io.topic_facts import name_in
 from rmpa.observe.why.diagnosis import Diagnosis, PathStage, StageResult

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 import psutil
 
 import rmpa
-from rmpa.core import limits
+from rmpa.observe import limits
 from rmpa.observe.io.bounds_section import own_text
 from rmpa.observe.io.peers_section import PeersSection
 from rmpa.observe.io.topics_section import TopicsSection, unreachable_infos
 from rmpa.observe.snapshot import AgentInfo, FilesInfo, Snapshot
+from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.descriptors import DESCRIPTORS
 from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.realtime import refused
@@ -171,7 +172,7 @@ def _files() -> FilesInfo:
         limit=limit,
         hard=DESCRIPTORS.hard_limit,
         reserved=reserved,
-        near=used >= limits.DESCRIPTORS_NEAR * (limit - reserved),
+        near=used >= runtime_limits.DESCRIPTORS_NEAR * (limit - reserved),
         refused=sum(count for name, count in counts.items() if name.startswith("descriptors.refused.")),
         problem=DESCRIPTORS.shortage.problem if DESCRIPTORS.shortage is not None else "",
     )

@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
+from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Policy, is_own
 from rmpa.bridge.proxy_names import proxy_name
+from rmpa.config import limits as config_limits
 from rmpa.config.values import did_you_mean
-from rmpa.core import limits
 from rmpa.core.contract import Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.names import is_global_name
@@ -146,10 +147,10 @@ class TopicFacts:
         return FarTopic(
             path_problem=problem.text if problem is not None else "",
             path_remedy=problem.remedy if problem is not None else "",
-            sources=tuple(sources[: limits.WHY_SOURCES_MAX]),
-            subscribers=tuple(subscribers[: limits.WHY_SOURCES_MAX]),
+            sources=tuple(sources[: bridge_limits.WHY_SOURCES_MAX]),
+            subscribers=tuple(subscribers[: bridge_limits.WHY_SOURCES_MAX]),
             near="" if sources else await self._nearest(attached.link.name, wire),
-            awaited=tuple(awaited[: limits.WHY_SOURCES_MAX]),
+            awaited=tuple(awaited[: bridge_limits.WHY_SOURCES_MAX]),
         )
 
     async def _nearest(self, asker: str, wire: str) -> str:
@@ -216,6 +217,6 @@ def name_in(args: dict[str, Any], key: str) -> str:
         RemoteProtocolError: It is none.
     """
     name = args.get(key)
-    if not isinstance(name, str) or len(name) > limits.CROSSING_NAME_MAX or not is_global_name(name):
+    if not isinstance(name, str) or len(name) > config_limits.CROSSING_NAME_MAX or not is_global_name(name):
         raise RemoteProtocolError(f"the question names no {key}")
     return name

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
 
+from rmpa.bridge import limits
 from rmpa.config.values import did_you_mean
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
 from rmpa.core.names import is_global_name
 from rmpa.observe.io.service_facts import ServiceFacts

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from rmpa.core import limits
+from rmpa.bridge import limits
 from rmpa.observe.why.diagnosis import Diagnosis, PathStage, StageResult
 
 if TYPE_CHECKING:

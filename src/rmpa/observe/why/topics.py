@@ -11,9 +11,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from rmpa.bridge import limits as bridge_limits
+from rmpa.config import limits as config_limits
 from rmpa.config.values import did_you_mean
-from rmpa.core import limits
+from rmpa.mesh import limits as mesh_limits
 from rmpa.observe.why.diagnosis import Diagnosis, PathStage, StageResult
+from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -85,7 +88,7 @@ def _linked(peer: PeerInfo) -> PathStage:
     text = f"linked by {link.remote} for {link.up_ago:.0f} s"
     if link.rtt is not None:
         text += f", round trip {link.rtt * 1e3:.1f} ms"
-    if link.heard_ago is not None and link.heard_ago > limits.LINK_LEASE / 2:
+    if link.heard_ago is not None and link.heard_ago > mesh_limits.LINK_LEASE / 2:
         text += f"; silent for {link.heard_ago:.1f} s"
         return PathStage("link", _WARN, text, "if it stays so, the cable or the radio is the place to look at")
     if link.path_problem:
@@ -136,7 +139,7 @@ def _diagnosis(near: NearTopic, peer: str, to: str, node: str, stages: tuple[Pat
 def _nodes(sight: BothSides, peer: str) -> list[str]:
     far = [source.node for source in sight.far.sources] if sight.far is not None else []
     known = [route.node for route in _routes(sight.near, peer)]
-    return list(dict.fromkeys([*far[: limits.WHY_SOURCES_MAX], *known]))[: limits.WHY_SOURCES_MAX]
+    return list(dict.fromkeys([*far[: bridge_limits.WHY_SOURCES_MAX], *known]))[: bridge_limits.WHY_SOURCES_MAX]
 
 
 def _routes(near: NearTopic, peer: str) -> list[RouteInfo]:
@@ -245,14 +248,16 @@ def _not_offered(sight: BothSides, far: FarSource | None, peer: str) -> PathStag
         )
     if far is not None and not far.offered:
         text = f"{peer} does not offer it: its name or type is none that can cross, or is too long"
-        return PathStage("offer", _FAIL, text, f"names of at most {limits.CROSSING_NAME_MAX} characters cross")
+        return PathStage("offer", _FAIL, text, f"names of at most {config_limits.CROSSING_NAME_MAX} characters cross")
     peers = [p for p in sight.near.snapshot.peers if p.name == peer]
     for bound in (bound for p in peers for bound in p.beyond if bound.here and bound.kind == "topics"):
         text, _, remedy = bound.text.partition("; ")
         return PathStage("limit", _FAIL, text, remedy)
     count = peers[0].topics_in if peers else 0
     text = f"the offer of it has not come here ({count} topics of {peer} have)"
-    remedy = f"if it stays so for more than {limits.RECONCILE_INTERVAL:g} s, it is a bug of ours: both logs, please"
+    remedy = (
+        f"if it stays so for more than {bridge_limits.RECONCILE_INTERVAL:g} s, it is a bug of ours: both logs, please"
+    )
     return PathStage("offer", _FAIL, text, remedy)
 
 
@@ -287,7 +292,9 @@ def _in_graph(near: NearTopic, route: RouteInfo) -> PathStage:
         if route.problem:
             problem, _, remedy = route.problem.partition("; ")
             return PathStage("graph", _FAIL, f"{text}: {problem}", remedy)
-        remedy = f"it is put there again within {limits.RECONCILE_INTERVAL:g} s; if not, the agent's log says why"
+        remedy = (
+            f"it is put there again within {bridge_limits.RECONCILE_INTERVAL:g} s; if not, the agent's log says why"
+        )
         return PathStage("graph", _FAIL, text, remedy)
     return PathStage("graph", _OK, f"its proxy {proxy} stands in the local graph")
 
@@ -355,7 +362,7 @@ def _sent(route: RouteInfo, far: FarSource | None, peer: str, wire: str) -> Path
         return PathStage("sent", _UNKNOWN, f"{peer} did not tell")
     if far.oversized:
         text = f"{far.oversized} messages of its publisher {route.node} are too long, the last has "
-        text += f"{far.oversized_bytes} bytes, and at most {limits.TCPROS_MESSAGE_MAX} cross"
+        text += f"{far.oversized_bytes} bytes, and at most {ros_limits.TCPROS_MESSAGE_MAX} cross"
         text += f"; {far.messages} others came" if far.messages else ""
         return PathStage("sent", _WARN if far.messages else _FAIL, text, "send them in parts, or compressed")
     if not far.messages and not route.messages:
@@ -377,7 +384,9 @@ def _arrived(
 ) -> PathStage:
     moved = now.messages - before.messages
     sent = far_now.messages - far.messages if far is not None and far_now is not None else None
-    rarely = float(now.contract.get("max_rate") or limits.CONTRACT_RATE_MAX) * limits.WHY_WINDOW < _SEVERAL
+    rarely = (
+        float(now.contract.get("max_rate") or config_limits.CONTRACT_RATE_MAX) * bridge_limits.WHY_WINDOW < _SEVERAL
+    )
     if not now.messages or (sent is not None and sent >= _SEVERAL and not moved and not rarely):
         text = f"{peer} has {'sent ' + str(sent) if sent else 'sent some'} meanwhile, and none arrived at {here}"
         dropped = f" ({far_now.dropped} were given up over there)" if far_now is not None and far_now.dropped else ""
@@ -388,10 +397,14 @@ def _arrived(
     text = f"{now.messages} messages, the last {age:.2f} s ago"
     if now.rate is not None:
         text += f", {now.rate:.1f} Hz"
-    if usual is not None and not moved and age > max(limits.WHY_SILENT, limits.WHY_SILENT_PERIODS * usual):
+    if (
+        usual is not None
+        and not moved
+        and age > max(bridge_limits.WHY_SILENT, bridge_limits.WHY_SILENT_PERIODS * usual)
+    ):
         text = f"nothing for {age:.1f} s; until then a message came every {usual * 1e3:.0f} ms at the latest"
         return PathStage("arrived", _FAIL, text, f"its publisher {now.node} on {peer} has fallen silent: look at it")
-    if usual is None and not now.latched and age > limits.WHY_SILENT:
+    if usual is None and not now.latched and age > bridge_limits.WHY_SILENT:
         return PathStage("arrived", _WARN, text, "a topic of few messages? nothing tells how often they should come")
     return PathStage("arrived", _OK, text)
 

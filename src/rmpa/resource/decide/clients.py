@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
+from rmpa.resource import limits
 from rmpa.resource.decide.saved_state import SavedRequirement
 from rmpa.resource.declare.requirement_text import parse_requirement
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError
+from rmpa.resource import limits
 from rmpa.resource.declare.attributes import Direction
 from rmpa.resource.declare.requirements import find_attribute
 from rmpa.resource.declare.units import quantity

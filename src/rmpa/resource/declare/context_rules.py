@@ -24,8 +24,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from rmpa.config.values import did_you_mean
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError
+from rmpa.resource import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping

@@ -11,8 +11,8 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError
+from rmpa.resource import limits
 from rmpa.resource.declare.requirements import Requirement, find_attribute
 from rmpa.resource.declare.resource import QoSRequest
 from rmpa.resource.declare.units import quantity

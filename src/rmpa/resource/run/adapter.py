@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError
+from rmpa.resource import limits
 from rmpa.resource.decide.adaptation import (
     Action,
     Adaptation,

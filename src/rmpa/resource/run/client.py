@@ -16,8 +16,8 @@ import secrets
 import time
 from typing import TYPE_CHECKING, Any, Self
 
-from rmpa.core import limits
 from rmpa.core.errors import PeerRefused, UnreachableError
+from rmpa.resource import limits
 from rmpa.resource.declare.answer import RequirementAnswer
 from rmpa.resource.declare.requirement_text import EXPIRES, PRIORITY
 from rmpa.ros.types.diagnostic_array import ARRAY_TYPE, DiagnosticLevel

@@ -11,8 +11,8 @@ import logging
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config.values import did_you_mean
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
+from rmpa.resource import limits
 from rmpa.resource.declare.context_rules import Chooser, parse_rule
 from rmpa.resource.run.descriptor import topic_of
 from rmpa.resource.run.fenced_call import Call

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from rmpa.core import limits
 from rmpa.core.contract import KEYS, Contract
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.resource import limits
 
 if TYPE_CHECKING:
     from rmpa.resource.declare.attributes import Attribute

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
+from rmpa.resource import limits
 from rmpa.runtime.threads import in_thread
 
 if TYPE_CHECKING:

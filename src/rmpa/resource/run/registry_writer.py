@@ -8,8 +8,8 @@ import logging
 import time
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.errors import RmpaError
+from rmpa.resource import limits
 from rmpa.resource.run.descriptor import TOPIC
 from rmpa.resource.run.resource_registry import Place, ResourceRegistry
 from rmpa.resource.run.runtime import RuntimePart

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from rmpa.core import limits
 from rmpa.core.errors import RmpaError
+from rmpa.resource import limits
 from rmpa.resource.run.descriptor import Descriptor
 
 if TYPE_CHECKING:

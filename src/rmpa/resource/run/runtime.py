@@ -14,8 +14,8 @@ import time
 from collections import Counter, deque
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError, RmpaError
+from rmpa.resource import limits
 from rmpa.resource.declare.fence import around
 from rmpa.resource.run.descriptor import TOPIC, describe, topic_of
 from rmpa.ros.types.messages import MessageError, MessageType

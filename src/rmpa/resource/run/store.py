@@ -25,7 +25,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
+from rmpa.resource import limits
 from rmpa.runtime.state_dir import module_dir, state_dir
 
 if TYPE_CHECKING:

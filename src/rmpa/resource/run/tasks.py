@@ -16,7 +16,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.core import limits
+from rmpa.resource import limits
 from rmpa.resource.declare.resource import OnFailure
 from rmpa.resource.run.runtime import RuntimePart
 from rmpa.resource.run.schedule import Schedule, TaskFigures, restart_delay, stuck_after, too_slow

@@ -6,8 +6,8 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
 from rmpa.core.errors import UnreachableError
+from rmpa.ros import limits
 from rmpa.ros.node.learn_type import learn_type
 from rmpa.ros.wire.tcpros import printable
 

@@ -14,9 +14,9 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.counters import Counters
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, RmpaError, StartError, UnreachableError
+from rmpa.ros import limits
 from rmpa.ros.core.identify import name_at
 from rmpa.ros.core.liveness import Liveness, refuses
 from rmpa.ros.http.client import call, call_api, exchange, read_response

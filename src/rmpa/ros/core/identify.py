@@ -6,8 +6,9 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.sizes import KIB
+from rmpa.ros import limits
 from rmpa.ros.http.client import call_api, connect
 from rmpa.ros.wire.tcpros import encode_header, parse_header, subscriber_header
 from rmpa.ros.wire.xmlrpc import RosFault
@@ -20,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 _CALLER_ID: Final = "/rmpa_identify"
 _TOPICS_ASKED: Final = 2
-_CHUNK: Final = 64 * limits.KIB
+_CHUNK: Final = 64 * KIB
 
 
 async def name_at(api: str, topics: Sequence[str] = ()) -> str | None:

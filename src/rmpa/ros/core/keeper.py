@@ -7,7 +7,8 @@ import contextlib
 import logging
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
+from rmpa.ros import limits
 from rmpa.ros.core.store import is_locked
 from rmpa.ros.master import kept
 from rmpa.ros.wire.xmlrpc import brief
@@ -89,7 +90,7 @@ class Keeper:
             self._anew = bool(rows)
             return kept.StoredRegistrations()
         found = kept.read(rows)
-        for lost in found.lost[: limits.LOG_LINES_MAX]:
+        for lost in found.lost[: core_limits.LOG_LINES_MAX]:
             _log.warning("! %s: left out: %s", self.path, lost)
         self._known = {(kind, name): _known(name, value) for kind, name, value in rows}
         self._size = sum(size for size, _ in self._known.values())

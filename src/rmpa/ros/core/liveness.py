@@ -15,11 +15,13 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.errors import OutOfDescriptors, UnreachableError
+from rmpa.core.sizes import KIB
+from rmpa.ros import limits
 from rmpa.ros.core.sock_diag import ask_listening_ports
 from rmpa.ros.http.client import connect, is_own_name, split_uri
 from rmpa.ros.master.reachability import Reachability
+from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.descriptors import Use, is_shortage
 
 if TYPE_CHECKING:
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
-_PIECE: Final = 4 * limits.KIB
+_PIECE: Final = 4 * KIB
 _LISTENING: Final = re.compile(rb"^ *\d+: [0-9A-F]+:([0-9A-F]{4}) [0-9A-F]+:[0-9A-F]{4} 0A ", re.MULTILINE)
 
 
@@ -112,7 +114,7 @@ class Liveness:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
         if self._look is not None:
-            await asyncio.wait([self._look], timeout=limits.DRAIN_TIMEOUT)
+            await asyncio.wait([self._look], timeout=runtime_limits.DRAIN_TIMEOUT)
 
     def suspect(self, node: str) -> None:
         """Check one node now."""

@@ -6,7 +6,7 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
+from rmpa.ros import limits
 from rmpa.ros.core.keeper import Keeper
 from rmpa.ros.core.liveness import is_gone, listening_ports
 from rmpa.ros.core.store import CoreStore

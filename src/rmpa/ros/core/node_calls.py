@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 
-from rmpa.core import limits
 from rmpa.core.errors import PeerRefused, RemoteProtocolError, UnreachableError
+from rmpa.ros import limits
 from rmpa.ros.core.liveness import refuses
 from rmpa.ros.http.client import call_api
 from rmpa.ros.node_info import NodePing

@@ -12,9 +12,9 @@ import logging
 import random
 from typing import TYPE_CHECKING, TypeAlias
 
-from rmpa.core import limits
 from rmpa.core.backoff import Backoff
 from rmpa.core.errors import LocalProtocolError, OutOfDescriptors, RemoteProtocolError, UnreachableError
+from rmpa.ros import limits
 from rmpa.ros.core.identify import name_at
 from rmpa.ros.http.client import call
 from rmpa.ros.master.effects import Effect, ParamUpdate, PublisherUpdate, Shutdown

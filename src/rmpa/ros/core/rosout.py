@@ -10,8 +10,8 @@ import contextlib
 import logging
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.errors import RmpaError
+from rmpa.ros import limits
 from rmpa.ros.master.effects import RegistrationKind
 from rmpa.ros.node.logger_services import LoggerServices
 from rmpa.ros.node.publication import Publication

@@ -15,7 +15,7 @@ import os
 import sqlite3
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from rmpa.core import limits
+from rmpa.ros import limits
 from rmpa.runtime.threads import in_thread
 
 if TYPE_CHECKING:

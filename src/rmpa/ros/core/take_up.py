@@ -16,9 +16,9 @@ from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.backoff import Backoff
 from rmpa.core.errors import RemoteProtocolError, RmpaError, UnreachableError
+from rmpa.ros import limits
 from rmpa.ros.core.identify import name_at
 from rmpa.ros.http.client import call_api
 from rmpa.ros.master.effects import RegistrationKind

@@ -18,8 +18,9 @@ from urllib.parse import urlsplit
 
 import h11
 
-from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded, OutOfDescriptors, RemoteProtocolError, UnreachableError
+from rmpa.core.sizes import KIB
+from rmpa.ros import limits
 from rmpa.ros.wire.xmlrpc import ResponseReader, RosFault, RosReply, XmlRpcValue, brief, call_pieces
 from rmpa.runtime.descriptors import DESCRIPTORS, OUT_OF_DESCRIPTORS, Use
 from rmpa.runtime.event_loop import yield_to_data, yielding_to_data
@@ -28,7 +29,7 @@ __all__ = ["RosFault", "call", "call_api", "connect", "exchange", "is_own_name",
 
 _log = logging.getLogger(__name__)
 
-_CHUNK: Final = 64 * limits.KIB
+_CHUNK: Final = 64 * KIB
 _LOOPBACK: Final = "127.0.0.1"
 
 

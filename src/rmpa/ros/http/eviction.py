@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, Protocol, TypeVar
 
-from rmpa.core import limits
+from rmpa.ros import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -9,9 +9,9 @@ import ipaddress
 import socket
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
 from rmpa.core.errors import StartError
 from rmpa.core.open_files import remedy
+from rmpa.ros import limits
 from rmpa.runtime.descriptors import DESCRIPTORS
 
 if TYPE_CHECKING:

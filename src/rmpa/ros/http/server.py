@@ -15,13 +15,14 @@ from typing import Final
 
 import h11
 
-from rmpa.core import limits
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
+from rmpa.ros import limits
 from rmpa.ros.http import eviction, listen
 from rmpa.ros.wire.call_body import CallBody
 from rmpa.ros.wire.http_head import REASONS, Head, plain_head
 from rmpa.ros.wire.xmlrpc import CallReader, RosFault, XmlRpcValue, brief, response_pieces, serialize_fault
+from rmpa.runtime import limits as runtime_limits
 from rmpa.runtime.acceptor import Acceptor
 from rmpa.runtime.descriptors import DESCRIPTORS, Use
 from rmpa.runtime.event_loop import yield_to_data
@@ -113,7 +114,7 @@ class XmlRpcServer:
             connection.close_when_answered()
         gone = [connection.gone for connection in self._connections]
         if gone:
-            await asyncio.wait(gone, timeout=limits.DRAIN_TIMEOUT)
+            await asyncio.wait(gone, timeout=runtime_limits.DRAIN_TIMEOUT)
         for connection in list(self._connections):
             connection.abort()
 
@@ -569,7 +570,7 @@ class _Connection(asyncio.Protocol):
         if self._transport is not None and not self._transport.is_closing():
             self._transport.write_eof()
             self._receiving = False
-            self._expect(limits.DRAIN_TIMEOUT)
+            self._expect(runtime_limits.DRAIN_TIMEOUT)
 
     # --- the end ----------------------------------------------------------------------------------------------
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import msgspec
 
-from rmpa.core import limits
+from rmpa.ros import limits
 from rmpa.ros.master.awaited import NodeRecord
 from rmpa.ros.master.effects import RegistrationKind
 from rmpa.ros.wire.xmlrpc import brief

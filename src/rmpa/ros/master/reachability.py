@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
+from rmpa.ros import limits
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

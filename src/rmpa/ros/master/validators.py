@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeAlias
 
-from rmpa.core import limits
+from rmpa.ros import limits
 from rmpa.ros.master.registrations import ANY_TYPE
 from rmpa.ros.master.resolution import resolve
 from rmpa.ros.wire.xmlrpc import XmlRpcValue, brief

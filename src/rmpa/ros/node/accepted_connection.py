@@ -6,8 +6,8 @@ import logging
 import socket
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.outbox import URGENT, Outbox
+from rmpa.ros import limits
 from rmpa.ros.wire.tcpros import encode_header, error_header, parse_header
 from rmpa.runtime.stream import Stream
 

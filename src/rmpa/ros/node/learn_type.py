@@ -11,8 +11,8 @@ import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.errors import RmpaError
+from rmpa.ros import limits
 from rmpa.ros.http.client import call_api
 from rmpa.ros.node.subscription import PublisherConnection
 from rmpa.ros.types.definitions import UnknownTypeError

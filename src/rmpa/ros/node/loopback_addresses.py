@@ -7,7 +7,7 @@ import itertools
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
+from rmpa.ros import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -20,8 +20,9 @@ import os
 import time
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from rmpa.core import limits
+from rmpa.config import limits as config_limits
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.ros import limits
 from rmpa.ros.environment import RosEnvironment, host_of, is_loopback
 from rmpa.ros.http.client import call_api
 from rmpa.ros.node.learn_type import find_or_learn
@@ -250,7 +251,7 @@ class Node:
         kind: str | ServiceType,
         handler: Handler,
         *,
-        timeout: float = limits.SERVICE_TIMEOUT,  # noqa: ASYNC109 - of each call, which the client hears of
+        timeout: float = config_limits.SERVICE_TIMEOUT,  # noqa: ASYNC109 - of each call, which the client hears of
     ) -> Service:
         """Serve a service.
 
@@ -322,7 +323,7 @@ class Node:
         name: str,
         kind: str | ServiceType,
         request: object = None,
-        timeout: float | None = limits.SERVICE_TIMEOUT,  # noqa: ASYNC109 - the message names it
+        timeout: float | None = config_limits.SERVICE_TIMEOUT,  # noqa: ASYNC109 - the message names it
     ) -> Any:
         """Call a service once; arguments and errors are those of ``connect_service`` and ``ServiceClient.call``.
 

@@ -11,9 +11,10 @@ import logging
 from collections import deque
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
+from rmpa.ros import limits
 from rmpa.ros.wire.slave_api import OUTBOUND, BusConnection
 from rmpa.ros.wire.tcpros import TopicDescription, check_subscriber, printable, publisher_header
+from rmpa.runtime import limits as runtime_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -262,7 +263,7 @@ class Publication:
         """Keep no message for later subscribers: its source is gone, or will send it again."""
         self._latched.clear()
 
-    async def drained(self, timeout: float = limits.DRAIN_TIMEOUT) -> None:  # noqa: ASYNC109 - for all together
+    async def drained(self, timeout: float = runtime_limits.DRAIN_TIMEOUT) -> None:  # noqa: ASYNC109 - for all together
         """Wait until all that was published has left, or ``timeout`` seconds are over."""
         if self._open:
             await asyncio.gather(*(link.stream.drained(timeout) for link in self._open))

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
-from rmpa.core import limits
 from rmpa.core.errors import (
     LocalProtocolError,
     OutOfDescriptors,
@@ -19,6 +18,8 @@ from rmpa.core.errors import (
     UnreachableError,
 )
 from rmpa.core.outbox import Outbox
+from rmpa.core.sizes import KIB
+from rmpa.ros import limits
 from rmpa.ros.http.client import connect
 from rmpa.ros.node.accepted_connection import keep_alive
 from rmpa.ros.node.service_stream import BODIES, INLINE, send_large
@@ -38,7 +39,7 @@ from rmpa.runtime.stream import Stream
 if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer, Header
 
-_WHOLE = 64 * limits.KIB
+_WHOLE = 64 * KIB
 
 Done = Callable[["tuple[bool, bytes | bytearray] | ServiceFailed"], None]
 

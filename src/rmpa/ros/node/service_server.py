@@ -7,8 +7,10 @@ import logging
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
+from rmpa.config import limits as config_limits
 from rmpa.core.errors import LimitExceeded, RmpaError
+from rmpa.core.sizes import KIB
+from rmpa.ros import limits
 from rmpa.ros.node.service_stream import BODIES, INLINE, send_large
 from rmpa.ros.wire.services import (
     BodyBuffer,
@@ -21,6 +23,7 @@ from rmpa.ros.wire.services import (
     server_header,
 )
 from rmpa.ros.wire.tcpros import LENGTH, printable
+from rmpa.runtime import limits as runtime_limits
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -30,7 +33,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_WHOLE: Final = 64 * limits.KIB
+_WHOLE: Final = 64 * KIB
 """Requests up to here are taken in one piece, without a copy in between."""
 
 Describe = Callable[[], Awaitable[ServiceDescription | str]]
@@ -113,7 +116,7 @@ class ServiceEndpoint:
         describe: Describe | None = None,
         *,
         description: ServiceDescription | None = None,
-        timeout: float = limits.SERVICE_TIMEOUT,
+        timeout: float = config_limits.SERVICE_TIMEOUT,
         on_mismatch: Callable[[Mapping[str, str], str], None] | None = None,
     ) -> None:
         self.service = service
@@ -162,7 +165,7 @@ class ServiceEndpoint:
         """Behind ``withdraw``: wait, a moment at the most, until the last replies have left."""
         if self._sessions:
             self._empty = asyncio.get_running_loop().create_future()
-            await asyncio.wait([self._empty], timeout=limits.DRAIN_TIMEOUT)
+            await asyncio.wait([self._empty], timeout=runtime_limits.DRAIN_TIMEOUT)
         for session in tuple(self._sessions):
             session.close()
 

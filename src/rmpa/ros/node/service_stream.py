@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
+from rmpa.core.sizes import KIB
 from rmpa.runtime.event_loop import yield_to_data
 
 if TYPE_CHECKING:
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 BODIES: Final = 0
 """The key of what a service's connection sends."""
-INLINE: Final = 256 * limits.KIB
+INLINE: Final = 256 * KIB
 """Larger bodies leave in parts: to copy one of 64 MiB into a queue would hold everything else up for 30 ms."""
-_PART: Final = 256 * limits.KIB
+_PART: Final = 256 * KIB
 
 
 async def send_large(stream: Stream, head: bytes, body: Buffer) -> None:

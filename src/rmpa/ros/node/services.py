@@ -8,7 +8,7 @@ import logging
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
-from rmpa.core import limits
+from rmpa.config import limits
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint

@@ -13,9 +13,9 @@ import socket
 import struct
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.counters import Counters
 from rmpa.core.errors import StartError
+from rmpa.ros import limits
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.node.loopback_addresses import LoopbackAddresses
 from rmpa.runtime.acceptor import Acceptor

@@ -7,10 +7,11 @@ import logging
 import random
 from typing import TYPE_CHECKING, Final, Protocol
 
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.backoff import Backoff
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
 from rmpa.core.outbox import URGENT, Outbox
+from rmpa.ros import limits
 from rmpa.ros.http.client import call_api, connect
 from rmpa.ros.node.accepted_connection import keep_alive
 from rmpa.ros.wire.slave_api import INBOUND, TCPROS, BusConnection
@@ -263,7 +264,7 @@ class PublisherConnection:
             self.bytes += len(message)
             self._on_message(message)
         start += consumed
-        if self._parts is not None and wanted > limits.CUT_THROUGH_BYTES and not self._closed:
+        if self._parts is not None and wanted > core_limits.CUT_THROUGH_BYTES and not self._closed:
             self._left = wanted
             self._parts.begin(wanted)
             if self._left:  # it may have closed us

@@ -8,10 +8,10 @@ import logging
 import socket
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import StartError
 from rmpa.core.open_files import remedy
+from rmpa.ros import limits
 from rmpa.ros.node.accepted_connection import AcceptedConnection
 from rmpa.ros.wire.tcpros import check_request, printable
 from rmpa.runtime.acceptor import Acceptor

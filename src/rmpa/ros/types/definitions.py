@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded, RmpaError
 from rmpa.core.names import is_type_name
+from rmpa.ros import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping

@@ -8,8 +8,8 @@ from collections import OrderedDict
 from time import monotonic
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.errors import RmpaError
+from rmpa.ros import limits
 from rmpa.ros.types.find import EMPTY_MD5, message_with_sum
 from rmpa.ros.types.installed import SearchPath
 from rmpa.ros.types.messages import MessageType

@@ -20,8 +20,8 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.names import is_type_name
+from rmpa.ros import limits
 from rmpa.ros.types.actions import action_message, actions_of
 from rmpa.ros.types.definitions import SEPARATOR
 from rmpa.ros.types.packages import package_folders, packages_below, read_text

@@ -10,8 +10,8 @@ import functools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, Union
 
-from rmpa.core import limits
 from rmpa.core.errors import RmpaError
+from rmpa.ros import limits
 from rmpa.ros.types.definitions import (
     DefinitionError,
     Field,

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
+from rmpa.ros import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -10,14 +10,15 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
+from rmpa.core.sizes import KIB
+from rmpa.ros import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 _METHOD: Final = re.compile(rb"<methodName>\s*([A-Za-z0-9_.]{1,64})\s*</methodName>")
 _TEXTS: Final = re.compile(rb"<value>\s*(?:<string>)?([^<]{1,256})(?:</string>)?\s*</value>")
-_BEGIN: Final = 4 * limits.KIB
+_BEGIN: Final = 4 * KIB
 """Bytes of a refused call that are kept to say what it was."""
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from typing import Final, NamedTuple
 
-from rmpa.core import limits
+from rmpa.ros import limits
 
 _HEAD: Final = re.compile(
     rb"POST /[\x21-\x7e]{0,1000} HTTP/1\.1\r\n((?:[A-Za-z-]{1,40}: [\x20-\x7e]{0,1000}\r\n){1,20})\r\n"

@@ -14,8 +14,8 @@ import struct
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError, LimitExceeded
+from rmpa.ros import limits
 from rmpa.ros.wire.tcpros import ANY, LENGTH, printable
 
 if TYPE_CHECKING:

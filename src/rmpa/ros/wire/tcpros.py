@@ -14,8 +14,8 @@ import struct
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.ros import limits
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

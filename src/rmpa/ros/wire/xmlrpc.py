@@ -16,8 +16,8 @@ from xmlrpc.client import Fault, ResponseError, Unmarshaller
 from defusedxml.common import DefusedXmlException
 from defusedxml.xmlrpc import DefusedExpatParser
 
-from rmpa.core import limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
+from rmpa.ros import limits
 from rmpa.ros.wire.xmlrpc_writer import legal_text, pieces
 
 XmlRpcValue: TypeAlias = Union[  # noqa: UP007 - | does not take the forward references of a recursive type

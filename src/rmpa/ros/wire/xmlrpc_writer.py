@@ -12,8 +12,8 @@ from datetime import datetime
 from itertools import chain
 from typing import TYPE_CHECKING, Final, cast
 
-from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError
+from rmpa.ros import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

@@ -13,11 +13,13 @@ from hypothesis import strategies as st
 from rmpa.bridge.data.io.flows import ExportFlow, ImportFlow
 from rmpa.bridge.data.io.link_time import LinkTime
 from rmpa.bridge.data.qos_events import QosEventKind
-from rmpa.core import limits
 from rmpa.core.contract import Contract, Durability, Priority, Reliability
 from rmpa.core.counters import Counters
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.mesh import limits as mesh_limits
+from rmpa.ros import limits as ros_limits
+from rmpa.runtime import limits as runtime_limits
 from tests.bridge.io.doubles import WALL, Clock, Link, Outlet, running
 
 if TYPE_CHECKING:
@@ -148,7 +150,7 @@ def test_each_peer_gets_as_many_kept_messages_as_its_contract_says() -> None:
 
 
 def test_no_contract_keeps_more_than_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "LATCHED_MAX", 5)
+    monkeypatch.setattr(ros_limits, "LATCHED_MAX", 5)
     flow, late = ExportFlow(), Link()
     deep = Contract(durability=Durability.TRANSIENT_LOCAL, depth=100)
     flow.add(1, Link(), 7, deep, 0)
@@ -402,7 +404,7 @@ def test_parts_are_handed_on_before_the_last_one_came() -> None:
         (b"", None),
         (b"\1\0\0", None),
         (b"\xff\xff\xff\xff", None),
-        ((limits.MESSAGE_MAX - 3).to_bytes(4, "little"), None),
+        ((ros_limits.MESSAGE_MAX - 3).to_bytes(4, "little"), None),
         (b"\3\0\0\0abcd", None),
         (b"\3\0\0\0ab", (2, 0, b"cd")),
         (b"\3\0\0\0ab", (2, LAST, b"")),
@@ -515,8 +517,8 @@ def test_the_same_number_again_in_the_middle_is_no_mixture() -> None:
 
 # --- in: what is old ------------------------------------------------------------------------------------------
 
-OLD = limits.STALE_AGE + 0.01
-HOLD = limits.STALE_HOLD
+OLD = runtime_limits.STALE_AGE + 0.01
+HOLD = mesh_limits.STALE_HOLD
 
 
 def burst(inlet: Inlet, clock: Clock, ages: list[float], first: int = 2) -> None:
@@ -721,18 +723,18 @@ def test_a_large_message_of_another_size_is_streamed_and_ends_the_replay() -> No
 def test_acknowledged_are_many_at_once_or_a_few_soon(clock: Clock) -> None:
     inlet = Inlet(RELIABLE)
     inlet.flow.begin_epoch(1, 1)
-    for sequence in range(1, limits.ACK_MESSAGES):
+    for sequence in range(1, mesh_limits.ACK_MESSAGES):
         inlet.message(sequence)
     assert inlet.acks == []
-    inlet.message(limits.ACK_MESSAGES)
-    assert inlet.acks == [limits.ACK_MESSAGES], "a full batch"
+    inlet.message(mesh_limits.ACK_MESSAGES)
+    assert inlet.acks == [mesh_limits.ACK_MESSAGES], "a full batch"
     assert clock.due == []
-    inlet.message(limits.ACK_MESSAGES + 1)
-    clock.advance(limits.ACK_DELAY / 2)
-    inlet.message(limits.ACK_MESSAGES + 2)
+    inlet.message(mesh_limits.ACK_MESSAGES + 1)
+    clock.advance(mesh_limits.ACK_DELAY / 2)
+    inlet.message(mesh_limits.ACK_MESSAGES + 2)
     assert len(inlet.acks) == 1
-    clock.advance(limits.ACK_DELAY / 2)
-    assert inlet.acks[1:] == [limits.ACK_MESSAGES + 2]
+    clock.advance(mesh_limits.ACK_DELAY / 2)
+    assert inlet.acks[1:] == [mesh_limits.ACK_MESSAGES + 2]
     clock.advance(1.0)
     assert len(inlet.acks) == 2, "once"
 
@@ -740,7 +742,7 @@ def test_acknowledged_are_many_at_once_or_a_few_soon(clock: Clock) -> None:
 def test_a_few_large_ones_are_acknowledged_at_once(clock: Clock) -> None:
     inlet = Inlet(RELIABLE)
     inlet.flow.begin_epoch(1, 1)
-    size = limits.ACK_BYTES // 2
+    size = mesh_limits.ACK_BYTES // 2
     inlet.parts(1, bytes(size), 50)
     assert inlet.acks == []
     inlet.parts(2, bytes(size), 50)
@@ -762,7 +764,7 @@ def test_a_torn_reliable_message_reaches_nobody_by_half_and_comes_again_whole(cl
     inlet.message(3, b"three")
     assert inlet.got == [b"one", b"2" * BIG, b"three"]
     assert inlet.counts == (0, 1, 0, 0)
-    clock.advance(limits.ACK_DELAY)
+    clock.advance(mesh_limits.ACK_DELAY)
     assert inlet.acks == [3]
 
 
@@ -809,7 +811,7 @@ def test_what_an_outage_held_up_is_delivered_when_it_is_reliable_unless_it_has_a
         inlet.parts(4, bytes(BIG), 50, stamp_ns=clock.wall_ns() - 7 * 10**9)
         assert len(inlet.got) == delivered
         assert inlet.counts == (0, 0, 0, 4 - delivered)
-        clock.advance(limits.ACK_DELAY)
+        clock.advance(mesh_limits.ACK_DELAY)
         assert inlet.acks == [4], "what is too old has arrived all the same"
         inlet.flow.close()
 

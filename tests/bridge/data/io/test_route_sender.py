@@ -11,17 +11,19 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 
 from rmpa.bridge.data.io.route_sender import ReliableRouteSender, RouteSender, make_route_sender
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.contract import Contract, History, Priority, Reliability
 from rmpa.core.errors import RemoteProtocolError
+from rmpa.mesh import limits as mesh_limits
+from rmpa.runtime import limits as runtime_limits
 from tests.bridge.io.doubles import Clock, Link, running
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 SMALL = b"s" * 8
-LARGE = b"L" * (limits.EXPRESS_MESSAGE_MAX + 1)
-ROW = limits.EXPRESS_AGAIN_MESSAGES
+LARGE = b"L" * (mesh_limits.EXPRESS_MESSAGE_MAX + 1)
+ROW = mesh_limits.EXPRESS_AGAIN_MESSAGES
 RELIABLE = Contract(reliability=Reliability.RELIABLE)
 
 
@@ -95,7 +97,7 @@ def test_from_express_to_bulk_and_back_again(clock: Clock) -> None:
     link = Link()
     leg = best_effort(link)
     on_bulk(link, leg)
-    clock.advance(limits.EXPRESS_AGAIN_AFTER)
+    clock.advance(mesh_limits.EXPRESS_AGAIN_AFTER)
     for _ in range(ROW - 1):
         leg.message(0, SMALL)
     assert set(link.lanes) == {"bulk"}
@@ -116,7 +118,7 @@ def test_a_large_one_while_the_way_back_is_fenced_does_not_go_by_the_express_lan
     link = Link()
     leg = best_effort(link)
     on_bulk(link, leg)
-    clock.advance(limits.EXPRESS_AGAIN_AFTER)
+    clock.advance(mesh_limits.EXPRESS_AGAIN_AFTER)
     for _ in range(ROW):
         leg.message(0, SMALL)
     held = len(link.sent)
@@ -146,7 +148,7 @@ def test_what_is_held_keeps_to_the_depth_and_the_newest_stay(history: History, k
 def test_what_is_held_keeps_to_the_bytes_but_one_message_always_fits(
     clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(limits, "LINK_QUEUE_BYTES", 1000)
+    monkeypatch.setattr(mesh_limits, "LINK_QUEUE_BYTES", 1000)
     link = Link()
     leg = best_effort(link, large=True)
     assert leg.message(0, bytes(400)) == 0
@@ -156,7 +158,7 @@ def test_what_is_held_keeps_to_the_bytes_but_one_message_always_fits(
     assert leg.message(0, bytes(1000)) == 1
     answer(link, leg)
     assert [len(payload) for _, _, payload in link.sent] == [1000]
-    clock.advance(limits.EXPRESS_AGAIN_AFTER)
+    clock.advance(mesh_limits.EXPRESS_AGAIN_AFTER)
     for _ in range(ROW):
         leg.message(0, b"")
     assert link.fences
@@ -207,7 +209,7 @@ def test_bulk_lost_nothing_of_it_comes_behind_what_goes_by_the_express_lane_now(
     link = Link()
     leg = best_effort(link)
     on_bulk(link, leg)
-    clock.advance(limits.EXPRESS_AGAIN_AFTER)
+    clock.advance(mesh_limits.EXPRESS_AGAIN_AFTER)
     for _ in range(ROW):
         leg.message(0, SMALL)
     number = link.fences.popleft()[1]
@@ -217,7 +219,7 @@ def test_bulk_lost_nothing_of_it_comes_behind_what_goes_by_the_express_lane_now(
     leg.fenced(number)
     leg.message(0, SMALL)
     assert link.numbers == list(range(1, ROW + 3))
-    assert link.bulk.terms[7] == (limits.ROUTE_QUEUE_MESSAGES, limits.BULK_STALE_AGE, False), "they hold on"
+    assert link.bulk.terms[7] == (core_limits.ROUTE_QUEUE_MESSAGES, mesh_limits.BULK_STALE_AGE, False), "they hold on"
 
 
 @pytest.mark.usefixtures("clock")
@@ -236,18 +238,18 @@ def test_bulk_lost_without_a_fence_what_waits_for_its_next_connection_stays() ->
 @pytest.mark.parametrize(
     ("contract", "depth", "ages", "strict"),
     [
-        (Contract(), limits.ROUTE_QUEUE_MESSAGES, (limits.STALE_AGE, limits.BULK_STALE_AGE), False),
-        (Contract(depth=3), 3, (limits.STALE_AGE, limits.BULK_STALE_AGE), False),
+        (Contract(), core_limits.ROUTE_QUEUE_MESSAGES, (runtime_limits.STALE_AGE, mesh_limits.BULK_STALE_AGE), False),
+        (Contract(depth=3), 3, (runtime_limits.STALE_AGE, mesh_limits.BULK_STALE_AGE), False),
         (Contract(depth=3, lifespan=0.5), 3, (0.5, 0.5), True),
         (
             Contract(depth=3, history=History.KEEP_ALL),
-            limits.KEEP_ALL_MESSAGES,
-            (limits.STALE_AGE, limits.BULK_STALE_AGE),
+            mesh_limits.KEEP_ALL_MESSAGES,
+            (runtime_limits.STALE_AGE, mesh_limits.BULK_STALE_AGE),
             False,
         ),
         (
             Contract(depth=3, lifespan=0.5, reliability=Reliability.RELIABLE),
-            limits.KEEP_ALL_MESSAGES,
+            mesh_limits.KEEP_ALL_MESSAGES,
             (None, None),
             False,
         ),
@@ -450,7 +452,7 @@ def test_nothing_more_happens_when_it_is_closed(clock: Clock) -> None:
 def test_the_window_bounds_what_is_under_way_and_acknowledgements_move_it(
     clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(limits, "RELIABLE_WINDOW_MESSAGES", 4)
+    monkeypatch.setattr(mesh_limits, "RELIABLE_WINDOW_MESSAGES", 4)
     link = Link()
     leg = reliable(link)
     for n in range(10):
@@ -468,7 +470,7 @@ def test_the_window_bounds_what_is_under_way_and_acknowledgements_move_it(
 
 @pytest.mark.usefixtures("clock")
 def test_beyond_its_bounds_the_oldest_is_lost_and_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "RELIABLE_WINDOW_MESSAGES", 2)
+    monkeypatch.setattr(mesh_limits, "RELIABLE_WINDOW_MESSAGES", 2)
     link = Link()
     leg = reliable(link, Contract(reliability=Reliability.RELIABLE, depth=5))
     lost = [leg.message(0, bytes([n])) for n in range(9)]
@@ -536,7 +538,7 @@ def test_bulk_lost_on_the_way_back_all_goes_by_the_express_lane(clock: Clock) ->
     leg = reliable(link)
     leg.message(0, LARGE)
     answer(link, leg)
-    clock.advance(limits.EXPRESS_AGAIN_AFTER)
+    clock.advance(mesh_limits.EXPRESS_AGAIN_AFTER)
     for _ in range(ROW):
         leg.message(0, SMALL)
     assert list(link.fences) == [("bulk", 2)]
@@ -655,8 +657,8 @@ class FallingLink(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.patch = pytest.MonkeyPatch()
-        self.patch.setattr(limits, "RELIABLE_WINDOW_MESSAGES", 4)
-        self.patch.setattr(limits, "EXPRESS_AGAIN_MESSAGES", 3)
+        self.patch.setattr(mesh_limits, "RELIABLE_WINDOW_MESSAGES", 4)
+        self.patch.setattr(mesh_limits, "EXPRESS_AGAIN_MESSAGES", 3)
         self.running = running(Clock())
         self.clock = self.running.__enter__()
         self.link = Link()
@@ -683,7 +685,7 @@ class FallingLink(RuleBasedStateMachine):
         self.published += count
         self.collect()
 
-    @rule(seconds=st.sampled_from([0.01, limits.EXPRESS_AGAIN_AFTER]))
+    @rule(seconds=st.sampled_from([0.01, mesh_limits.EXPRESS_AGAIN_AFTER]))
     def wait(self, seconds: float) -> None:
         self.clock.advance(seconds)
 

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
+from rmpa.bridge import limits
 from rmpa.bridge.messages import decode
 from rmpa.bridge.params import transfer
 from rmpa.bridge.params.io.core import read_text, write_text
 from rmpa.bridge.params.io.part import Params
 from rmpa.bridge.session.peer_rpc import PeerRpc
 from rmpa.config.settings import FollowRule, ParamSettings, Settings, TimeSettings
-from rmpa.core import limits
 from rmpa.core.counters import Counters
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros.master.api import MasterApi

@@ -10,11 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rmpa.bridge import limits
 from rmpa.bridge.services.io.bodies import BodyReceiver, BodySender, Budget
 from rmpa.bridge.services.io.calls import Budgets, Caller, CallStats, Server
-from rmpa.core import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST, Outbox, QueuedMessage
+from rmpa.mesh import limits as mesh_limits
+from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -40,7 +43,7 @@ class Lane:
         self.sent = 0
 
     def send(self, route: int, sequence: int, stamp_ns: int, payload: Buffer) -> int:
-        assert len(payload) <= limits.FRAGMENT_BYTES
+        assert len(payload) <= core_limits.FRAGMENT_BYTES
         framed = memoryview(bytes(payload))
         self._go(lambda: self.wire.takers[route].message(sequence, stamp_ns, framed))
         return 0
@@ -50,8 +53,8 @@ class Lane:
 
     def extend(self, parcel: QueuedMessage, data: Buffer) -> int:
         view = memoryview(bytes(data))
-        for start in range(0, len(view), limits.FRAGMENT_BYTES):
-            part = view[start : start + limits.FRAGMENT_BYTES]
+        for start in range(0, len(view), core_limits.FRAGMENT_BYTES):
+            part = view[start : start + core_limits.FRAGMENT_BYTES]
             flags = (0 if parcel.sent else FIRST) | LAST * (parcel.sent + len(part) == parcel.size)
             parcel.sent += len(part)
             self._go(
@@ -62,7 +65,7 @@ class Lane:
         return 0
 
     def set_terms(self, route: int, depth: int, max_age: float | None, *, strict: bool) -> None:
-        assert (depth, max_age) == (limits.KEEP_ALL_MESSAGES, None), "nothing of a call may be dropped"
+        assert (depth, max_age) == (mesh_limits.KEEP_ALL_MESSAGES, None), "nothing of a call may be dropped"
 
     def _go(self, deliver: Callable[[], None]) -> None:
         self.sent += 1
@@ -312,7 +315,7 @@ def test_bodies_arrive_whole_and_once(sizes: list[int]) -> None:
     ("parts", "error"),
     [
         ([(FIRST, b"\1\0")], RemoteProtocolError),
-        ([(FIRST, (limits.SERVICE_MESSAGE_MAX + 2).to_bytes(4, "little"))], LimitExceeded),
+        ([(FIRST, (ros_limits.SERVICE_MESSAGE_MAX + 2).to_bytes(4, "little"))], LimitExceeded),
         ([(FIRST, b"\2\0\0\0"), (0, b"abc")], RemoteProtocolError),
         ([(FIRST, b"\2\0\0\0"), (LAST, b"a")], RemoteProtocolError),
     ],

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
+from rmpa.bridge import limits
 from rmpa.bridge.actions import Describe, Detach, Publish, Retract
 from rmpa.bridge.data.qos_events import QosEventKind
 from rmpa.bridge.messages import Description, Source
 from rmpa.bridge.topics.io.proxies import PeerProxies
-from rmpa.core import limits
 from rmpa.core.contract import Contract, Durability, Liveliness, Reliability
 from rmpa.core.outbox import FIRST
+from rmpa.mesh import limits as mesh_limits
 from tests.bridge.io.nodes import MD5, Core, Ear, stages
 from tests.bridge.io.two_bridges import made_up
 from tests.bridge.io.virtual import VirtualLoop, run
@@ -218,7 +219,7 @@ def test_a_reliable_source_goes_on_with_the_same_flow() -> None:
         assert listener.texts == ["one", "two", "five"]
         assert (flow.quality.messages, flow.lost) == (3, 2)
         assert not listener.closed
-        await asyncio.sleep(limits.ACK_DELAY * 2)
+        await asyncio.sleep(mesh_limits.ACK_DELAY * 2)
         assert proxied.acks[-1] == 5
 
     play(scene)
@@ -311,7 +312,7 @@ def test_what_is_not_to_go_on_any_more_is_forgotten(how: str) -> None:
         proxied.inbound.unheard(lambda _: False)
         assert proxied.inbound.position(CMD) is None
         assert proxied.inbound._latest == {}
-        await asyncio.sleep(limits.ACK_DELAY * 2)
+        await asyncio.sleep(mesh_limits.ACK_DELAY * 2)
         assert proxied.acks == []
 
     play(scene)
@@ -379,7 +380,7 @@ def test_a_source_that_leaves_with_its_peer_is_lost_at_once_however_the_link_end
         proxied.inbound.link_down()
         if silent:
             proxied.inbound.detach(Detach(1, CMD, 1, keep=True))
-            await asyncio.sleep(limits.AWAY_GRACE)
+            await asyncio.sleep(mesh_limits.AWAY_GRACE)
             assert proxied.occurred == []
         else:
             proxied.inbound.detach(Detach(1, CMD, 1))

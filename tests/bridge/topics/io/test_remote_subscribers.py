@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import pytest
 
+from rmpa.bridge import limits
 from rmpa.bridge.messages import (
     Advertise,
     Audience,
@@ -26,7 +27,6 @@ from rmpa.bridge.topics.imports import Imports
 from rmpa.bridge.topics.io import remote_subscribers as module
 from rmpa.bridge.topics.io.remote_subscribers import RemoteSubscribers
 from rmpa.config.settings import PolicySettings
-from rmpa.core import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -8,16 +8,17 @@ from dataclasses import replace
 
 import pytest
 
-from rmpa.core import limits
+from rmpa.config import limits as config_limits
 from rmpa.core.counters import Counters
 from rmpa.core.errors import ConfigError, StartError
 from rmpa.discovery.io.interfaces import Interface, list_interfaces
 from rmpa.discovery.io.packet_filter import PacketFilter
+from rmpa.observe import limits
 from rmpa.observe.doctor.io.multicast import GroupReceiver, GroupSender, hear_ourselves
 
 PORT = 20000 + os.getpid() % 20000
 LO = next(interface for interface in list_interfaces() if interface.name == "lo")
-GROUP = limits.MULTICAST_GROUP
+GROUP = config_limits.MULTICAST_GROUP
 
 
 def test_what_is_sent_on_an_interface_is_heard_there() -> None:

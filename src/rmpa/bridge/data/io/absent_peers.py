@@ -6,7 +6,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
+from rmpa.mesh import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable

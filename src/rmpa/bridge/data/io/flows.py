@@ -17,12 +17,14 @@ from rmpa.bridge.data.io.route_sender import ReliableRouteSender, RouteSender, m
 from rmpa.bridge.data.losses import ReceptionHistory
 from rmpa.bridge.data.qos_events import QosWatch
 from rmpa.bridge.data.quality import Quality
-from rmpa.core import limits
 from rmpa.core.contract import Contract, Durability, Priority, Reliability
 from rmpa.core.counters import Counters
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ReliableReceiver
+from rmpa.ros import limits as ros_limits
+from rmpa.runtime import limits as runtime_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -112,7 +114,7 @@ class ExportFlow:
         """Keep the last ``depth`` messages for peers that come later."""
         self._keeping = True
         if depth > (self._latched.maxlen or 0):
-            self._latched = deque(self._latched, maxlen=min(depth, limits.LATCHED_MAX))
+            self._latched = deque(self._latched, maxlen=min(depth, ros_limits.LATCHED_MAX))
 
     def add(self, peer: int, link: DataLink, route: int, contract: Contract, epoch: int) -> RouteSender:
         """Send to one more peer from now on; first what its contract, or the publisher, has kept for it."""
@@ -252,7 +254,7 @@ class ImportFlow:
             self._receiver = known if known is not None else ReliableReceiver()
         self._epoch = 0
         self._plain = self._receiver is None
-        self._stale_ns = round((contract.lifespan or limits.STALE_AGE) * 1e9)
+        self._stale_ns = round((contract.lifespan or runtime_limits.STALE_AGE) * 1e9)
         # The first ones of a route may be as old as they are: kept messages, of a latching publisher at least one.
         self._kept = contract.kept if contract.durability is Durability.TRANSIENT_LOCAL else 1
         self._size = self._got = 0
@@ -282,7 +284,7 @@ class ImportFlow:
     def lane(self) -> str:
         """The lane of its messages: ``express`` or ``bulk``; where size decides, that of the last one."""
         if self.contract.priority is Priority.NORMAL:
-            return "bulk" if self._last_size > limits.EXPRESS_MESSAGE_MAX else "express"
+            return "bulk" if self._last_size > mesh_limits.EXPRESS_MESSAGE_MAX else "express"
         return "express" if self.contract.priority is Priority.HIGH else "bulk"
 
     @property
@@ -452,7 +454,7 @@ class ImportFlow:
             self._gave_way()
         self._stale = (sequence, stamp_ns, bytes(framed))
         if self._timer is None:
-            self._timer = self._loop.call_later(limits.STALE_HOLD, self._nothing_newer)
+            self._timer = self._loop.call_later(mesh_limits.STALE_HOLD, self._nothing_newer)
         return True
 
     def _supersede(self) -> None:
@@ -528,8 +530,8 @@ class ImportFlow:
         if len(part) < _LENGTH:
             raise RemoteProtocolError(f"a first part of {len(part)} bytes has no length")
         size = _LENGTH + int.from_bytes(part[:_LENGTH], "little")
-        if size > limits.MESSAGE_MAX:
-            raise LimitExceeded("message", size, limits.MESSAGE_MAX)
+        if size > ros_limits.MESSAGE_MAX:
+            raise LimitExceeded("message", size, ros_limits.MESSAGE_MAX)
         if self._receiver is not None:
             if not self._receiver.judge(sequence, self._epoch).deliver:
                 self._accept(sequence, 0, 0, 0)

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from rmpa.bridge.data.downsampling import Downsampler
 from rmpa.bridge.data.lane_switch import EXPRESS, LaneSwitch
-from rmpa.core import limits
 from rmpa.core.contract import Contract, History, Reliability
+from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ReliableSender
+from rmpa.runtime import limits as runtime_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -87,14 +88,14 @@ class RouteSender:
         self.link: DataLink | None = link
         self.route = route
         self.contract = contract
-        self._depth = limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.depth
+        self._depth = mesh_limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.depth
         self.sequence = 0
         self.dropped = 0
         """Messages that gave way because a bound of ours was reached."""
         self._loop = asyncio.get_running_loop()
         self._lane: DataLane = link.express
         self._switch = LaneSwitch(contract, large=large)
-        self._small = limits.EXPRESS_MESSAGE_MAX
+        self._small = mesh_limits.EXPRESS_MESSAGE_MAX
         self._held: deque[tuple[int, int, bytes]] = deque()
         self._held_bytes = 0
         self._parcel: QueuedMessage | None = None
@@ -200,7 +201,9 @@ class RouteSender:
         self._held.append((sequence, stamp_ns, payload))
         self._held_bytes += len(payload)
         dropped = 0
-        while len(self._held) > 1 and (len(self._held) > self._depth or self._held_bytes > limits.LINK_QUEUE_BYTES):
+        while len(self._held) > 1 and (
+            len(self._held) > self._depth or self._held_bytes > mesh_limits.LINK_QUEUE_BYTES
+        ):
             self._held_bytes -= len(self._held.popleft()[2])
             dropped += 1
         self.dropped += dropped
@@ -238,7 +241,10 @@ class RouteSender:
         if self.link is None:
             return
         contract = self.contract
-        for lane, stale in ((self.link.express, limits.STALE_AGE), (self.link.bulk, limits.BULK_STALE_AGE)):
+        for lane, stale in (
+            (self.link.express, runtime_limits.STALE_AGE),
+            (self.link.bulk, mesh_limits.BULK_STALE_AGE),
+        ):
             strict = contract.lifespan is not None
             lane.set_terms(self.route, self._depth, contract.lifespan if strict else stale, strict=strict)
 
@@ -276,9 +282,13 @@ class ReliableRouteSender(RouteSender):
     reliable = True
 
     def __init__(self, link: DataLink, route: int, contract: Contract, epoch: int, *, large: bool = False) -> None:
-        depth = limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.depth
+        depth = mesh_limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.depth
         self.sender = ReliableSender(
-            depth, limits.REPLAY_BYTES, limits.RELIABLE_WINDOW_MESSAGES, limits.RELIABLE_WINDOW_BYTES, epoch
+            depth,
+            mesh_limits.REPLAY_BYTES,
+            mesh_limits.RELIABLE_WINDOW_MESSAGES,
+            mesh_limits.RELIABLE_WINDOW_BYTES,
+            epoch,
         )
         self._keep: Callable[[bytes, int], object] | None = None
         self._told = 0
@@ -374,7 +384,7 @@ class ReliableRouteSender(RouteSender):
         """Nothing that was numbered may be dropped from a queue; the window bounds it instead."""
         if self.link is not None:
             for lane in (self.link.express, self.link.bulk):
-                lane.set_terms(self.route, limits.KEEP_ALL_MESSAGES, None, strict=False)
+                lane.set_terms(self.route, mesh_limits.KEEP_ALL_MESSAGES, None, strict=False)
 
 
 def make_route_sender(link: DataLink, route: int, contract: Contract, epoch: int, *, large: bool) -> RouteSender:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Final
 
+from rmpa.bridge import limits
 from rmpa.bridge.params.transfer import too_large
 from rmpa.bridge.policy import OWN_NODE
-from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError, PeerRefused, RemoteProtocolError
+from rmpa.ros import limits as ros_limits
 from rmpa.ros.master.parameters import holds_nil
 from rmpa.ros.wire.xmlrpc import ResponseReader, response_pieces
 from rmpa.runtime.event_loop import yield_to_data, yielding_to_data
@@ -50,9 +51,9 @@ async def read_text(text: str) -> XmlRpcValue:
     """
     reader = ResponseReader()
     try:
-        for begin in range(0, len(text), limits.XMLRPC_SLICE):
-            reader.feed(text[begin : begin + limits.XMLRPC_SLICE].encode())
-            if begin >= limits.HTTP_BODY_INLINE:
+        for begin in range(0, len(text), ros_limits.XMLRPC_SLICE):
+            reader.feed(text[begin : begin + ros_limits.XMLRPC_SLICE].encode())
+            if begin >= ros_limits.HTTP_BODY_INLINE:
                 await asyncio.sleep(0)
             else:
                 yield_to_data()

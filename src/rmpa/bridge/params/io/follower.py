@@ -6,10 +6,10 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Any
 
+from rmpa.bridge import limits
 from rmpa.bridge.params import transfer
 from rmpa.bridge.params.io.core import ParamCore, read_text
 from rmpa.bridge.params.rules import Following, learn
-from rmpa.core import limits
 from rmpa.core.counters import Counters, RefusalLog
 from rmpa.core.errors import RemoteProtocolError, RmpaError
 

@@ -8,11 +8,12 @@ import logging
 from collections import defaultdict
 from typing import TYPE_CHECKING, Any
 
+from rmpa.bridge import limits
 from rmpa.bridge.params import transfer
 from rmpa.bridge.params.io.core import PEERS, ParamCore, read_text, write_text
 from rmpa.bridge.params.rules import key_problem, leaves
+from rmpa.config import limits as config_limits
 from rmpa.config.param_rules import overlap
-from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError, RmpaError
 from rmpa.runtime.event_loop import yield_to_data, yielding_to_data
 
@@ -37,7 +38,9 @@ class ParamServer:
         most: How many parameters one peer may follow.
     """
 
-    def __init__(self, core: ParamCore, policy: ParamPolicy, asks: PeerRpc, most: int = limits.FOLLOWED_MAX) -> None:
+    def __init__(
+        self, core: ParamCore, policy: ParamPolicy, asks: PeerRpc, most: int = config_limits.FOLLOWED_MAX
+    ) -> None:
         self._core = core
         self.most = most
         self.policy = policy
@@ -149,8 +152,8 @@ class ParamServer:
     async def _follow(self, attached: PeerSession, args: dict[str, Any]) -> dict[str, object]:
         """From now on a peer follows these keys, and none of those that it did before."""
         keys = args.get("keys")
-        if not isinstance(keys, list) or len(keys) > limits.FOLLOW_RULES_MAX:
-            raise RmpaError(f"keys is not a list of at most {limits.FOLLOW_RULES_MAX} parameters")
+        if not isinstance(keys, list) or len(keys) > config_limits.FOLLOW_RULES_MAX:
+            raise RmpaError(f"keys is not a list of at most {config_limits.FOLLOW_RULES_MAX} parameters")
         refused: dict[str, str] = {}
         wanted: set[str] = set()
         for given in keys:
@@ -160,7 +163,7 @@ class ParamServer:
             if not why and key not in wanted and len(wanted) >= self.most:
                 why = f"more parameters than limits.params = {self.most} over there; raise it, or follow a namespace"
             if why:
-                refused[str(given)[: limits.CROSSING_NAME_MAX]] = why
+                refused[str(given)[: config_limits.CROSSING_NAME_MAX]] = why
             else:
                 wanted.add(key)
         self._followers[attached.peer] = (attached, wanted)

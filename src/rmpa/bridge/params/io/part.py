@@ -7,12 +7,13 @@ import contextlib
 import logging
 from typing import TYPE_CHECKING
 
+from rmpa.bridge import limits
 from rmpa.bridge.params.io.core import ParamCore
 from rmpa.bridge.params.io.follower import ParamFollower
 from rmpa.bridge.params.io.param_server import ParamServer
 from rmpa.bridge.params.rules import ParamPolicy, follow_rules
 from rmpa.bridge.session.part import Part
-from rmpa.core import limits
+from rmpa.config import limits as config_limits
 from rmpa.core.errors import RmpaError, UnreachableError
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ class Params(Part):
         bridge: Bridge,
         params: ParamSettings,
         time: TimeSettings,
-        most: int = limits.FOLLOWED_MAX,
+        most: int = config_limits.FOLLOWED_MAX,
     ) -> None:
         self._core = ParamCore(core, bridge.node)
         self._desk = ParamServer(self._core, ParamPolicy(params, time), bridge.asks, most)

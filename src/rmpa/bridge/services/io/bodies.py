@@ -11,9 +11,13 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Final, Protocol
 
-from rmpa.core import limits
+from rmpa.bridge import limits
+from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.core.sizes import KIB, MIB
+from rmpa.mesh import limits as mesh_limits
+from rmpa.ros import limits as ros_limits
 from rmpa.runtime.event_loop import yield_to_data
 
 if TYPE_CHECKING:
@@ -23,11 +27,11 @@ if TYPE_CHECKING:
 _LENGTH: Final = 4
 _HEAD_MAX: Final = 1
 """In front of a response: whether it went well."""
-_PORTION: Final = 256 * limits.KIB
+_PORTION: Final = 256 * KIB
 """Of a large body at once, some 50 microseconds; then others have their turn."""
-_AHEAD: Final = 4 * limits.MIB
+_AHEAD: Final = 4 * MIB
 """Of what is being sent, this much may wait for the link; the rest stays where it is."""
-_WHOLE: Final = limits.FRAGMENT_BYTES - _LENGTH
+_WHOLE: Final = core_limits.FRAGMENT_BYTES - _LENGTH
 """Up to here a body goes in one frame."""
 _PAUSE: Final = 0.005
 """Between two looks whether the link has taken some of that."""
@@ -111,7 +115,7 @@ class BodySender:
         self._large: deque[tuple[int, bytes, Buffer, Budget | None]] = deque()
         self._task: asyncio.Task[None] | None = None
         for lane in (link.express, link.bulk):
-            lane.set_terms(route, limits.KEEP_ALL_MESSAGES, None, strict=False)
+            lane.set_terms(route, mesh_limits.KEEP_ALL_MESSAGES, None, strict=False)
 
     def send(self, sequence: int, body: Buffer, head: bytes = b"", budget: Budget | None = None) -> bool:
         """Send one body behind ``head``; whether it takes the bulk lane.
@@ -124,7 +128,7 @@ class BodySender:
         """
         link = self._link
         size = len(head) + len(body)
-        if link is None or size <= limits.EXPRESS_MESSAGE_MAX:
+        if link is None or size <= mesh_limits.EXPRESS_MESSAGE_MAX:
             if link is not None:
                 framed = b"".join((size.to_bytes(_LENGTH, "little"), head, body))
                 link.express.send(self._route, sequence, time.time_ns(), framed)
@@ -249,8 +253,8 @@ class BodyReceiver:
             raise RemoteProtocolError(f"a first part of {len(part)} bytes has no length")
         self.drop("another one began before its end")
         size = int.from_bytes(part[:_LENGTH], "little")
-        if size > limits.SERVICE_MESSAGE_MAX + _HEAD_MAX:
-            raise LimitExceeded("service message", size, limits.SERVICE_MESSAGE_MAX + _HEAD_MAX)
+        if size > ros_limits.SERVICE_MESSAGE_MAX + _HEAD_MAX:
+            raise LimitExceeded("service message", size, ros_limits.SERVICE_MESSAGE_MAX + _HEAD_MAX)
         self._sequence, self._size = sequence, size
         if self._budget.take(size):
             self._buffer = bytearray()

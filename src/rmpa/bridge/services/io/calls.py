@@ -7,9 +7,10 @@ from collections import OrderedDict
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
+from rmpa.bridge import limits
 from rmpa.bridge.services.io.bodies import BodyReceiver, BodySender, Budget
-from rmpa.core import limits
 from rmpa.core.stats import SampleRing
+from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
     from rmpa.bridge.services.io.bodies import BodyLink
@@ -102,7 +103,7 @@ class Caller(BodyReceiver):
         self._serial = serial = self._serial + 1 & _MASK
         call.on_gone = partial(self._gone, serial)
         now = self.used_at = self._loop.time()
-        self._pending[serial] = (call, now, size > limits.EXPRESS_MESSAGE_MAX)
+        self._pending[serial] = (call, now, size > mesh_limits.EXPRESS_MESSAGE_MAX)
         self._sender.send(serial, call.request)
 
     def body(self, sequence: int, body: bytes | bytearray) -> None:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
+from rmpa.bridge import limits
 from rmpa.bridge.policy import OWN_NODE
-from rmpa.core import limits
 from rmpa.core.errors import LocalProtocolError, RmpaError
 from rmpa.ros.node.service_client import ServiceConnection, ServiceFailed
 

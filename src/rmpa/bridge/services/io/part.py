@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
 
+from rmpa.bridge import limits
 from rmpa.bridge.actions import Send, Warn
 from rmpa.bridge.messages import (
     AdvertiseServices,
@@ -45,8 +46,8 @@ from rmpa.bridge.services.io.serving import Serving
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.bridge.session.part import Part
 from rmpa.config.settings import LimitSettings
-from rmpa.core import limits
 from rmpa.core.counters import RefusalLog
+from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
 from rmpa.ros.node.service_server import ServiceCall, ServiceEndpoint
 from rmpa.ros.wire.services import ServiceDescription
@@ -208,7 +209,7 @@ class Services(Part):
         if peer in self._grace:
             return
         if attached.link.silent and not self._closed:
-            self._grace[peer] = self._loop.call_later(limits.AWAY_GRACE, self._stay_away, peer)
+            self._grace[peer] = self._loop.call_later(mesh_limits.AWAY_GRACE, self._stay_away, peer)
         else:
             self._stay_away(peer)
 

@@ -6,6 +6,7 @@ import asyncio
 import time
 from typing import TYPE_CHECKING, Final
 
+from rmpa.bridge import limits
 from rmpa.bridge.services.exports import (
     EndRoute,
     ExportAction,
@@ -18,7 +19,6 @@ from rmpa.bridge.services.exports import (
 )
 from rmpa.bridge.services.io.calls import Budgets, CallStats, Server
 from rmpa.bridge.services.io.connection_pool import ServicePool
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.core.names import is_type_name
 from rmpa.ros.core.liveness import listening_ports

@@ -6,12 +6,12 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Final
 
+from rmpa.bridge import limits
 from rmpa.bridge.data.io.flows import ExportFlow
 from rmpa.bridge.data.io.route_sender import ReliableRouteSender
 from rmpa.bridge.data.losses import LossRecords
 from rmpa.bridge.messages import Description, Source
 from rmpa.bridge.policy import OWN_NODE
-from rmpa.core import limits
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.mesh.reliable import ResumeTable
 from rmpa.ros.node.subscription import PublisherConnection

@@ -9,15 +9,16 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from rmpa.bridge import limits
 from rmpa.bridge.actions import Publish
 from rmpa.bridge.data.io.flows import ImportFlow
 from rmpa.bridge.data.io.link_time import LinkTime
 from rmpa.bridge.proxy_names import proxy_name
 from rmpa.bridge.session.proxy_nodes import ProxyNodes
-from rmpa.core import limits
 from rmpa.core.contract import Durability, Reliability
 from rmpa.core.errors import RmpaError
 from rmpa.core.open_files import remedy
+from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.wire.tcpros import TopicDescription, printable
 from rmpa.ros.wire.xmlrpc import RosReply
@@ -335,7 +336,7 @@ class PeerProxies:
         past = flow.past(publication.topic if publication is not None else source.topic, missed=missed)
         if past is not None and (missed or past.lost or past.counts):
             self._pasts[source] = past
-            if len(self._pasts) > limits.LOSSES_REMEMBERED:
+            if len(self._pasts) > mesh_limits.LOSSES_REMEMBERED:
                 self._pasts.popitem(last=False)
 
     def leave(self) -> dict[Source, ReceptionHistory]:

@@ -9,12 +9,12 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING
 
+from rmpa.bridge import limits
 from rmpa.bridge.messages import Audience, encode
 from rmpa.bridge.proxy_names import proxied_node, proxy_name
 from rmpa.bridge.session.part import Part
 from rmpa.bridge.topics.audience import audience, is_watched
 from rmpa.bridge.topics.imports import RouteState
-from rmpa.core import limits
 from rmpa.ros.node.subscription import PublisherConnection
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import rmpa
 from rmpa.config.settings import Settings
 from rmpa.config.sources import Flags, load_settings
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError, RmpaError
+from rmpa.observe import limits
 from rmpa.observe.doctor.agents import judge_agents
 from rmpa.observe.doctor.finding import Finding, FindingLevel
 from rmpa.observe.doctor.io import machine, network

@@ -10,8 +10,9 @@ import time
 from pathlib import Path
 from typing import Final
 
-from rmpa.core import limits
+from rmpa.observe import limits
 from rmpa.observe.doctor.machine import KernelRights, WallClock
+from rmpa.runtime import limits as runtime_limits
 
 _UNSYNCHRONISED: Final = 0x40
 """STA_UNSYNC of adjtimex(2)."""
@@ -75,7 +76,7 @@ def look_at_rights(*, wanted: bool, agents: bool) -> KernelRights:
         fifo=refusal[0],
         memlock=None if free else memlock,
         wanted=wanted,
-        files=None if agents else limits.OPEN_FILES if files == resource.RLIM_INFINITY else files,
+        files=None if agents else runtime_limits.OPEN_FILES if files == resource.RLIM_INFINITY else files,
     )
 
 

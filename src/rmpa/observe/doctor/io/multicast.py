@@ -10,10 +10,11 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Self
 
-from rmpa.core import limits
 from rmpa.core.errors import ConfigError, StartError
+from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import MAGIC, VERSION, BeaconKind
 from rmpa.discovery.io.sockets import Membership, open_receiver, receive
+from rmpa.observe import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -56,7 +57,7 @@ class GroupSender:
         _check_group(group)
         self._to = (group, port)
         self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
-        self._sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, limits.MULTICAST_TTL)
+        self._sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, discovery_limits.MULTICAST_TTL)
         self._sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
 
     def __enter__(self) -> Self:

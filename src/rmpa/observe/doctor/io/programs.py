@@ -9,7 +9,7 @@ import subprocess
 import threading
 from typing import TYPE_CHECKING
 
-from rmpa.core import limits
+from rmpa.observe import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

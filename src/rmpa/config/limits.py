@@ -1,0 +1,68 @@
+"""Limits and time-outs of settings: their defaults and the values that they may have.
+
+Each has its reason beside it. Seconds and bytes, unless the name says otherwise.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rmpa.core.sizes import KIB
+
+# --- settings ---------------------------------------------------------------------------------------------------
+CONFIG_FILE_MAX: Final = 256 * KIB
+"""A settings file; ours is some 4 KB, and finding a line in a huge one takes long."""
+NAMES_REMEMBERED: Final = 256
+"""Peers for whom the rules of names are remembered: as many as a large network has; found again by the rules."""
+REMAPS_MAX: Final = 256
+"""Rules for names in one direction of a ``[[peer]]``; each is held against each other one."""
+CONTRACT_DEPTH_MAX: Final = 100_000
+"""Messages that a contract may let wait: 100 s of a 1 kHz topic. ``LINK_QUEUE_BYTES`` bounds their bytes."""
+CONTRACT_TIME_MIN: Final = 0.001
+"""Shortest deadline, lifespan and lease: a timer that is due more often would hold up what it watches."""
+CONTRACT_TIME_MAX: Final = 86_400.0
+"""Longest deadline, lifespan and lease, a day: more is a mistake in the unit."""
+CONTRACT_RATE_MIN: Final = 0.001
+"""Lowest ``max_rate`` in messages a second: one in a quarter of an hour."""
+CONTRACT_RATE_MAX: Final = 1_000_000.0
+"""Highest ``max_rate`` in messages a second: more than any topic reaches."""
+FOLLOWED_MAX: Final = 256
+"""Default of ``limits.params``: parameters that one module follows, and that one peer may follow here; a namespace
+counts as one."""
+FOLLOW_RULES_MAX: Final = 2048
+"""Tables ``[[param]]`` in a file, whatever ``limits.params`` says: each is held against each other one."""
+BOUND_MAX: Final = 1_000_000
+"""Highest value of a setting in ``[limits]``: such a graph takes some gigabytes."""
+CPU_MAX: Final = 1023
+"""Highest number of a CPU that an affinity can name: CPU_SETSIZE less one."""
+
+# --- discovery --------------------------------------------------------------------------------------------------
+MULTICAST_GROUP: Final = "239.255.82.77"
+"""Administratively scoped (RFC 2365), so routers keep it on site; 82.77 is "RM"."""
+MULTICAST_PORT: Final = 11411
+"""Of domain 0; domain n uses this plus n."""
+
+# --- mesh -------------------------------------------------------------------------------------------------------
+OUTAGE_MIN: Final = 1.0
+"""Shortest ``outage`` of a contract: a link that fell silent is noticed no sooner."""
+OUTAGE_MAX: Final = 86_400.0
+"""Longest ``outage`` of a contract, a day; as the other times of a contract."""
+
+# --- ROS --------------------------------------------------------------------------------------------------------
+SERVICE_TIMEOUT: Final = 60.0
+"""For a call, where nobody says otherwise: planners take tens of seconds; rospy and roscpp wait for ever."""
+
+# --- bridge -----------------------------------------------------------------------------------------------------
+TOPICS_PER_PEER_MAX: Final = 32_768
+"""Default of ``limits.topics``: (topic, node) pairs of one peer that are known here, those that this module offers,
+and open routes of one peer. Each takes some 5 KB."""
+NODES_PER_PEER_MAX: Final = 4096
+"""Default of ``limits.nodes``: nodes of one peer that get a proxy here. Each takes some 15 KB; large robots have some
+hundred, fleets behind a relay a few thousand."""
+SERVICES_PER_PEER_MAX: Final = 16_384
+"""Default of ``limits.services``: services of one peer that are known here, those that this module offers, and those
+that one peer has open at once. A large robot's nodes have some 500, loggers left out."""
+SERVICE_TIMEOUT_MAX: Final = 3600.0
+"""Longest time that a call may be given: a caller of a server that hangs is told so within the hour."""
+CROSSING_NAME_MAX: Final = 1024
+"""Characters of a topic's, node's or type's name that crosses the mesh; the longest seen have some 200."""
