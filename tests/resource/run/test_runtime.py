@@ -131,7 +131,7 @@ async def test_what_is_published_while_a_profile_is_applied_waits(core: RosCore,
 async def test_what_waits_is_bounded_and_the_oldest_gives_way(
     core: RosCore, one: Resource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rmpa.core.limits.RESOURCE_HELD_MAX", 40)
+    monkeypatch.setattr("rmpa.resource.limits.RESOURCE_HELD_MAX", 40)
     runtime = Runtime(one, Node("speaker", master_uri=core.uri))
     ear = Ear()
     runtime.parts.append(ear)

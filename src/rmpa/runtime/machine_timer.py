@@ -1,0 +1,68 @@
+"""Runs the timer of a protocol machine in the event loop.
+
+A machine has no clock: it says by ``next_timer()`` when it wants to be called next, and is called with the time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+class MachineTimer:
+    """One pending timer for one machine, moved whenever the machine's ``next_timer()`` has changed.
+
+    Args:
+        next_timer: When the machine wants to be called, in seconds of ``now``; ``None``: not at all.
+        on_due: Called with the time, which is never before the moment that was asked for: the event loop may call a
+            moment early, because it rounds to its clock's resolution. The timer is armed again behind it.
+        now: The clock of the machine; by default the event loop's ``time()``.
+    """
+
+    def __init__(
+        self,
+        next_timer: Callable[[], float | None],
+        on_due: Callable[[float], object],
+        *,
+        now: Callable[[], float] | None = None,
+    ) -> None:
+        self._next_timer = next_timer
+        self._on_due = on_due
+        self._now = now
+        self._handle: asyncio.TimerHandle | None = None
+        self._due: float | None = None
+        self._closed = False
+
+    def arm(self) -> None:
+        """Ask the machine when it is due, and wait for that moment instead of another one."""
+        due = None if self._closed else self._next_timer()
+        if due == self._due:
+            return
+        self._cancel()
+        if due is not None:
+            loop = asyncio.get_running_loop()
+            self._due = due
+            if self._now is None:
+                self._handle = loop.call_at(due, self._fire)
+            else:
+                self._handle = loop.call_later(max(0.0, due - self._now()), self._fire)
+
+    def close(self) -> None:
+        """Never call again."""
+        self._closed = True
+        self._cancel()
+
+    def _cancel(self) -> None:
+        self._due = None
+        if self._handle is not None:
+            self._handle.cancel()
+            self._handle = None
+
+    def _fire(self) -> None:
+        due, self._due, self._handle = self._due, None, None
+        now = asyncio.get_running_loop().time() if self._now is None else self._now()
+        self._on_due(now if due is None else max(due, now))
+        self.arm()
