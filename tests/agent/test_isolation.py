@@ -25,7 +25,7 @@ import pytest
 
 from rmpa.agent import Agent
 from rmpa.config import limits as config_limits
-from rmpa.config.settings import PeerRule, PolicySettings, Settings
+from rmpa.config.settings import Multicast, PeerRule, PolicySettings, Settings
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import UnreachableError
 from rmpa.core.guid import Guid
@@ -159,7 +159,9 @@ class World:
 @asynccontextmanager
 async def worlds(tmp_path: Path, master: str = "") -> AsyncIterator[World]:
     group = (config_limits.MULTICAST_GROUP, 20000 + (os.getpid() + 7919) % 20000)
-    settings = Settings(core_port=0, interfaces=("lo",), group_port=group[1], runtime_dir=str(tmp_path))
+    settings = Settings(
+        core_port=0, interfaces=("lo",), multicast=Multicast(port=group[1]), runtime_dir=str(tmp_path)
+    )
     near = replace(settings, name="near")
     if master:
         near = replace(near, core_mode="external", core_master=master)

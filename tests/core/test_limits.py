@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import pytest
 
 import rmpa
-from rmpa.config.file import known_keys
+from rmpa.config.file import SCHEMAS
 from rmpa.core.sizes import KIB, MIB
 
 LIMITS: Final = {
@@ -134,7 +134,7 @@ def test_each_row_has_the_codes_figure(row: Row) -> None:
 def test_each_row_says_what_happens_and_names_settings_that_there_are(row: Row) -> None:
     assert row.happens not in ("", _NONE), f"line {row.line}: what happens at it?"
     assert row.told, f"line {row.line}: where is it told? ({_NONE} for nowhere)"
-    known = {".".join(key) for key in known_keys()}
+    known = {".".join(key) for key in SCHEMAS}
     for setting in re.findall(r"`([a-z_]+\.[a-z_]+)`", row.setting):
         assert setting in known, f"line {row.line}: there is no setting {setting}"
 
@@ -155,6 +155,6 @@ def test_the_settings_of_the_page_are_those_that_there_are() -> None:
     from rmpa.config.settings import LimitSettings
 
     defaults = LimitSettings()
-    assert written == {key: getattr(defaults, key) for _, key in (k for k in known_keys() if k[0] == "limits")}
+    assert written == {key: getattr(defaults, key) for _, key in (k for k in SCHEMAS if k[0] == "limits")}
     for key in written:
         assert f"`RMPA_LIMIT_{key.upper()}`" in text

@@ -40,6 +40,7 @@ COMMANDS = {
     "doctor": ("rmpa.cli.doctor", "Check this machine: network, clock, rights, ROS environment."),
     "multicast": ("rmpa.cli.multicast", "Send and receive multicast packets by hand."),
     "experiment": ("rmpa.cli.experiment", "Measure RMPA and classic ROS side by side: the paper's evaluation."),
+    "config": ("rmpa.cli.config", "Show the settings and where each comes from; print their JSON Schema."),
     "reload": ("rmpa.cli.reload", "Let the agent read its settings again."),
     "completion": ("rmpa.cli.completion", "Print the script that completes rmpa's commands in a shell."),
 }

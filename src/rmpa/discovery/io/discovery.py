@@ -77,10 +77,12 @@ class Discovery:
         self._on_event = on_event
         self._on_interfaces = on_interfaces
         self._clock: Clock = clock if clock is not None else SystemClock()
-        self._roster = Roster(identity, rng=random.random, multicast=settings.multicast, counters=self.counters)
+        self._roster = Roster(
+            identity, rng=random.random, multicast=settings.multicast.enabled, counters=self.counters
+        )
         self._intake = PacketFilter(settings.domain, self.counters, is_linked=self._roster.is_linked)
         self._refusals = RefusalLog(_log, self.counters)
-        self._group: Address = (settings.group, settings.discovery_port)
+        self._group: Address = (settings.multicast.group, settings.discovery_port)
         self._sender = sockets.Sender(udp_socket, self._group, self.counters)
         self._watcher = InterfaceWatcher(self._interfaces_changed, look=look)
         self._seeds = SeedResolver(settings.seeds, settings.discovery_port, self._seeds_changed, resolve=resolve)
@@ -100,7 +102,7 @@ class Discovery:
         loop = asyncio.get_running_loop()
         loop.add_reader(self._udp.fileno(), partial(self._readable, self._udp, multicast=False))
         self._open_door()
-        if self._settings.multicast:
+        if self._settings.multicast.enabled:
             self._open_group()
         everything = self._watcher.start()
         self._use(everything)
@@ -234,7 +236,7 @@ class Discovery:
         self._interfaces = choose(everything, wanted)
         if problem := unknown_names(everything, wanted):
             self._warn(problem)
-        if not self._settings.multicast:
+        if not self._settings.multicast.enabled:
             return
         if self._interfaces != before:
             _log.info("= multicast %s:%d on %s", *self._group, ", ".join(map(str, self._interfaces)) or "nothing")

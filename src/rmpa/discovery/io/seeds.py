@@ -17,7 +17,7 @@ from rmpa.discovery import limits
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.config.settings import HostPort
+    from rmpa.config.values import HostPort
     from rmpa.discovery.events import Address
 
 _log = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import rmpa
 from rmpa.config.settings import Settings
-from rmpa.config.sources import Flags, load_settings
+from rmpa.config.sources import load_settings
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.observe import limits
 from rmpa.observe.doctor.agents import judge_agents
@@ -57,7 +57,7 @@ def look_at(environ: Mapping[str, str], config: str | None = None) -> DoctorInpu
     """
     settings, problems = Settings(), []
     try:
-        loaded = load_settings(Flags(config=config), environ, host_name=socket.gethostname())
+        loaded = load_settings({"config": config}, environ, host_name=socket.gethostname())
     except ConfigError as error:
         problems.append(Finding("settings", error.source, FindingLevel.FAIL, str(error), "`rmpa up` will not start"))
     else:

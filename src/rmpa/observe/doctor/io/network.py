@@ -71,14 +71,14 @@ def in_container() -> bool:
 def look_at_multicast(settings: Settings) -> list[Finding]:
     """Send and hear on each interface that an agent would use, at the agents' own port."""
     usable = choose(list_interfaces(), settings.interfaces)
-    if not settings.multicast:
+    if not settings.multicast.enabled:
         return [Finding("multicast", "", FindingLevel.SKIPPED, "the settings switch it off (discovery.multicast)")]
     try:
-        heard = hear_ourselves(usable, settings.group, settings.discovery_port)
+        heard = hear_ourselves(usable, settings.multicast.group, settings.discovery_port)
     except StartError as error:
         return [Finding("multicast", "", FindingLevel.FAIL, f"{error.what} {error.problem}", error.remedy)]
     echoes = [MulticastEcho(one.interface.name, one.problem, one.after) for one in heard]
-    return judge_multicast(echoes, settings.group, settings.discovery_port)
+    return judge_multicast(echoes, settings.multicast.group, settings.discovery_port)
 
 
 def look_at_rp_filter() -> dict[str, int]:
@@ -123,7 +123,7 @@ def look_at_ports(settings: Settings, ours: Mapping[int, str], agents: Mapping[i
         ports.append(_tcp("the mesh (TCP)", "", settings.port, ours))
     number = settings.discovery_port
     try:
-        open_receiver(settings.group, number).close()
+        open_receiver(settings.multicast.group, number).close()
     except OSError as error:
         ports.append(Port("beacons (UDP)", number, error.strerror or str(error), _owner(number)))
     else:
