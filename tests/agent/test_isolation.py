@@ -330,7 +330,7 @@ async def thousands_of_peers_are_invented(world: World) -> None:
 
     await world.beside(work)
     assert world.near.station is not None
-    assert len(world.near.station.discovery.peers()) > core_limits.ROSTER_PEERS_MAX / 2
+    assert len(world.near.station.discovery.peers()) > core_limits.PEERS_MAX / 2
     assert world.near.station.discovery.counters["roster.full"] > 0
     assert world.linked()
 

@@ -82,7 +82,7 @@ def test_what_is_dropped_is_freed() -> None:
     box.push(b"in front", 99)
     for _ in range(10_000):
         box.push(bytes(100), 1)
-    assert sum(p.held for f in box._flows.values() for p in f.parcels) == box.pending_bytes == 1008
+    assert sum(p.held for f in box._queues.values() for p in f.messages) == box.pending_bytes == 1008
     assert box.pending_entries == 11
 
 
@@ -420,10 +420,10 @@ class AgainstModel(RuleBasedStateMachine):
     @invariant()
     def bounds_hold(self) -> None:
         assert self.box._data_bytes <= max(BYTES, self.newest)
-        assert all(0 < len(f.parcels) <= ENTRIES for f in self.box._flows.values())
-        assert all(f.size == sum(p.held for p in f.parcels if not p.sent) for f in self.box._flows.values())
+        assert all(0 < len(f.messages) <= ENTRIES for f in self.box._queues.values())
+        assert all(f.size == sum(p.held for p in f.messages if not p.sent) for f in self.box._queues.values())
         assert bool(self.box) == bool(self.box.pending_bytes)
-        assert sorted(self.box._turns) == sorted(k for k, f in self.box._flows.items() if f.turning)
+        assert sorted(self.box._round_robin) == sorted(k for k, f in self.box._queues.items() if f.scheduled)
 
     def teardown(self) -> None:
         self.wire += drain(self.box)

@@ -230,11 +230,11 @@ def test_of_one_direction_the_newer_stays() -> None:
 
 def test_invented_identities_do_not_fill_the_memory() -> None:
     low = of(LOW)
-    for i in range(2 * core_limits.ROSTER_PEERS_MAX):
+    for i in range(2 * core_limits.PEERS_MAX):
         stranger = Identity(Guid.of("10.1.0.0", i + 1), i.to_bytes(16, "big"), "x")
         low.link_up(i + 1, stranger, 0.0, dialled=False)
         low.link_down(i + 1, "lost", 0.0)
-    assert len(low.peers()) <= core_limits.ROSTER_PEERS_MAX
+    assert len(low.peers()) <= core_limits.PEERS_MAX
 
 
 def test_ourselves_is_nobody() -> None:

@@ -12,7 +12,7 @@ from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.discovery.beacon import Beacon
 from rmpa.discovery.events import Event, SendMulticast
-from rmpa.discovery.roster import Roster
+from rmpa.discovery.membership import MembershipProtocol
 
 if TYPE_CHECKING:
     from tests.simulation.network import Address, Network
@@ -41,7 +41,7 @@ class RosterPeer:
         self.run = 0
         self.alive = False
         self.refused = 0
-        self.roster: Roster
+        self.roster: MembershipProtocol
         self.identity: Identity
 
     def start(self) -> None:
@@ -50,7 +50,7 @@ class RosterPeer:
         self.alive = True
         rng = random.Random(self.world.rng.getrandbits(64))
         self.identity = Identity(Guid.of(*self.address, self.run & 0xFFFF), rng.randbytes(16), self.name)
-        self.roster = Roster(self.identity, rng=rng.random, multicast=self.multicast)
+        self.roster = MembershipProtocol(self.identity, rng=rng.random, multicast=self.multicast)
         self.prepare(rng)
         self.network.sockets[self.address] = self._datagram
         self.world.note(self.name, f"starts run {self.run}")

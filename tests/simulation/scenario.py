@@ -17,9 +17,9 @@ from rmpa.discovery.beacon import Beacon, BeaconKind
 from tests.simulation.network import Network, Weather, World
 from tests.simulation.roster_peer import RosterPeer, stranger
 
-CALM: Final = core_limits.ROSTER_LEASE + 2 * discovery_limits.HEARTBEAT_INTERVAL + 2.0
+CALM: Final = core_limits.PEER_LEASE + 2 * discovery_limits.HEARTBEAT_INTERVAL + 2.0
 """Seconds after healing within which all rosters agree: a lease for the dead, two heartbeats for the found."""
-AFTER_FORGERY: Final = discovery_limits.ROSTER_LEASE_MAX + CALM
+AFTER_FORGERY: Final = discovery_limits.LEASE_MAX + CALM
 """The same where forged beacons asked for the longest lease."""
 
 MakePeer = Callable[..., Any]

@@ -26,9 +26,9 @@ CONTRACTS_REMEMBERED: Final = 4096
 """(topic, type) pairs whose contract is remembered; the oldest is forgotten first, and found again by the rules."""
 
 # --- discovery --------------------------------------------------------------------------------------------------
-ROSTER_LEASE: Final = 16.0
+PEER_LEASE: Final = 16.0
 """A peer that has no link and was silent for three heartbeats and a second is gone."""
-ROSTER_PEERS_MAX: Final = 512
+PEERS_MAX: Final = 512
 """Peers in a roster: a hostile sender of invented GUIDs cannot fill the memory."""
 
 # --- mesh -------------------------------------------------------------------------------------------------------

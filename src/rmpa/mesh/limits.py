@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from rmpa.core.limits import ROSTER_LEASE
+from rmpa.core.limits import PEER_LEASE
 from rmpa.core.sizes import KIB, MIB
 
 # --- mesh -------------------------------------------------------------------------------------------------------
@@ -98,7 +98,7 @@ LINK_STABLE: Final = 5.0
 """A link that was up for this long was good: the next loss is retried from the shortest delay."""
 REFUSED_RETRY: Final = 5.0
 """Before a peer is called again that said no for a reason which waiting seldom mends (version, domain)."""
-FORGET_UNANNOUNCED: Final = ROSTER_LEASE
+FORGET_UNANNOUNCED: Final = PEER_LEASE
 """A peer known by its link alone is called again for this long after the link fell."""
 LINK_UNACKED: Final = 2.0
 """Sent bytes that nobody acknowledged for this long end a connection (TCP_USER_TIMEOUT): two leases, so that the

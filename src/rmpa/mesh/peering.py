@@ -284,7 +284,7 @@ class Peering:
         peer.last_error = reason
         if silent or now - link.since >= limits.LINK_STABLE:
             peer.backoff.reset()
-        if not peer.announced and len(self._peers) > core_limits.ROSTER_PEERS_MAX:
+        if not peer.announced and len(self._peers) > core_limits.PEERS_MAX:
             peer.gone = True  # invented identities must not fill the memory, nor make us dial for them
         if peer.gone:
             self._forget_if_idle(peer)

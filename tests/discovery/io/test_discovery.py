@@ -113,7 +113,7 @@ async def test_a_restart_on_the_same_port_is_told(agents: list[Agent], settings:
     await start(agents, base)
     await start([], pc)
     await until(base.names)
-    pc.discovery._roster._closed = True  # killed: no goodbye
+    pc.discovery._membership._closed = True  # killed: no goodbye
     await pc.end()
     again = Agent("pc", settings, port=pc.port)
     await start(agents, again)
@@ -204,7 +204,7 @@ async def test_a_seed_by_name_and_without_a_port(agents: list[Agent], settings: 
     await start(agents, hub)
     # On one machine the last that opened the discovery port gets its unicasts; keep that one the hub.
     left = Agent("left", Settings(multicast=quiet, seeds=(HostPort("robot.local"),)), resolve=resolve)
-    left.discovery._open_door = lambda: None  # type: ignore[method-assign]
+    left.discovery._open_seed_port = lambda: None  # type: ignore[method-assign]
     await start(agents, left)
     await until(lambda: left.names() == {"hub"} and hub.names() == {"left"})
     assert tries == ["robot.local"] * 2
@@ -352,12 +352,12 @@ async def test_an_identity_that_no_longer_fits_is_announced_no_more(agents: list
 
     base = Agent("base", settings, look=lambda: tuple(now_there), on_interfaces=fits)
     await start(agents, base)
-    await until(lambda: not base.discovery._roster._burst)
+    await until(lambda: not base.discovery._membership._burst)
     for times in (1, 2):
         now_there.append(Interface(f"new{times}", 4242 + times, (), up=False, multicast=False, loopback=False))
         base.discovery._watcher._compare()
         assert len(asked) == times
-        assert bool(base.discovery._roster._burst) == (times == 2)
+        assert bool(base.discovery._membership._burst) == (times == 2)
 
 
 async def test_seeds_that_do_not_answer_and_another_domain_are_told(

@@ -18,7 +18,7 @@ from rmpa.core import limits
 from rmpa.core.contract import KEYS, Contract, Contracts
 from rmpa.observe.snapshot import EventInfo, LatencyInfo, LatencySpread, RouteInfo, TopicInfo, UnreachableInfo
 from rmpa.ros.wire.tcpros import LENGTH
-from rmpa.runtime.event_loop import breathing_sorted, yield_to_data, yielding_to_data
+from rmpa.runtime.event_loop import sorted_yielding, yield_to_data, yielding_to_data
 from rmpa.runtime.system_clock import SystemClock
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ class TopicsSection:
                 tuple(mismatches.get(name, ())),
                 tuple(text for node in state.publishers.get(name, {}) if (text := unreachable.get(node))),
             )
-            for name in breathing_sorted(known)
+            for name in sorted_yielding(known)
         )
 
     def _topic(
