@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import pytest
 from blockbuster import blockbuster_ctx
 
-from rmpa.experiments.bed import namespaces
+from lab.bed import namespaces
 from tests import probes
 from tests.interop import ros
 
