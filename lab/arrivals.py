@@ -9,8 +9,8 @@ from __future__ import annotations
 import itertools
 from typing import TYPE_CHECKING, Final
 
+from lab import words
 from lab.experiments.model import Table
-from lab.experiments.report import words
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence

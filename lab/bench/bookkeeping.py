@@ -16,12 +16,13 @@ import time
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
-from rich.table import Table
-
-from lab import plot, results, samples
+from lab import samples
 from lab.bed.bench import Bed
 from lab.bench import profile, schedule
-from lab.tables import Target, dash, show_targets, us
+from lab.figures import shapes
+from lab.findings import Claim
+from lab.results import finish
+from lab.tables import dash, table_of, us
 from rmpa.resource.decide.adaptation import AdaptationSettings, Apply, Reacted
 from rmpa.resource.declare.resource import Resource, at_most
 from rmpa.resource.run.client import ResourceClient
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rich.console import Console
+    from rich.table import Table
 
     from rmpa.resource.decide.adaptation import Action
 
@@ -86,11 +88,11 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
     console.print(_cost_table(costs, relay))
     console.print(_reaction_table(waits, reported, plan.window))
     targets = [
-        Target(f"measuring an {kind}, share of relaying a message", round(cost / least, 4), _SHARE)
+        Claim(f"measuring an {kind}, share of relaying a message", round(cost / least, 4), _SHARE)
         for kind, cost in costs.items()
     ]
     targets.append(
-        Target(
+        Claim(
             "disturbance to reconfiguration, windows, worst (as the resource says it, without applying the profile)",
             round(max(reported) / plan.window, 2),
             _WINDOWS,
@@ -101,13 +103,18 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
         "relay": [asdict(cost) for cost in relay],
         "reaction_windows": [round(wait / plan.window, 4) for wait in waits],
         "reported_windows": [round(wait / plan.window, 4) for wait in reported],
-        "targets": show_targets(console, targets),
     }
-    written = results.write("bookkeeping", {**asdict(plan), "seed": _SEED}, result, json)
-    image = written.with_suffix(".png")
-    plot.bars(image, {"CPU a message": {**costs, **{f"{c.agent}, {c.rate:g} Hz": c.total for c in relay}}}, "µs")
-    console.print(f"written: {written} and {image.name}")
-    return result
+    return finish(
+        console,
+        "bookkeeping",
+        {**asdict(plan), "seed": _SEED},
+        result,
+        json,
+        claims=targets,
+        panels=shapes.bars(
+            {"CPU a message": {**costs, **{f"{c.agent}, {c.rate:g} Hz": c.total for c in relay}}}, "µs"
+        ),
+    )
 
 
 # --- bookkeeping ----------------------------------------------------------------------------------------------------
@@ -221,7 +228,7 @@ async def _reactions(plan: Plan) -> tuple[list[float], list[float]]:
 
 
 def _cost_table(costs: dict[str, float], relay: list[profile.Cost]) -> Table:
-    table = Table(title="processor time a message, µs")
+    table = table_of("processor time a message, µs", (), ())
     for head in ("what", "µs", f"share of the cheaper agent's at {_USUAL:g} Hz"):
         table.add_column(head, justify="left" if head == "what" else "right")
     least = min(cost.total for cost in relay if cost.rate == _USUAL)
@@ -233,7 +240,7 @@ def _cost_table(costs: dict[str, float], relay: list[profile.Cost]) -> Table:
 
 
 def _reaction_table(waits: list[float], reported: list[float], window: float) -> Table:
-    table = Table(title=f"disturbance to reconfiguration, in windows of {window:g} s")
+    table = table_of(f"disturbance to reconfiguration, in windows of {window:g} s", (), ())
     for head in ("by", "p50", "largest", "least", "disturbances"):
         table.add_column(head, justify="left" if head == "by" else "right")
     for who, times in (("the stop watch", waits), ("the resource, without the applying", reported)):

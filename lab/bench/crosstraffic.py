@@ -10,17 +10,18 @@ import subprocess
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
-from rich.table import Table
-
-from lab import plot, results
 from lab.bed.bench import Bed
 from lab.bench import schedule
-from lab.tables import Target, dash, ratio, show_targets, us, usage_table
+from lab.figures import shapes
+from lab.findings import Claim
+from lab.results import finish
+from lab.tables import dash, percentiles, ratio, table_of, usage_table
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from rich.console import Console
+    from rich.table import Table
 
     from lab.bed.namespaces import Host
 
@@ -93,7 +94,6 @@ def measure(quick: bool, console: Console, json: Path | None = None, *, realtime
     result: dict[str, object] = {
         "rows": [_row(key, condition, one, scores) for (key, condition), one in scores.items()],
         "scheduling": how,
-        "targets": show_targets(console, _targets(scores)),
         **host.finish(console),
     }
     settings = {
@@ -104,11 +104,15 @@ def measure(quick: bool, console: Console, json: Path | None = None, *, realtime
         "image_hz": _IMAGE_RATE,
         "link_bits_per_s": _LINK,
     }
-    written = results.write(schedule.named("crosstraffic", realtime=realtime), settings, result, json)
-    image = written.with_suffix(".png")
-    plot.tails(image, _panels(scores, titles), "from due to there, µs", _DEADLINE)
-    console.print(f"written: {written} and {image.name}")
-    return result
+    return finish(
+        console,
+        schedule.named("crosstraffic", realtime=realtime),
+        settings,
+        result,
+        json,
+        claims=_targets(scores),
+        panels=shapes.tails(_panels(scores, titles), "from due to there, µs", _DEADLINE),
+    )
 
 
 def _take(plan: Plan, console: Console, *, realtime: bool) -> tuple[Scores, dict[str, str], str]:
@@ -132,12 +136,12 @@ def _take(plan: Plan, console: Console, *, realtime: bool) -> tuple[Scores, dict
     return scores, {way.key: way.title for way in ways}, how
 
 
-def _targets(scores: Scores) -> list[Target]:
+def _targets(scores: Scores) -> list[Claim]:
     ours, idle = scores["agents", "loaded"], scores["agents", "unloaded"]
     return [
-        Target("p99 beside images, ms", _ms(ours.summary.p99), 1.0),
-        Target("p99 beside images / unloaded", ratio(ours.summary.p99, idle.summary.p99), 3.0),
-        Target("images, share of the link", ours.share, 0.9, at_least=True),
+        Claim("p99 beside images, ms", _ms(ours.summary.p99), 1.0),
+        Claim("p99 beside images / unloaded", ratio(ours.summary.p99, idle.summary.p99), 3.0),
+        Claim("images, share of the link", ours.share, 0.9, at_least=True),
     ]
 
 
@@ -187,19 +191,17 @@ def _row(key: str, condition: str, one: Loaded, scores: Scores) -> dict[str, obj
 
 
 def _table(scores: Scores, titles: dict[str, str]) -> Table:
-    table = Table(
-        title=f"a command of {_SIZE} B at {_RATE:.0f} Hz on {_LINK / 1e6:.0f} Mbit/s, from due to there, µs"
-    )
-    for head in ("way", "beside"):
-        table.add_column(head)
     heads = ("p50", "p95", "p99", "p99.9", "max", "count", "lost", ">1 ms", "to unloaded", "to classic")
-    for head in heads:
-        table.add_column(head, justify="right")
+    table = table_of(
+        f"a command of {_SIZE} B at {_RATE:.0f} Hz on {_LINK / 1e6:.0f} Mbit/s, from due to there, µs",
+        ("way", "beside"),
+        heads,
+    )
     for condition, beside in (("unloaded", "nothing"), ("loaded", "images")):
         for key, title in titles.items():
             one = scores[key, condition]
             row = one.summary
-            cells = [us(value) for value in (row.p50, row.p95, row.p99, row.p999, row.largest)]
+            cells = percentiles(row)
             counts = [str(row.count), str(row.lost), f"{100 * one.later_than(_DEADLINE):.2f} %"]
             bases = (scores[key, "unloaded"].summary.p99, scores["direct", condition].summary.p99)
             table.add_row(title, beside, *cells, *counts, *[dash(ratio(row.p99, base)) for base in bases])
@@ -207,12 +209,11 @@ def _table(scores: Scores, titles: dict[str, str]) -> Table:
 
 
 def _image_table(scores: Scores, titles: dict[str, str]) -> Table:
-    table = Table(
-        title=f"images of 1 MB, {_IMAGE_RATE} Hz offered ({8 * _IMAGE * _IMAGE_RATE / _LINK:.2f} of the link)"
+    table = table_of(
+        f"images of 1 MB, {_IMAGE_RATE} Hz offered ({8 * _IMAGE * _IMAGE_RATE / _LINK:.2f} of the link)",
+        ("way",),
+        ("MB/s", "share of the link", "to classic", "p50 late, ms", "max, ms", "came", "dropped"),
     )
-    table.add_column("way")
-    for head in ("MB/s", "share of the link", "to classic", "p50 late, ms", "max, ms", "came", "dropped"):
-        table.add_column(head, justify="right")
     for key, title in titles.items():
         one = scores[key, "loaded"]
         row = one.images.summary

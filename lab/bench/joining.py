@@ -16,13 +16,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
-from rich.table import Table
-
-from lab import results
 from lab.bed.agents import last_link
 from lab.bed.bench import Bed
 from lab.bed.ros import NODES
-from lab.tables import Target, show_targets
+from lab.findings import Claim
+from lab.results import finish
+from lab.tables import table_of
 from lab.usage import Meter
 from rmpa.core.errors import RmpaError
 from rmpa.observe.io.control_client import ControlClient
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rich.console import Console
+    from rich.table import Table
 
     from lab.bed.agents import Agent
     from rmpa.observe.snapshot import Snapshot
@@ -115,23 +115,23 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
     result: dict[str, object] = {
         "modules": {str(count): asdict(row) for count, row in rows.items()},
         "mirrored": mirrors,
-        "targets": show_targets(
-            console,
-            [
-                Target(
-                    f"{most} modules: last start to full mesh, median, s", _median(rows[most].joins), _MESH_WITHIN
-                ),
-                Target(f"{most} modules at once: last READY to mesh, s", rows[most].together_ready, _MESH_WITHIN),
-                *(
-                    Target(f"{what} mirrored, from the link, median, s", _median(times), _MIRRORED_WITHIN)
-                    for what in ("topics", "services")
-                    if (times := [seconds for one in mirrors if (seconds := one[what]) is not None])
-                ),
-            ],
-        ),
     }
-    console.print(f"written: {results.write('joining', asdict(plan), result, json)}")
-    return result
+    return finish(
+        console,
+        "joining",
+        asdict(plan),
+        result,
+        json,
+        claims=[
+            Claim(f"{most} modules: last start to full mesh, median, s", _median(rows[most].joins), _MESH_WITHIN),
+            Claim(f"{most} modules at once: last READY to mesh, s", rows[most].together_ready, _MESH_WITHIN),
+            *(
+                Claim(f"{what} mirrored, from the link, median, s", _median(times), _MIRRORED_WITHIN)
+                for what in ("topics", "services")
+                if (times := [seconds for one in mirrors if (seconds := one[what]) is not None])
+            ),
+        ],
+    )
 
 
 # --- modules --------------------------------------------------------------------------------------------------
@@ -245,11 +245,13 @@ def _mirror(plan: Plan) -> dict[str, float | None]:
 
 
 def _table(rows: dict[int, Row], plan: Plan) -> Table:
-    table = Table(title=f"full mesh (to reach: {_MESH_WITHIN:g} s), and each agent over {plan.idle:.0f} s of nothing")
     heads = ["modules", "last start to mesh, s", "worst", "its READY, s", "all at once, s", "after READY"]
     heads += ["CPU mean, %", "worst"]
-    for head in (*heads, "bytes/s", "packets/s"):
-        table.add_column(head, justify="right")
+    table = table_of(
+        f"full mesh (to reach: {_MESH_WITHIN:g} s), and each agent over {plan.idle:.0f} s of nothing",
+        (),
+        (*heads, "bytes/s", "packets/s"),
+    )
     for count, row in rows.items():
         joins = [f"{_median(row.joins):.2f}", f"{max(row.joins):.2f}", f"{_median(row.ready):.2f}"]
         once = [f"{row.together:.2f}", f"{row.together_ready:.2f}"]
@@ -261,10 +263,7 @@ def _table(rows: dict[int, Row], plan: Plan) -> Table:
 
 def _mirror_table(mirrors: Sequence[dict[str, float | None]], plan: Plan) -> Table:
     title = f"a graph of {plan.nodes} nodes at a module that joins (to reach: {_MIRRORED_WITHIN:g} s from its link)"
-    table = Table(title=title)
-    table.add_column("what")
-    for head in ("from the link, s", "worst", "from its start, s"):
-        table.add_column(head, justify="right")
+    table = table_of(title, ("what",), ("from the link, s", "worst", "from its start, s"))
     for what, count in (("topics", plan.topics), ("services", plan.services)):
         times = [seconds for one in mirrors if (seconds := one[what]) is not None]
         starts = [seconds for one in mirrors if (seconds := one[f"{what}_from_start"]) is not None]

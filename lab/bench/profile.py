@@ -23,16 +23,17 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 from rich.console import Console
-from rich.table import Table
 
-from lab import plot, results
+from lab import results
 from lab.bed.agents import Agent
 from lab.bed.bench import Bed
 from lab.bed.processes import eventually
 from lab.bed.ros import NODES
 from lab.bench import schedule
 from lab.bench.scale import per_message
-from lab.tables import us
+from lab.figures import shapes
+from lab.results import finish
+from lab.tables import table_of, us
 from lab.usage import Meter
 
 if TYPE_CHECKING:
@@ -135,15 +136,13 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
         "costs": [asdict(cost) for cost in costs],
         "profiles": {name: asdict(profile) for name, profile in profiles.items()},
     }
-    written = results.write("profile", {**asdict(plan), "bytes": _SIZE, "profiled_hz": _PROFILED_RATE}, result, json)
-    text, image = written.with_suffix(".txt"), written.with_suffix(".png")
-    with text.open("w", encoding="utf-8") as file:
+    with results.path_of("profile", ".txt").open("w", encoding="utf-8") as file:
         for where in (console, Console(file=file, width=130)):
             _show(where, costs, profiles)
     base = {cost.agent: cost.total for cost in costs if cost.rate == _USUAL}
-    plot.bars(image, _parts(profiles, base), "µs of CPU a relayed message")
-    console.print(f"written: {written}, {text.name} and {image.name}")
-    return result
+    settings = {**asdict(plan), "bytes": _SIZE, "profiled_hz": _PROFILED_RATE}
+    panels = shapes.bars(_parts(profiles, base), "µs of CPU a relayed message")
+    return finish(console, "profile", settings, result, json, panels=panels)
 
 
 # --- the cost -------------------------------------------------------------------------------------------------------
@@ -342,9 +341,11 @@ def _short(file: str) -> str:
 
 
 def _show(console: Console, costs: list[Cost], profiles: Mapping[str, Profile]) -> None:
-    table = Table(title=f"processor time of one agent for a relayed message of {_SIZE} B, µs; idle cost taken off")
-    for head in ("agent", "Hz", "user + system", "user, by ticks", "system, by ticks", "context switches"):
-        table.add_column(head, justify="right")
+    table = table_of(
+        f"processor time of one agent for a relayed message of {_SIZE} B, µs; idle cost taken off",
+        (),
+        ("agent", "Hz", "user + system", "user, by ticks", "system, by ticks", "context switches"),
+    )
     for cost in costs:
         parts = [us(value) for value in (cost.total, cost.total * cost.user, cost.total * (1 - cost.user))]
         table.add_row(cost.agent, f"{cost.rate:.0f}", *parts, f"{cost.switches:.2f}")

@@ -15,16 +15,17 @@ from array import array
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from rich.table import Table
-
-from lab import plot, results, samples
+from lab import samples
 from lab.bed import ros
 from lab.bed.bench import Bed
 from lab.bed.processes import eventually
 from lab.bed.ros import NODES
 from lab.bench import schedule
 from lab.experiments import flow
-from lab.tables import Target, dash, ratio, show_targets, us
+from lab.figures import shapes
+from lab.findings import Claim
+from lab.results import finish
+from lab.tables import dash, ratio, table_of, us
 from lab.usage import Meter, Usage, add
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rich.console import Console
+    from rich.table import Table
 
     from lab.bed.agents import Agent
     from lab.bed.processes import Process
@@ -293,15 +295,18 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
         "ladders": {
             ladder: [_row(ladder, n, one, found) for n, one in found.items()] for ladder, found in steps.items()
         },
-        "targets": show_targets(console, list(_targets(steps))),
         **host.finish(console),
     }
     settings = {**asdict(plan), "bytes": _SIZE, "hz": _RATE, "hz_subscribers": _FAN_RATE}
-    written = results.write("scale", settings, result, json)
-    image = written.with_suffix(".png")
-    plot.lines(image, _panels(steps), "times the figure of the first step")
-    console.print(f"written: {written} and {image.name}")
-    return result
+    return finish(
+        console,
+        "scale",
+        settings,
+        result,
+        json,
+        claims=list(_targets(steps)),
+        panels=shapes.lines(_panels(steps), "times the figure of the first step"),
+    )
 
 
 def copies(ladder: str, count: int) -> int:
@@ -314,16 +319,16 @@ def _of_copy(ladder: str, count: int, step: Step) -> float | None:
     return None if cpu is None else cpu / copies(ladder, count)
 
 
-def _targets(steps: Steps) -> Iterator[Target]:
+def _targets(steps: Steps) -> Iterator[Claim]:
     for ladder, found in steps.items():
         base, top = min(found), max(found)
         words = f"{ladder}, {base} → {top}"
         if ladder != "subscribers":
-            yield Target(f"{words}: latency p50", ratio(found[top].p50(), found[base].p50()), _LIMIT)
-            yield Target(f"{words}: CPU a message, both agents", ratio(found[top].both, found[base].both), _LIMIT)
+            yield Claim(f"{words}: latency p50", ratio(found[top].p50(), found[base].p50()), _LIMIT)
+            yield Claim(f"{words}: CPU a message, both agents", ratio(found[top].both, found[base].both), _LIMIT)
         else:
             per_copy = [_of_copy(ladder, count, found[count]) for count in (top, base)]
-            yield Target(f"{words}: CPU a copy, sending agent", ratio(*per_copy), _LIMIT)
+            yield Claim(f"{words}: CPU a copy, sending agent", ratio(*per_copy), _LIMIT)
 
 
 def _row(ladder: str, count: int, step: Step, found: dict[int, Step]) -> dict[str, object]:
@@ -344,8 +349,6 @@ def _row(ladder: str, count: int, step: Step, found: dict[int, Step]) -> dict[st
 
 
 def _table(ladder: str, found: dict[int, Step]) -> Table:
-    table = Table(title=_TITLES[ladder])
-    table.add_column(ladder, justify="right")
     heads = ["p50, µs", "to first", "p99", "lost", "p50 at the last", "direct p50", "to first"]
     heads += [
         "CPU agent 1, µs",
@@ -356,8 +359,7 @@ def _table(ladder: str, found: dict[int, Step]) -> Table:
         "CPU direct to first",
         "idle agent 1, %",
     ]
-    for head in heads:
-        table.add_column(head, justify="right")
+    table = table_of(_TITLES[ladder], (), heads)
     base = found[min(found)]
     for count, step in found.items():
         first = ratio(step.p50(), base.p50())

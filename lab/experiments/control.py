@@ -15,7 +15,8 @@ from lab import statistics
 from lab.arrivals import counted, counting_from, pairs, source_periods
 from lab.experiments import flow
 from lab.experiments.contenders import CLASSIC, DEFAULTS, RELAYS, RMPA, nodelay_of, relays_of, system_of, turn
-from lab.experiments.model import Cell, Claim, Figure, Findings, Grid, Measured, Panel, Series
+from lab.experiments.model import Cell, Measured
+from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

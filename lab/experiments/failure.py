@@ -17,7 +17,7 @@ from lab.bed.processes import Deadline, eventually
 from lab.experiments import flow
 from lab.experiments.contenders import system_of
 from lab.experiments.failure_findings import FLOWS, RATE, SCENARIOS, findings
-from lab.experiments.model import Cell, Findings, Measured, Plan, Results, Table
+from lab.experiments.model import Cell, Measured, Plan, Results, Table
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from lab.bed.processes import Process
     from lab.bed.system import Stage, System
     from lab.experiments.model import Client, Value
+    from lab.findings import Findings
 
 HOSTS: Final = ("joystick", "velocity", "base", "pc")
 _SIZE: Final = 64

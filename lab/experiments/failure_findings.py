@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from lab.experiments.model import Claim, Figure, Findings, Grid, Panel, Series
+from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 from lab.statistics import flowing, outages
 
 if TYPE_CHECKING:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Final
 from lab.arrivals import counted
 from lab.experiments import flow
 from lab.experiments.contenders import system_of
-from lab.experiments.model import Cell, Claim, Figure, Findings, Grid, Measured, Panel, Plan, Results, Series, Table
+from lab.experiments.model import Cell, Measured, Plan, Results, Table
+from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 from lab.samples import summary
 from lab.statistics import distribution, median
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from lab import samples, statistics
+from lab import samples, statistics, words
 from lab.arrivals import counted, latencies, lost
 from lab.experiments.contenders import CLASSIC, RMPA, turn
-from lab.experiments.model import Cell, Claim, Figure, Findings, Grid, Panel, Series
-from lab.experiments.report import words
+from lab.experiments.model import Cell
 from lab.experiments.stream import LEAD, SETTLE, stream
+from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Final
 from lab import samples, statistics
 from lab.arrivals import counted, latencies, lost
 from lab.experiments.contenders import CLASSIC, DEFAULTS, RELAYS, RMPA, nodelay_of, relays_of, turn
-from lab.experiments.model import Cell, Claim, Figure, Findings, Grid, Panel, Series
+from lab.experiments.model import Cell
 from lab.experiments.stream import SETTLE, stream
+from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

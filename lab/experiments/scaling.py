@@ -11,7 +11,8 @@ from lab.arrivals import counted, counting_from, latencies, lost
 from lab.bed.processes import Deadline
 from lab.experiments import flow
 from lab.experiments.contenders import system_of
-from lab.experiments.model import Cell, Claim, Figure, Findings, Grid, Measured, Panel, Plan, Results, Series, Table
+from lab.experiments.model import Cell, Measured, Plan, Results, Table
+from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 from lab.samples import summary
 from lab.usage import Meter, Usage
 

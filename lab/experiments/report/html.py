@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from markdown_it import MarkdownIt
 
-from lab.experiments.report.words import slug
+from lab.words import slug
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -7,7 +7,7 @@ import shlex
 from itertools import groupby
 from typing import TYPE_CHECKING, Final
 
-from lab.experiments.report import words
+from lab import words
 from lab.samples import summary
 
 if TYPE_CHECKING:
@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from lab.experiments.manifest import Manifest
-    from lab.experiments.model import Claim, Figure, Grid, Plan
+    from lab.experiments.model import Plan
     from lab.experiments.report.sections import Section
+    from lab.findings import Claim, Figure, Grid
 
 TITLE: Final = "Classic ROS beside RMPA: the paper's evaluation, run again"
 _BOXES: Final = (

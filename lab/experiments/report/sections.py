@@ -6,16 +6,17 @@ import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from lab.experiments.model import Findings
 from lab.experiments.registry import find_experiment
+from lab.findings import Findings
 from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from lab.experiments.model import Experiment, Figure, Results, Value
+    from lab.experiments.model import Experiment, Results, Value
     from lab.experiments.store import Store
+    from lab.findings import Figure
 
 _log = logging.getLogger(__name__)
 

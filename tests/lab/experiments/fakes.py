@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
 from lab.experiments.code import Code
-from lab.experiments.model import Cell, Claim, Findings, Measured, Plan, Table
+from lab.experiments.model import Cell, Measured, Plan, Table
+from lab.findings import Claim, Findings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

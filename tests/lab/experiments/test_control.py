@@ -14,7 +14,7 @@ from lab.experiments.model import Cell, Measured, Plan, Results, Table
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from lab.experiments.model import Claim
+    from lab.findings import Claim
 
 MS = 1_000_000
 PERIOD = 100 * MS

@@ -8,7 +8,8 @@ import pytest
 
 from lab.experiments.failure import EXPERIMENT, NODES
 from lab.experiments.failure_findings import FLOWS, RATE, SCENARIOS, Fate, fates
-from lab.experiments.model import Cell, Claim, Findings, Measured, Plan, Results, Table, Value
+from lab.experiments.model import Cell, Measured, Plan, Results, Table, Value
+from lab.findings import Claim, Findings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

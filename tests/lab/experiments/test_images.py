@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from lab.experiments.images import EXPERIMENT, bits, bytes_per_second
-from lab.experiments.model import Cell, Claim, Findings, Measured, Plan, Results, Table
+from lab.experiments.model import Cell, Measured, Plan, Results, Table
+from lab.findings import Claim, Findings
 
 MB = 1024 * 1024
 PERIOD = 10_000_000

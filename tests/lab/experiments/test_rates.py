@@ -12,7 +12,7 @@ from lab.experiments.rates import EXPERIMENT, PAPER
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from lab.experiments.model import Grid
+    from lab.findings import Grid
 
 FULL = Plan(clients=("roscpp",))
 US = 1000

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from lab.experiments.model import Cell, Findings, Measured, Plan, Results, Table, Value
+from lab.experiments.model import Cell, Measured, Plan, Results, Table, Value
 from lab.experiments.scaling import EXPERIMENT
+from lab.findings import Findings
 
 
 def cell(system: str, modules: int) -> Cell:

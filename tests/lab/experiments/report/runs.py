@@ -6,20 +6,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from lab.experiments.code import Code
-from lab.experiments.model import (
-    Cell,
-    Claim,
-    Figure,
-    Findings,
-    Grid,
-    Measured,
-    Panel,
-    Plan,
-    Results,
-    Series,
-    Table,
-)
+from lab.experiments.model import Cell, Measured, Plan, Results, Table
 from lab.experiments.store import Store
+from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ import re
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from lab.experiments.model import Claim
+    from lab.findings import Claim
 
 _VERDICTS: Final = {True: "✓ reached", False: "✗ **not reached**", None: "? too few samples to say"}
 _OUTSIDE_SLUGS: Final = re.compile(r"[^\w\- ]")
