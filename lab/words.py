@@ -21,6 +21,11 @@ def number(value: float | None, digits: int = 3) -> str:
     return f"{value:,.0f}" if 1 <= abs(value) < 1e9 else f"{value:.{digits - 1}e}"
 
 
+def counted(value: float | None, digits: int = 3, factor: float = 1.0) -> str:
+    """A figure for a table, in another unit if a factor is given; a dash for what is not known."""
+    return number(None if value is None else value * factor, digits)
+
+
 def quantity(value: float | None, unit: str = "", digits: int = 3) -> str:
     """A number with its unit."""
     return f"{number(value, digits)} {unit}" if unit and value is not None else number(value, digits)

@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from pandas import DataFrame
     from rich.console import Console
 
     from lab.bed.agents import Agent
     from lab.bed.bench import Bed
     from lab.bed.processes import Process
     from lab.bed.ros import Ros
-    from lab.experiments.model import Table
 
 LEAD_IN: Final = 0.2
 """Seconds of each round whose messages are thrown away: caches and the processor's clock come up."""
@@ -187,7 +187,7 @@ class Stream:
         return arrivals
 
 
-def parse(came: Table, late: Sequence[int], lead: int) -> Arrivals:
+def parse(came: DataFrame, late: Sequence[int], lead: int) -> Arrivals:
     """Read what a sink noted and how late its source was (``flow``), without the first ``lead`` messages."""
     columns = [_numbers(came, name) for name in ("sequence", "due_ns", "came_ns")]
     counted = [at for at, sequence in enumerate(columns[0]) if sequence >= lead]
@@ -195,8 +195,8 @@ def parse(came: Table, late: Sequence[int], lead: int) -> Arrivals:
     return Arrivals(max(0, len(late) - lead), sequence, due, there, late[lead:], lead=lead)
 
 
-def _numbers(table: Table, name: str) -> Sequence[int]:
-    return array("Q", [value for value in table.column(name) if isinstance(value, int)])
+def _numbers(table: DataFrame, name: str) -> Sequence[int]:
+    return array("Q", table[name].tolist())
 
 
 @dataclass(slots=True)

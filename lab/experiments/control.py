@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, cast
 
 from lab import statistics
-from lab.arrivals import counted, counting_from, pairs, source_periods
 from lab.experiments import flow
 from lab.experiments.contenders import CLASSIC, DEFAULTS, RELAYS, RMPA, nodelay_of, relays_of, system_of, turn
 from lab.experiments.model import Cell, Measured
 from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
+from lab.frames import counting_from, pairs, source_periods
+from lab.words import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

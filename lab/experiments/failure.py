@@ -17,7 +17,8 @@ from lab.bed.processes import Deadline, eventually
 from lab.experiments import flow
 from lab.experiments.contenders import system_of
 from lab.experiments.failure_findings import FLOWS, RATE, SCENARIOS, findings
-from lab.experiments.model import Cell, Measured, Plan, Results, Table
+from lab.experiments.model import Cell, Measured, Plan, Results
+from lab.frames import frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -221,7 +222,8 @@ class Robot:
 
     def _take(self, node: Node, process: Process) -> None:
         keys = {one.topic: one.key for one in FLOWS if one.sink == node.name}
-        for topic, *row in flow.noted(process, _topics(node), self._scratch, settle=0.0).rows:
+        noted = flow.noted(process, _topics(node), self._scratch, settle=0.0)
+        for topic, *row in noted.itertuples(index=False, name=None):
             self.rows.append((keys[str(topic)], *row))
 
 
@@ -313,8 +315,8 @@ class Failure:
             robot.note("end")
             by_hand = 0 if robot.back() else robot.by_hand(down)
         tables = {
-            "flows": Table(("flow", "sequence", "due_ns", "came_ns"), robot.rows),
-            "moments": Table(("what", "at_ns"), robot.moments),
+            "flows": frame(("flow", "sequence", "due_ns", "came_ns"), robot.rows),
+            "moments": frame(("what", "at_ns"), robot.moments),
         }
         return Measured(tables, {"by_hand": by_hand, "rate": RATE})
 

@@ -7,13 +7,17 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from lab.arrivals import counted
+import pandas as pd
+
+from lab import frames
 from lab.experiments import flow
 from lab.experiments.contenders import system_of
-from lab.experiments.model import Cell, Measured, Plan, Results, Table
+from lab.experiments.model import Cell, Measured, Plan, Results
 from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
+from lab.frames import counting_from
 from lab.samples import summary
 from lab.statistics import distribution, median
+from lab.words import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -88,11 +92,10 @@ class _Stream:
         """Let it send for so long."""
         return flow.begin(self.source, self._scratch, size=size, rate=rate, count=max(2, round(rate * seconds)))
 
-    def end(self, begun: flow.Round) -> tuple[list[tuple[Value, ...]], int]:
-        """What came of a round, as (sequence, due, came), and how many were sent."""
-        sent = len(flow.sent(begun).rows)
-        came = flow.noted(self.sink, [self._topic], self._scratch, begun.number)
-        return [row[1:] for row in came.rows], sent
+    def end(self, begun: flow.Round) -> tuple[pd.DataFrame, int]:
+        """What came of a round (``sequence``, ``due_ns``, ``came_ns``), and how many were sent."""
+        sent = len(flow.sent(begun))
+        return flow.noted(self.sink, [self._topic], self._scratch, begun.number).drop(columns="topic"), sent
 
 
 _ABOUT: Final = f"""\
@@ -135,15 +138,10 @@ class Images:
             among, among_sent = commands.end(commands.begin(_SIZE, _RATE, _LEAD_IN + times.beside))
             pictures, pictures_sent = images.end(taken)
         lead = round(_RATE * _LEAD_IN)
-        rows: list[tuple[Value, ...]] = [
-            (beside, *row)
-            for beside, came in (("alone", alone), ("images", among))
-            for row in came
-            if _int(row[0]) >= lead
-        ]
+        counted_in = {"alone": counting_from(alone, lead), "images": counting_from(among, lead)}
         tables = {
-            "commands": Table(("beside", "sequence", "due_ns", "came_ns"), rows),
-            "images": Table(("sequence", "due_ns", "came_ns"), pictures),
+            "commands": pd.concat(counted_in, names=["beside"]).reset_index("beside").reset_index(drop=True),
+            "images": pictures,
         }
         facts: dict[str, Value] = {
             "link": link,
@@ -218,17 +216,15 @@ def _score(rounds: Sequence[Measured]) -> Score:
     shares, speeds, late = [], [], []
     dropped = 0
     for one in rounds:
-        came: dict[str, dict[int, tuple[int, int]]] = {"alone": {}, "images": {}}
-        for beside, sequence, due, at in one.tables["commands"].rows:
-            came[str(beside)].setdefault(_int(sequence), (_int(due), _int(at)))
+        commands, pictures = one.tables["commands"].drop_duplicates(["beside", "sequence"]), one.tables["images"]
         for beside, fact in (("alone", "alone"), ("images", "beside")):
-            latencies[beside] += [(at - due) / 1000 for due, at in came[beside].values()]
-            lost[beside] += max(0, _int(one.facts[fact]) - len(came[beside]))
-        pictures = [(_int(due), _int(at)) for _, due, at in one.tables["images"].rows]
-        late += [(at - due) / 1e6 for due, at in pictures]
+            came = frames.latencies(commands, beside=beside)
+            latencies[beside] += [1000 * ms for ms in came]
+            lost[beside] += max(0, _int(one.facts[fact]) - len(came))
+        late += frames.latencies(pictures)
         dropped += max(0, _int(one.facts["images"]) - len(pictures))
-        dues = [due for due, _ in came["images"].values()]
-        if dues and (speed := bytes_per_second([at for _, at in pictures], min(dues), max(dues))):
+        dues = frames.where(commands, beside="images")["due_ns"].tolist()
+        if dues and (speed := bytes_per_second(pictures["came_ns"].tolist(), min(dues), max(dues))):
             speeds.append(speed / 1e6)
             if carried := bits(str(one.facts["link"])):
                 shares.append(8 * speed / carried)

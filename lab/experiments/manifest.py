@@ -25,7 +25,7 @@ class CellRecord(msgspec.Struct, frozen=True, kw_only=True):
         seconds: That the last attempt took, with what is around it.
         attempts: How often it was tried.
         facts: Single values that were measured.
-        tables: What the columns of each of its CSV files hold (``table_file.kinds``), by the file's name.
+        tables: What the columns of each of its CSV files hold (``frames.kinds``), by the file's name.
         error: Why it failed, or why the attempt before did.
     """
 

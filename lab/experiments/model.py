@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Literal, Protocol
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+    from pandas import DataFrame
+
     from lab.bed.system import Stage
     from lab.findings import Findings
 
@@ -67,37 +69,15 @@ class Cell:
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
-    """Samples as they were taken: one row a message, a second, a process.
-
-    Args:
-        columns: Names with their unit: ``("topic", "sequence", "due_ns", "came_ns")``.
-        rows: As many values each.
-    """
-
-    columns: tuple[str, ...]
-    rows: Sequence[tuple[Value, ...]]
-
-    def column(self, name: str) -> list[Value]:
-        """One column's values.
-
-        Raises:
-            ValueError: There is no such column.
-        """
-        at = self.columns.index(name)
-        return [row[at] for row in self.rows]
-
-
-@dataclass(frozen=True, slots=True)
 class Measured:
     """What came of one cell.
 
     Args:
-        tables: Raw samples by name; each becomes a CSV file.
+        tables: Raw samples by name (``lab.frames``); each becomes a CSV file.
         facts: Single values: what was lost, what a process used; they go to the manifest.
     """
 
-    tables: Mapping[str, Table] = field(default_factory=dict)
+    tables: Mapping[str, DataFrame] = field(default_factory=dict)
     facts: Mapping[str, Value] = field(default_factory=dict)
 
 

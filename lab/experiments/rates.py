@@ -9,11 +9,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from lab import samples, statistics
-from lab.arrivals import counted, latencies, lost
 from lab.experiments.contenders import CLASSIC, DEFAULTS, RELAYS, RMPA, nodelay_of, relays_of, turn
 from lab.experiments.model import Cell
 from lab.experiments.stream import SETTLE, stream
 from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
+from lab.frames import latencies, lost
+from lab.words import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -174,11 +175,10 @@ def _steps(results: Results, contender: Contender, client: str) -> Steps:
     steps: Steps = {}
     for _, measured in contender.select(results, client=client):
         arrivals, sent = measured.tables["arrivals"], measured.tables["sent"]
-        for rate in dict.fromkeys(sent.column("rate")):
-            if isinstance(rate, int):
-                step = steps.setdefault(rate, Step())
-                step.values += latencies(arrivals, rate=rate)
-                step.lost += lost(arrivals, sent, rate=rate)
+        for rate in sent["rate"].unique().tolist():
+            step = steps.setdefault(rate, Step())
+            step.values += latencies(arrivals, rate=rate)
+            step.lost += lost(arrivals, sent, rate=rate)
     return dict(sorted(steps.items()))
 
 

@@ -7,17 +7,20 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from lab.arrivals import counted, counting_from, latencies, lost
 from lab.bed.processes import Deadline
 from lab.experiments import flow
 from lab.experiments.contenders import system_of
-from lab.experiments.model import Cell, Measured, Plan, Results, Table
+from lab.experiments.model import Cell, Measured, Plan, Results
 from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
+from lab.frames import counting_from, frame, latencies, lost
 from lab.samples import summary
 from lab.usage import Meter, Usage
+from lab.words import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
+
+    from pandas import DataFrame
 
     from lab.bed.processes import Process
     from lab.bed.system import Stage, System
@@ -127,12 +130,12 @@ class Scaling:
         lead = round(_PROBE_RATE * _LEAD_IN)
         usage = [("idle", idle), ("probe", busy)]
         tables = {
-            "joins": Table(("ready_s", "linked_s", "first_s"), joins),
-            "processes": Table(
+            "joins": frame(("ready_s", "linked_s", "first_s"), joins),
+            "processes": frame(
                 ("while", "process", "cpu_percent", "rss_bytes"),
                 [(phase, name, used.percent, used.rss) for phase, found in usage for name, used in found.items()],
             ),
-            "traffic": Table(("host", *(f"{name}_per_s" for name in _TRAFFIC)), crossed),
+            "traffic": frame(("host", *(f"{name}_per_s" for name in _TRAFFIC)), crossed),
             "arrivals": counting_from(came, lead),
             "sent": counting_from(sent, lead),
         }
@@ -251,7 +254,7 @@ class Step:
 def _step(measured: Measured) -> Step:
     """What one cell shows; classic ROS's master with its helpers counts as one."""
     used: dict[str, dict[str, float]] = {"idle": {}, "probe": {}}
-    for phase, name, percent, _ in measured.tables["processes"].rows:
+    for phase, name, percent, _ in measured.tables["processes"].itertuples(index=False, name=None):
         what, _, host = str(name).partition("@")
         who = host if what == "agent" else "nodes" if what.startswith("nodes") else "master"
         used[str(phase)][who] = used[str(phase)].get(who, 0.0) + _float(percent)
@@ -265,15 +268,14 @@ def _step(measured: Measured) -> Step:
         nodes,
         _crossing(measured.tables["traffic"], "bytes"),
         _crossing(measured.tables["traffic"], "packets"),
-        [_float(value) for value in joins.column("linked_s") if value is not None],
-        [_float(value) for value in joins.column("first_s")],
+        [float(value) for value in joins["linked_s"].dropna()],
+        joins["first_s"].tolist(),
     )
 
 
-def _crossing(traffic: Table, unit: str) -> float:
+def _crossing(traffic: DataFrame, unit: str) -> float:
     """The mean over modules of what goes in and out in a second."""
-    ways = [traffic.column(f"{way}_{unit}_per_s") for way in ("tx", "rx")]
-    return sum(statistics.fmean(_float(value) for value in way) for way in ways)
+    return float(sum(traffic[f"{way}_{unit}_per_s"].mean() for way in ("tx", "rx")))
 
 
 def _float(value: object) -> float:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, cast
 
-from lab.arrivals import ARRIVALS, SENT, counting_from
+import pandas as pd
+
 from lab.experiments import flow
 from lab.experiments.contenders import nodelay_of, relays_of, system_of
-from lab.experiments.model import Measured, Table
+from lab.experiments.model import Measured
+from lab.frames import counting_from
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -39,8 +41,8 @@ class Stream:
 
     def __init__(self, stage: Stage, source: Process, sink: Process, topic: str, step: str) -> None:
         self._stage, self._source, self._sink, self._topic, self._step = stage, source, sink, topic, step
-        self._came: list[tuple[Value, ...]] = []
-        self._sent: list[tuple[Value, ...]] = []
+        self._came: list[pd.DataFrame] = []
+        self._sent: list[pd.DataFrame] = []
 
     def run(self, step: Value, *, size: int, rate: float, count: int) -> None:
         """Send one step; keep its last ``count`` messages."""
@@ -50,13 +52,15 @@ class Stream:
         came = counting_from(
             flow.noted(self._sink, [self._topic], self._stage.scratch, begun.number, settle=SETTLE), lead
         )
-        self._sent += [(step, *row) for row in sent.rows]
-        self._came += [(step, *row[1:]) for row in came.rows]
+        came = came.drop(columns="topic")
+        for table, steps in ((sent, self._sent), (came, self._came)):
+            table.insert(0, self._step, step)
+            steps.append(table)
 
     def measured(self) -> Measured:
         """All steps: tables ``arrivals`` and ``sent``."""
-        came, sent = Table((self._step, *ARRIVALS), self._came), Table((self._step, *SENT), self._sent)
-        return Measured({"arrivals": came, "sent": sent}, {"sent": len(self._sent), "came": len(self._came)})
+        came, sent = (pd.concat(steps, ignore_index=True) for steps in (self._came, self._sent))
+        return Measured({"arrivals": came, "sent": sent}, {"sent": len(sent), "came": len(came)})
 
 
 @contextmanager

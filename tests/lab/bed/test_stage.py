@@ -81,8 +81,8 @@ def test_messages_flow_and_nothing_is_left_behind(plan: Plan, kind: Kind) -> Non
         assert robot.master == ("pc" if kind == "classic" else "")
         source, sink = _nodes(robot, stage)
         begun = flow.begin(source, stage.scratch, size=64, rate=100, count=20)
-        assert len(flow.sent(begun).rows) == 20
-        assert len(flow.noted(sink, TOPICS, stage.scratch, begun.number).rows) == 40
+        assert len(flow.sent(begun)) == 20
+        assert len(flow.noted(sink, TOPICS, stage.scratch, begun.number)) == 40
         eventually(lambda: set(robot.pids()) == _running(plan, kind), what="all that the system itself runs")
         assert all(psutil.pid_exists(pid) for pid in robot.pids().values())
         scratch = stage.scratch
@@ -104,7 +104,7 @@ def test_killed_host_ends_all_at_once_and_comes_back(plan: Plan, kind: Kind) -> 
         assert not [name for name in robot.pids() if name.endswith("@velocity")]
         begun = flow.begin(source, stage.scratch, size=64, rate=100, count=10)
         flow.sent(begun)
-        came = flow.noted(sink, TOPICS, stage.scratch, begun.number).column("topic")
+        came = flow.noted(sink, TOPICS, stage.scratch, begun.number)["topic"].tolist()
         assert (came.count("/cmd"), came.count("/vel")) == (10, 0)
         before = time.monotonic()
         assert before <= robot.start("velocity") <= time.monotonic()
@@ -182,7 +182,7 @@ class TestCables:
             robot.cut("joystick")
             begun = flow.begin(source, stage.scratch, size=64, rate=100, count=10)
             flow.sent(begun)
-            assert not flow.noted(sink, TOPICS, stage.scratch, begun.number).rows
+            assert flow.noted(sink, TOPICS, stage.scratch, begun.number).empty
             robot.restore("joystick")
             flow.wait_flowing(source, sink, TOPICS, stage.scratch, timeout=60.0)
 

@@ -12,7 +12,7 @@ from lab.bench import schedule
 from lab.bench.crosstraffic import Loaded, shape
 from lab.bench.period import Evenness, paired
 from lab.bench.schedule import Arrivals, Score, Way, parse
-from lab.experiments.model import Table
+from lab.frames import frame
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,7 +30,7 @@ def made(came: dict[int, float], *, sent: int = 10, late: Sequence[int] = ()) ->
 
 def test_the_lead_in_is_left_out_of_everything() -> None:
     rows = [("/t", 0, 100, 190), ("/t", 1, 200, 230), ("/t", 2, 300, 350), ("/t", 3, 400, 470)]
-    arrivals = parse(Table(COLUMNS, rows), [5, 6, 7, 8], 2)
+    arrivals = parse(frame(COLUMNS, rows), [5, 6, 7, 8], 2)
     assert (arrivals.sent, list(arrivals.sequence), list(arrivals.late)) == (2, [2, 3], [7, 8])
     assert arrivals.latencies() == [0.05, 0.07]
     assert arrivals.from_send() == pytest.approx([0.043, 0.062])
@@ -57,7 +57,7 @@ def test_lost_and_doubled_are_counted() -> None:
 
 
 def test_nothing_that_came_is_nothing() -> None:
-    arrivals = parse(Table(COLUMNS, []), [0, 0, 0], 1)
+    arrivals = parse(frame(COLUMNS, []), [0, 0, 0], 1)
     assert (arrivals.lost, arrivals.periods(), arrivals.step, arrivals.bytes_per_second(64, 0, 99)) == (
         2,
         [],

@@ -58,21 +58,21 @@ def test_round_arrives_whole_with_the_heads_it_was_sent_with(robot: Robot, clien
     said = source.wait_event("sent", where=lambda event: event["round"] == begun.number)
     start = int(str(said["start_ns"]))
     assert said["count"] == 50
-    assert sent.column("sequence") == list(range(50))
+    assert sent["sequence"].tolist() == list(range(50))
     came = flow.noted(sink, TOPICS, tmp_path, begun.number)
     for topic in TOPICS:
-        rows = [row for row in came.rows if row[0] == topic]
+        rows = [row for row in came.itertuples(index=False, name=None) if row[0] == topic]
         assert [row[1] for row in rows] == list(range(50))
         assert [row[2] for row in rows] == [start + 5 * MILLISECOND * number for number in range(50)]
         late = [_int(row[3]) - _int(row[2]) for row in rows]
-        assert all(there > left for there, left in zip(late, map(_int, sent.column("late_ns")), strict=True))
+        assert all(there > left for there, left in zip(late, map(_int, sent["late_ns"].tolist()), strict=True))
 
 
 def test_velocity_carries_what_the_command_carried(robot: Robot, client: Client, tmp_path: Path) -> None:
     source, sink = _flowing(robot, client, tmp_path)
     begun = flow.begin(source, tmp_path, size=flow.HEAD, rate=100, count=5)
     flow.sent(begun)
-    came = flow.noted(sink, TOPICS, tmp_path, begun.number).rows
+    came = list(flow.noted(sink, TOPICS, tmp_path, begun.number).itertuples(index=False, name=None))
     heads = {topic: [row[1:3] for row in came if row[0] == topic] for topic in TOPICS}
     assert heads["/cmd"] == heads["/vel"]
     assert len(heads["/vel"]) == 5
@@ -107,7 +107,7 @@ def _velocities(
 ) -> list[tuple[object, ...]]:
     begun = flow.begin(source, scratch, size=64, rate=rate, count=count)
     flow.sent(begun)
-    return list(flow.noted(sink, ["/vel"], scratch, begun.number).rows)
+    return list(flow.noted(sink, ["/vel"], scratch, begun.number).itertuples(index=False, name=None))
 
 
 def test_source_keeps_its_phase(robot: Robot, client: Client, tmp_path: Path) -> None:
@@ -123,20 +123,20 @@ def test_sink_gives_one_round_or_all_and_forgets_them(robot: Robot, client: Clie
     rounds = [flow.begin(source, tmp_path, size=64, rate=200, count=count) for count in (3, 4)]
     for begun in rounds:
         flow.sent(begun)
-    everything = flow.noted(sink, TOPICS, tmp_path).rows
+    everything = flow.noted(sink, TOPICS, tmp_path)
     assert len(everything) == 2 * (3 + 4)
-    assert not flow.noted(sink, TOPICS, tmp_path).rows
+    assert flow.noted(sink, TOPICS, tmp_path).empty
     begun = flow.begin(source, tmp_path, size=64, rate=200, count=5)
     flow.sent(begun)
-    assert not flow.noted(sink, TOPICS, tmp_path, rounds[0].number).rows
-    assert not flow.noted(sink, TOPICS, tmp_path, begun.number).rows  # the question for another forgot these, too
+    assert flow.noted(sink, TOPICS, tmp_path, rounds[0].number).empty
+    assert flow.noted(sink, TOPICS, tmp_path, begun.number).empty  # the question for another forgot these, too
 
 
 def test_sink_answers_at_once_while_messages_come(robot: Robot, client: Client, tmp_path: Path) -> None:
     source, sink = _flowing(robot, client, tmp_path)
     begun = flow.begin(source, tmp_path, size=64, rate=100, count=1000)
     sink_has = flow.noted(sink, TOPICS, tmp_path, settle=0)
-    assert len(sink_has.rows) < 2000
+    assert len(sink_has) < 2000
     assert not [event for event in source.events("sent") if event["round"] == begun.number]  # it sends still
 
 
@@ -169,7 +169,7 @@ def test_large_messages_come_whole(robot: Robot, client: Client, tmp_path: Path)
     source, sink = _flowing(robot, client, tmp_path)
     begun = flow.begin(source, tmp_path, size=1_000_000, rate=10, count=5)
     flow.sent(begun)
-    assert len(flow.noted(sink, TOPICS, tmp_path, begun.number).rows) == 10
+    assert len(flow.noted(sink, TOPICS, tmp_path, begun.number)) == 10
 
 
 def test_files_are_of_native_numbers(robot: Robot, client: Client, tmp_path: Path) -> None:
