@@ -53,7 +53,7 @@ _USUAL: Final = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class BookkeepingPlan:
     """How much is measured.
 
     Args:
@@ -69,8 +69,8 @@ class Plan:
     relayed: float
 
 
-FULL: Final = Plan(400, 1.0, 40, 10.0)
-QUICK: Final = Plan(50, 0.2, 6, 2.0)
+FULL: Final = BookkeepingPlan(400, 1.0, 40, 10.0)
+QUICK: Final = BookkeepingPlan(50, 0.2, 6, 2.0)
 
 
 def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
@@ -81,7 +81,7 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
         way = schedule.agents(bed)
         stream = way.stream(bed, "/relayed")
         pids = {f"agent {number}": agent.pid for number, agent in enumerate(way.agents, 1)}
-        rates = profile.Plan((_USUAL, 4 * _USUAL), plan.relayed, plan.relayed, 0.0)
+        rates = profile.ProfilePlan((_USUAL, 4 * _USUAL), plan.relayed, plan.relayed, 0.0)
         relay = list(profile.relay_costs(stream, pids, rates))
     waits, reported = asyncio.run(_reactions(plan))
     least = min(cost.total for cost in relay if cost.rate == _USUAL)
@@ -169,7 +169,7 @@ def _batch(function: Callable[[], None]) -> float:
 # --- reaction -------------------------------------------------------------------------------------------------------
 
 
-async def _reactions(plan: Plan) -> tuple[list[float], list[float]]:
+async def _reactions(plan: BookkeepingPlan) -> tuple[list[float], list[float]]:
     """Seconds from each disturbance until another profile ran; and what the resource says, less the applying."""
     chance = random.Random(_SEED)
     running = disturbed = ""

@@ -30,7 +30,7 @@ _ROUND_DEADLINE: Final = 120.0
 
 
 @dataclass(slots=True)
-class Contender:
+class RoundTripPath:
     """One path from ``ping`` and back.
 
     Args:
@@ -70,7 +70,7 @@ class Contender:
                 process.freeze()
 
 
-def floor_c(bed: Bed) -> Contender:
+def floor_c(bed: Bed) -> RoundTripPath:
     """Raw TCP in C++."""
     shell = bed.shell()
     program = compiled("floor", NODES)
@@ -79,14 +79,14 @@ def floor_c(bed: Bed) -> Contender:
     return _raw("floor_c", "C, raw TCP", shell.start(program, "ping", port, commands=True), server)
 
 
-def _raw(key: str, title: str, ping: Process, server: Process) -> Contender:
+def _raw(key: str, title: str, ping: Process, server: Process) -> RoundTripPath:
     ping.wait_event("ready")
-    return Contender(key, title, ping, {"ping": ping, "pong": server}, [ping, server])
+    return RoundTripPath(key, title, ping, {"ping": ping, "pong": server}, [ping, server])
 
 
 def script(
     key: str, title: str, program: str, words: Callable[[], list[str]] = list, *, freeze: bool = False
-) -> Callable[[Bed], Contender]:
+) -> Callable[[Bed], RoundTripPath]:
     """Both ends are one Python script of ``nodes/``, called with ``serve`` and with ``ping``.
 
     Args:
@@ -97,7 +97,7 @@ def script(
         freeze: Whether both may be stopped while others are measured: not where ends watch each other's life.
     """
 
-    def start(bed: Bed) -> Contender:
+    def start(bed: Bed) -> RoundTripPath:
         shell, given = bed.shell(), words()
         server = shell.start(sys.executable, NODES / program, "serve", *given, name=f"{key} pong")
         up = server.wait_event("up")
@@ -105,15 +105,15 @@ def script(
         ping = shell.start(sys.executable, NODES / program, "ping", *given, name=f"{key} ping", commands=True)
         ping.wait_event("ready", 30.0)
         ends = {"ping": ping, "pong": server}
-        return Contender(key, title, ping, ends, list(ends.values()) if freeze else [])
+        return RoundTripPath(key, title, ping, ends, list(ends.values()) if freeze else [])
 
     return start
 
 
-def direct(client: str, *, nodelay: bool) -> Callable[[Bed], Contender]:
+def direct(client: str, *, nodelay: bool) -> Callable[[Bed], RoundTripPath]:
     """One client library, straight from node to node."""
 
-    def start(bed: Bed) -> Contender:
+    def start(bed: Bed) -> RoundTripPath:
         shell = bed.shell()
         shell.master()
         word = "tcpNoDelay" if nodelay else "Nagle"
@@ -123,13 +123,13 @@ def direct(client: str, *, nodelay: bool) -> Callable[[Bed], Contender]:
     return start
 
 
-def direct_hosts(bed: Bed) -> Contender:
+def direct_hosts(bed: Bed) -> RoundTripPath:
     """Roscpp straight from host to host by the same kind of cable as the agents': classic ROS at its best."""
     here, there = bed.classic()
     return _nodes("roscpp_hosts", "roscpp direct, two hosts", here, there, "roscpp")
 
 
-def relays(bed: Bed) -> Contender:
+def relays(bed: Bed) -> RoundTripPath:
     """Roscpp through two C++ relays each way: as many hops as through two agents."""
     shell = bed.shell()
     shell.master()
@@ -141,20 +141,20 @@ def relays(bed: Bed) -> Contender:
     return _nodes("relays", "roscpp, two C++ relays", shell, shell, "roscpp", between, ask="/ping2", answer="/pong2")
 
 
-def agents_hosts(bed: Bed) -> Contender:
+def agents_hosts(bed: Bed) -> RoundTripPath:
     """Roscpp through two agents in two network namespaces."""
     a, b = bed.lab.hosts("a", "b")
     first, second = bed.agent(a, name="a"), bed.agent(b, name="b")
     return _through("agents_hosts", "roscpp, two agents, two hosts", bed, first, second)
 
 
-def agents_one_host(bed: Bed) -> Contender:
+def agents_one_host(bed: Bed) -> RoundTripPath:
     """Roscpp through two agents on the real machine."""
     first, second = bed.agent(MACHINE, name="one"), bed.agent(MACHINE, name="two")
     return _through("agents_one_host", "roscpp, two agents, one host", bed, first, second)
 
 
-def _through(key: str, title: str, bed: Bed, first: Agent, second: Agent) -> Contender:
+def _through(key: str, title: str, bed: Bed, first: Agent, second: Agent) -> RoundTripPath:
     between = {"agent 1": first.process, "agent 2": second.process}
     here, there = (bed.shell(agent.host, agent.core_port) for agent in (first, second))
     made = _nodes(key, title, here, there, "roscpp", between)
@@ -173,13 +173,13 @@ def _nodes(
     nodelay: bool = True,
     ask: str = "/ping",
     answer: str = "/pong",
-) -> Contender:
+) -> RoundTripPath:
     pong = there.node(client, "velocity", "__name:=pong", cmd=ask, vel="/pong", nodelay=nodelay)
     start = here.rospy if client == "rospy" else here.roscpp
     ping = start("ping", "__name:=ping", commands=True, topic="/ping", reply=answer, nodelay=nodelay)
     ping.wait_event("ready", 30.0)
     processes = {"ping": ping, **(between or {}), "pong": pong}
-    return Contender(key, title, ping, processes, list(processes.values()))
+    return RoundTripPath(key, title, ping, processes, list(processes.values()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +192,7 @@ class Entry:
         needs: Each says why it cannot run here, or an empty string.
     """
 
-    start: Callable[[Bed], Contender]
+    start: Callable[[Bed], RoundTripPath]
     module: str = ""
     needs: tuple[Callable[[], str], ...] = ()
 

@@ -39,7 +39,7 @@ _DEADLINE: Final = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class CrosstrafficPlan:
     """How much is measured.
 
     Args:
@@ -51,16 +51,16 @@ class Plan:
     rounds: int
 
 
-FULL: Final = Plan(20.0, 5)
-QUICK: Final = Plan(8.0, 2)
+FULL: Final = CrosstrafficPlan(20.0, 5)
+QUICK: Final = CrosstrafficPlan(8.0, 2)
 
 
-class Loaded(schedule.Score):
+class LoadedScore(schedule.LatencyScore):
     """Commands beside images, and the images."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.images = schedule.Score()
+        self.images = schedule.LatencyScore()
         self.throughput: list[float] = []
 
     def add_images(self, images: schedule.Arrivals, commands: schedule.Arrivals) -> None:
@@ -75,7 +75,7 @@ class Loaded(schedule.Score):
         return 8 * sum(self.throughput) / len(self.throughput) / _LINK if self.throughput else None
 
 
-Scores = dict[tuple[str, str], Loaded]
+Scores = dict[tuple[str, str], LoadedScore]
 
 
 def measure(quick: bool, console: Console, json: Path | None = None, *, realtime: bool = False) -> dict[str, object]:
@@ -115,7 +115,7 @@ def measure(quick: bool, console: Console, json: Path | None = None, *, realtime
     )
 
 
-def _take(plan: Plan, console: Console, *, realtime: bool) -> tuple[Scores, dict[str, str], str]:
+def _take(plan: CrosstrafficPlan, console: Console, *, realtime: bool) -> tuple[Scores, dict[str, str], str]:
     """The scores, the ways' titles by key, and how all that ran was scheduled."""
     scores: Scores = {}
     with Bed() as bed:
@@ -131,7 +131,7 @@ def _take(plan: Plan, console: Console, *, realtime: bool) -> tuple[Scores, dict
         for order in schedule.turns(ways, plan.rounds, console):
             for way in order:
                 for condition in ("unloaded", "loaded"):
-                    score = scores.setdefault((way.key, condition), Loaded())
+                    score = scores.setdefault((way.key, condition), LoadedScore())
                     _round(*streams[way.key], plan.seconds, score, loaded=condition == "loaded")
     return scores, {way.key: way.title for way in ways}, how
 
@@ -157,7 +157,14 @@ def shape(host: Host) -> None:
         subprocess.run(command, check=True, capture_output=True, timeout=20)
 
 
-def _round(command: schedule.Stream, image: schedule.Stream, seconds: float, score: Loaded, *, loaded: bool) -> None:
+def _round(
+    command: schedule.MeasuredStream,
+    image: schedule.MeasuredStream,
+    seconds: float,
+    score: LoadedScore,
+    *,
+    loaded: bool,
+) -> None:
     if loaded:
         image.begin(_IMAGE, _IMAGE_RATE, _AHEAD + seconds + 1.0)
         image.wait_lead_in(_AHEAD)
@@ -171,7 +178,7 @@ def _ms(value: float | None) -> float | None:
     return None if value is None else value / 1000
 
 
-def _row(key: str, condition: str, one: Loaded, scores: Scores) -> dict[str, object]:
+def _row(key: str, condition: str, one: LoadedScore, scores: Scores) -> dict[str, object]:
     idle, classic = scores[key, "unloaded"].summary, scores["direct", condition].summary
     row = {
         "way": key,

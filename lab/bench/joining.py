@@ -47,7 +47,7 @@ _INTERFACE: Final = "eth0"
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class JoiningPlan:
     """How much is measured.
 
     Args:
@@ -69,8 +69,8 @@ class Plan:
     services: int = 100
 
 
-FULL: Final = Plan()
-QUICK: Final = Plan(modules=(2, 4, 16), joins=1, idle=5.0, mirrors=1)
+FULL: Final = JoiningPlan()
+QUICK: Final = JoiningPlan(modules=(2, 4, 16), joins=1, idle=5.0, mirrors=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +137,7 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
 # --- modules --------------------------------------------------------------------------------------------------
 
 
-def _modules(plan: Plan, count: int, console: Console) -> Row:
+def _modules(plan: JoiningPlan, count: int, console: Console) -> Row:
     console.print(f"{count} modules", style="dim")
     with Bed() as bed:
         hosts = bed.lab.hosts(*(f"m{number}" for number in range(count)))
@@ -216,7 +216,7 @@ def _traffic(agent: Agent) -> Traffic:
 # --- a graph --------------------------------------------------------------------------------------------------
 
 
-def _mirror(plan: Plan) -> dict[str, float | None]:
+def _mirror(plan: JoiningPlan) -> dict[str, float | None]:
     """Seconds from the link of a joining module to all topics, and to all services, in its graph; from its start."""
     with Bed() as bed:
         there, joins = bed.lab.hosts("there", "joins")
@@ -244,7 +244,7 @@ def _mirror(plan: Plan) -> dict[str, float | None]:
 # --- tables ---------------------------------------------------------------------------------------------------
 
 
-def _table(rows: dict[int, Row], plan: Plan) -> Table:
+def _table(rows: dict[int, Row], plan: JoiningPlan) -> Table:
     heads = ["modules", "last start to mesh, s", "worst", "its READY, s", "all at once, s", "after READY"]
     heads += ["CPU mean, %", "worst"]
     table = table_of(
@@ -261,7 +261,7 @@ def _table(rows: dict[int, Row], plan: Plan) -> Table:
     return table
 
 
-def _mirror_table(mirrors: Sequence[dict[str, float | None]], plan: Plan) -> Table:
+def _mirror_table(mirrors: Sequence[dict[str, float | None]], plan: JoiningPlan) -> Table:
     title = f"a graph of {plan.nodes} nodes at a module that joins (to reach: {_MIRRORED_WITHIN:g} s from its link)"
     table = table_of(title, ("what",), ("from the link, s", "worst", "from its start, s"))
     for what, count in (("topics", plan.topics), ("services", plan.services)):

@@ -35,7 +35,7 @@ _CONDITIONS: Final = ("idle", "hogs")
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class LoadPlan:
     """How much is measured.
 
     Args:
@@ -49,10 +49,10 @@ class Plan:
     rounds: int
 
 
-FULL: Final = Plan(5.0, 20.5, 5)
-QUICK: Final = Plan(5.5, 5.5, 2)
+FULL: Final = LoadPlan(5.0, 20.5, 5)
+QUICK: Final = LoadPlan(5.5, 5.5, 2)
 
-Scores = dict[tuple[str, str], schedule.Score]
+Scores = dict[tuple[str, str], schedule.LatencyScore]
 
 
 def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
@@ -104,11 +104,11 @@ def hogs(count: int) -> Iterator[None]:
             hog.end()
 
 
-def _take(scores: Scores, way: schedule.Way, condition: str, stream: schedule.Stream, seconds: float) -> None:
-    scores.setdefault((way.key, condition), schedule.Score()).add(stream.run(_SIZE, _RATE, seconds))
+def _take(scores: Scores, way: schedule.Way, condition: str, stream: schedule.MeasuredStream, seconds: float) -> None:
+    scores.setdefault((way.key, condition), schedule.LatencyScore()).add(stream.run(_SIZE, _RATE, seconds))
 
 
-def _row(key: str, condition: str, one: schedule.Score, scores: Scores) -> dict[str, object]:
+def _row(key: str, condition: str, one: schedule.LatencyScore, scores: Scores) -> dict[str, object]:
     return {
         "way": key,
         "condition": condition,

@@ -33,7 +33,7 @@ _FASTEST: Final = 1000
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class PeriodPlan:
     """How much is measured.
 
     Args:
@@ -45,8 +45,8 @@ class Plan:
     rounds: int
 
 
-FULL: Final = Plan({10: 10.2, 50: 4.2, 100: 3.0, 1000: 2.0}, 10)
-QUICK: Final = Plan({10: 2.0, 50: 1.0, 100: 1.0, 1000: 1.0}, 3)
+FULL: Final = PeriodPlan({10: 10.2, 50: 4.2, 100: 3.0, 1000: 2.0}, 10)
+QUICK: Final = PeriodPlan({10: 2.0, 50: 1.0, 100: 1.0, 1000: 1.0}, 3)
 
 
 class Evenness:

@@ -55,7 +55,7 @@ _ATTACH: Final = 0.7
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ProfilePlan:
     """How much is measured.
 
     Args:
@@ -71,8 +71,8 @@ class Plan:
     profiled: float
 
 
-FULL: Final = Plan((100.0, _USUAL, 4000.0), 10.0, 10.0, 10.0)
-QUICK: Final = Plan((_USUAL,), 3.0, 5.0, 2.0)
+FULL: Final = ProfilePlan((100.0, _USUAL, 4000.0), 10.0, 10.0, 10.0)
+QUICK: Final = ProfilePlan((_USUAL,), 3.0, 5.0, 2.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ class Cost:
 
 
 @dataclass(slots=True)
-class Profile:
+class AgentProfile:
     """Where one agent's time goes.
 
     Args:
@@ -120,7 +120,7 @@ class Profile:
 def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
     """Measure, print the tables, write the files; return the result."""
     plan = QUICK if quick else FULL
-    profiles = {"agent 1": Profile(), "agent 2": Profile()}
+    profiles = {"agent 1": AgentProfile(), "agent 2": AgentProfile()}
     with Bed() as bed:
         way = schedule.agents(bed)
         stream = way.stream(bed, _TOPIC)
@@ -148,7 +148,7 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
 # --- the cost -------------------------------------------------------------------------------------------------------
 
 
-def relay_costs(stream: schedule.Stream, pids: Mapping[str, int], plan: Plan) -> Iterator[Cost]:
+def relay_costs(stream: schedule.MeasuredStream, pids: Mapping[str, int], plan: ProfilePlan) -> Iterator[Cost]:
     """What a relayed message costs each agent, at each of the plan's rates."""
     stream.run(_SIZE, _USUAL, 1.0)
     meter = Meter(pids)
@@ -171,7 +171,7 @@ def relay_costs(stream: schedule.Stream, pids: Mapping[str, int], plan: Plan) ->
 
 
 @contextmanager
-def _streaming(stream: schedule.Stream, seconds: float) -> Iterator[None]:
+def _streaming(stream: schedule.MeasuredStream, seconds: float) -> Iterator[None]:
     """A stream that lasts longer than what looks at it; it ends at the end."""
     stream.begin(_SIZE, _PROFILED_RATE, seconds + 2.0)
     stream.wait_lead_in(0.2)
@@ -179,7 +179,7 @@ def _streaming(stream: schedule.Stream, seconds: float) -> Iterator[None]:
     stream.end()
 
 
-def _perf(into: Profile, pid: int, stream: schedule.Stream, seconds: float, scratch: Path) -> None:
+def _perf(into: AgentProfile, pid: int, stream: schedule.MeasuredStream, seconds: float, scratch: Path) -> None:
     if shutil.which("perf") is None:
         into.missing["perf"] = "not installed (apt install linux-perf)"
         return
@@ -195,7 +195,7 @@ def _perf(into: Profile, pid: int, stream: schedule.Stream, seconds: float, scra
     into.symbols = parse_perf(_run([*report, "dso,symbol"]).stdout)
 
 
-def _strace(into: Profile, pid: int, stream: schedule.Stream, seconds: float, scratch: Path) -> None:
+def _strace(into: AgentProfile, pid: int, stream: schedule.MeasuredStream, seconds: float, scratch: Path) -> None:
     if shutil.which("strace") is None:
         into.missing["strace"] = "not installed (apt install strace)"
         return
@@ -216,7 +216,7 @@ def _strace(into: Profile, pid: int, stream: schedule.Stream, seconds: float, sc
     into.calls = {name: round(count / arrivals.total, 3) for name, count in calls.items()}
 
 
-def _spy(into: Profile, pid: int, stream: schedule.Stream, seconds: float, scratch: Path) -> None:
+def _spy(into: AgentProfile, pid: int, stream: schedule.MeasuredStream, seconds: float, scratch: Path) -> None:
     program = Path(sys.executable).with_name("py-spy")
     if not program.exists():
         into.missing["py-spy"] = "not installed (pip install -c constraints.txt -e '.[lab-peers]')"
@@ -231,7 +231,7 @@ def _spy(into: Profile, pid: int, stream: schedule.Stream, seconds: float, scrat
     into.functions, into.modules = parse_stacks(raw.read_text(encoding="utf-8"))
 
 
-def _count_calls(profiles: Mapping[str, Profile], seconds: float) -> None:
+def _count_calls(profiles: Mapping[str, AgentProfile], seconds: float) -> None:
     """Count with fresh agents, which start with the profiler's help."""
     with Bed() as bed:
         hosts = bed.lab.hosts("a", "b")
@@ -340,7 +340,7 @@ def _short(file: str) -> str:
 # --- showing --------------------------------------------------------------------------------------------------------
 
 
-def _show(console: Console, costs: list[Cost], profiles: Mapping[str, Profile]) -> None:
+def _show(console: Console, costs: list[Cost], profiles: Mapping[str, AgentProfile]) -> None:
     table = table_of(
         f"processor time of one agent for a relayed message of {_SIZE} B, µs; idle cost taken off",
         (),
@@ -370,7 +370,7 @@ def _show(console: Console, costs: list[Cost], profiles: Mapping[str, Profile]) 
             console.print(f"  {tool} is left out: {reason}", style="yellow", markup=False)
 
 
-def _parts(profiles: Mapping[str, Profile], costs: Mapping[str, float]) -> dict[str, dict[str, float]]:
+def _parts(profiles: Mapping[str, AgentProfile], costs: Mapping[str, float]) -> dict[str, dict[str, float]]:
     """The cost at 1 kHz by object, as ``perf`` divides it."""
     return {
         name: {what: costs[name] * share / 100 for what, share in profile.objects.items() if share >= 1.0}

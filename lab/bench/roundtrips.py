@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from lab.bench.contenders import Contender
+    from lab.bench.contenders import RoundTripPath
 
 _WARM_UP: Final = 20
 """Round trips of each turn that are thrown away: caches and the processor's clock come up."""
@@ -124,7 +124,7 @@ def _measure(
     return finish(console, name, asdict(plan), result, json, panels=shapes.shares(shown, "one way, µs"))
 
 
-def start_all(bed: Bed, keys: Sequence[str], left_out: dict[str, str], console: Console) -> list[Contender]:
+def start_all(bed: Bed, keys: Sequence[str], left_out: dict[str, str], console: Console) -> list[RoundTripPath]:
     """Start all that can take part, and stop them until their turn; say why the others cannot, and note it."""
     taking_part = []
     for key in keys:
@@ -144,7 +144,7 @@ def start_all(bed: Bed, keys: Sequence[str], left_out: dict[str, str], console: 
     return taking_part
 
 
-def _turn(one: Contender, size: int, trips: int, scratch: Path, scores: Scores) -> None:
+def _turn(one: RoundTripPath, size: int, trips: int, scratch: Path, scores: Scores) -> None:
     with one.awake():
         one.round(size, _WARM_UP, scratch)
         times, lost, usage = one.round(size, trips, scratch)

@@ -119,7 +119,7 @@ class Arrivals:
         return size * (len(inside) - 1) / (inside[-1] - inside[0]) * 1e9 if len(inside) > 1 else 0.0
 
 
-class Stream:
+class MeasuredStream:
     """A publisher and a receiver of one topic, and their rounds.
 
     Args:
@@ -219,7 +219,7 @@ class Way:
     agents: list[Agent] = field(default_factory=list)
     relayed: bool = False
 
-    def stream(self, bed: Bed, topic: str, *, queue: int = 100, fifo: int = 0) -> Stream:
+    def stream(self, bed: Bed, topic: str, *, queue: int = 100, fifo: int = 0) -> MeasuredStream:
         """Start both nodes of one topic, under SCHED_FIFO if ``fifo`` is a priority."""
         prefix = ["chrt", "-f", str(fifo)] if fifo else []
 
@@ -235,7 +235,7 @@ class Way:
                 between[f"relay {number}"] = node(shell, "velocity", "--cmd", begin, "--vel", end)
         target = node(self.there, "sink", "--topics", end)
         source = node(self.here, "source", "--topic", topic)
-        made = Stream(bed, source, target, end, between)
+        made = MeasuredStream(bed, source, target, end, between)
         made.wait_flowing()
         return made
 
@@ -301,7 +301,7 @@ def _policy(pid: int) -> str:
     return f"{names.get(policy, str(policy))} {os.sched_getparam(pid).sched_priority}"
 
 
-class Score:
+class LatencyScore:
     """One way under one condition, over all rounds."""
 
     def __init__(self) -> None:

@@ -32,7 +32,7 @@ _WARM_UP: Final = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ServicesPlan:
     """How much is measured.
 
     Args:
@@ -44,8 +44,8 @@ class Plan:
     rounds: int
 
 
-FULL: Final = Plan(dict(zip(_SIZES, (3000, 1500, 400), strict=True)), 10)
-QUICK: Final = Plan(dict(zip(_SIZES, (200, 100, 30), strict=True)), 2)
+FULL: Final = ServicesPlan(dict(zip(_SIZES, (3000, 1500, 400), strict=True)), 10)
+QUICK: Final = ServicesPlan(dict(zip(_SIZES, (200, 100, 30), strict=True)), 2)
 
 
 def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:

@@ -47,7 +47,7 @@ _FILL_DEADLINE: Final = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class StormPlan:
     """How much is measured.
 
     Args:
@@ -59,8 +59,8 @@ class Plan:
     rounds: int
 
 
-FULL: Final = Plan(4.0, 12)
-QUICK: Final = Plan(2.6, 4)
+FULL: Final = StormPlan(4.0, 12)
+QUICK: Final = StormPlan(2.6, 4)
 
 
 @dataclass(slots=True)
@@ -79,14 +79,14 @@ class Case:
 
     key: str
     title: str
-    stream: schedule.Stream
+    stream: schedule.MeasuredStream
     idle: str
     client: Process | None = None
     port: int = 0
     others: dict[str, Process] | None = None
 
 
-class Stormy(schedule.Score):
+class Stormy(schedule.LatencyScore):
     """A stream's rounds, and the calls."""
 
     def __init__(self) -> None:

@@ -40,7 +40,7 @@ _HELLO: Final = 30.0
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class TasksPlan:
     """How much is measured.
 
     Args:
@@ -52,8 +52,8 @@ class Plan:
     rounds: int
 
 
-FULL: Final = Plan(5.0, 12)
-QUICK: Final = Plan(1.5, 4)
+FULL: Final = TasksPlan(5.0, 12)
+QUICK: Final = TasksPlan(1.5, 4)
 
 
 @dataclass(slots=True)

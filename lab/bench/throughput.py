@@ -52,7 +52,7 @@ _QUIET: Final = 20.0
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ThroughputPlan:
     """How much is measured.
 
     Args:
@@ -66,8 +66,8 @@ class Plan:
     bisections: int
 
 
-FULL: Final = Plan(5.0, 3, 6)
-QUICK: Final = Plan(2.0, 1, 3)
+FULL: Final = ThroughputPlan(5.0, 3, 6)
+QUICK: Final = ThroughputPlan(2.0, 1, 3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ def lost_between(first: Count, last: Count) -> float:
 
 
 @dataclass(slots=True)
-class Way:
+class FloodWay:
     """One way from publisher to receiver, freshly started.
 
     Args:
@@ -214,25 +214,25 @@ def _dropped(agent: Agent) -> int | None:
     return sum(found) if found else None
 
 
-def _direct(bed: Bed) -> Way:
+def _direct(bed: Bed) -> FloodWay:
     shell = bed.shell()
     shell.master()
-    return Way(shell, shell)
+    return FloodWay(shell, shell)
 
 
-def _direct_hosts(bed: Bed) -> Way:
-    return Way(*bed.classic())
+def _direct_hosts(bed: Bed) -> FloodWay:
+    return FloodWay(*bed.classic())
 
 
-def _agents(bed: Bed) -> Way:
+def _agents(bed: Bed) -> FloodWay:
     hosts = bed.lab.hosts("a", "b")
     agents = [bed.agent(host, name=host.name) for host in hosts]
     agents[0].wait_peer("b")
     here, there = (bed.shell(agent.host, agent.core_port) for agent in agents)
-    return Way(here, there, agents)
+    return FloodWay(here, there, agents)
 
 
-WAYS: Final[dict[str, tuple[str, Callable[[Bed], Way]]]] = {
+WAYS: Final[dict[str, tuple[str, Callable[[Bed], FloodWay]]]] = {
     "direct": ("roscpp direct", _direct),
     "direct_hosts": ("roscpp direct, two hosts", _direct_hosts),
     "agents": ("two agents, two hosts", _agents),
@@ -240,7 +240,7 @@ WAYS: Final[dict[str, tuple[str, Callable[[Bed], Way]]]] = {
 
 
 @dataclass(slots=True)
-class Score:
+class ThroughputScore:
     """One way at one size.
 
     Args:
@@ -262,13 +262,13 @@ class Score:
         return sorted(self.windows, key=lambda window: window.received)[len(self.windows) // 2]
 
 
-Scores = dict[tuple[str, int], Score]
+Scores = dict[tuple[str, int], ThroughputScore]
 
 
 def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
     """Measure, print the tables, write the files; return the result."""
     plan = QUICK if quick else FULL
-    scores: Scores = {(key, bytes_each): Score() for bytes_each in _LIMITS for key in WAYS}
+    scores: Scores = {(key, bytes_each): ThroughputScore() for bytes_each in _LIMITS for key in WAYS}
     with _on_cores(_CORES) as cores:
         for turn in range(plan.rounds):
             console.print(f"round {turn + 1} of {plan.rounds}", style="dim")

@@ -21,8 +21,8 @@ from rmpa.core.errors import ConfigError, StartError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+    from lab.bed.plan import Client, Plan, Size
     from lab.experiments.asked import Bed
-    from lab.experiments.model import Client, Plan, Size
     from lab.experiments.report import Report
     from lab.experiments.runner import Job, Outcome
     from lab.experiments.store import Store

@@ -12,7 +12,7 @@ import pandas as pd
 from lab import frames
 from lab.experiments import flow
 from lab.experiments.contenders import system_of
-from lab.experiments.model import Cell, Measured, Plan, Results
+from lab.experiments.model import Cell, Measured, Results
 from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 from lab.frames import counting_from
 from lab.samples import summary
@@ -22,9 +22,11 @@ from lab.words import counted
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
+    from lab.bed.plan import Client, Plan
     from lab.bed.processes import Process
-    from lab.bed.system import Stage, System
-    from lab.experiments.model import Client, Value
+    from lab.bed.stage import Stage
+    from lab.bed.system import System
+    from lab.experiments.model import Value
 
 HOSTS: Final = ("joystick", "pc")
 _LINK: Final = "100mbit"
@@ -49,7 +51,7 @@ _UNITS: Final = {"": 1.0, "k": 1e3, "m": 1e6, "g": 1e9}
 
 
 @dataclass(frozen=True, slots=True)
-class Times:
+class ImageTimes:
     """Seconds of a cell.
 
     Args:
@@ -65,8 +67,8 @@ class Times:
     rounds: int
 
 
-_FULL: Final = Times(5.0, 2.0, 20.0, 2)
-_SHORT: Final = Times(0.3, 0.3, 1.0, 1)
+_FULL: Final = ImageTimes(5.0, 2.0, 20.0, 2)
+_SHORT: Final = ImageTimes(0.3, 0.3, 1.0, 1)
 
 
 class _Stream:
@@ -169,7 +171,7 @@ class Images:
         )
 
 
-def _times(plan: Plan) -> Times:
+def _times(plan: Plan) -> ImageTimes:
     return _SHORT if plan.short else _FULL
 
 
@@ -190,7 +192,7 @@ def bits(link: str) -> float | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Score:
+class ImageScore:
     """One system with one client, over all rounds.
 
     Args:
@@ -210,7 +212,7 @@ class Score:
     dropped: int
 
 
-def _score(rounds: Sequence[Measured]) -> Score:
+def _score(rounds: Sequence[Measured]) -> ImageScore:
     latencies: dict[str, list[float]] = {"alone": [], "images": []}
     lost = {"alone": 0, "images": 0}
     shares, speeds, late = [], [], []
@@ -228,7 +230,7 @@ def _score(rounds: Sequence[Measured]) -> Score:
             speeds.append(speed / 1e6)
             if carried := bits(str(one.facts["link"])):
                 shares.append(8 * speed / carried)
-    return Score(latencies, lost, shares, speeds, late, dropped)
+    return ImageScore(latencies, lost, shares, speeds, late, dropped)
 
 
 def bytes_per_second(came: Sequence[int], begin: int, end: int) -> float:
@@ -241,7 +243,7 @@ def _int(value: object) -> int:
     return int(str(value))
 
 
-Scores = dict[tuple[str, str], Score]
+Scores = dict[tuple[str, str], ImageScore]
 
 
 def _figure(client: str, scores: Scores) -> Figure:
@@ -284,7 +286,7 @@ def _commands(scores: Scores) -> Grid:
     return Grid("Commands", heads, rows, note)
 
 
-def _later(score: Score, beside: str) -> str:
+def _later(score: ImageScore, beside: str) -> str:
     late = sum(value > _DEADLINE for value in score.latencies[beside]) + score.lost[beside]
     sent = len(score.latencies[beside]) + score.lost[beside]
     return f"{100 * late / sent:.2f} %" if sent else "-"

@@ -6,8 +6,9 @@ from typing import Literal
 
 import msgspec
 
-from lab.experiments.code import Code  # noqa: TC001 - msgspec reads these types when it decodes
-from lab.experiments.model import Plan, Value  # noqa: TC001 - likewise
+from lab.bed.plan import Plan  # noqa: TC001 - msgspec reads these types when it decodes
+from lab.experiments.code import Code  # noqa: TC001 - likewise
+from lab.experiments.model import Value  # noqa: TC001 - likewise
 
 FORMAT = 1
 """Of ``manifest.json``; another number is another layout."""

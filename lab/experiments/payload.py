@@ -20,9 +20,10 @@ from lab.words import counted
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from lab.bed.system import Stage
+    from lab.bed.plan import Plan
+    from lab.bed.stage import Stage
     from lab.experiments.contenders import Contender
-    from lab.experiments.model import Measured, Plan, Results
+    from lab.experiments.model import Measured, Results
 
 _KB: Final = 1024
 SIZES: Final = {

@@ -19,9 +19,10 @@ from lab.words import counted
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from lab.bed.system import Stage
+    from lab.bed.plan import Plan
+    from lab.bed.stage import Stage
     from lab.experiments.contenders import Contender
-    from lab.experiments.model import Measured, Plan, Results
+    from lab.experiments.model import Measured, Results
 
 PAPER: Final = (10, 20, 30, 40, 50)
 """Hz; the paper's."""
@@ -113,7 +114,7 @@ class Rates:
 EXPERIMENT: Final = Rates()
 
 
-class Step:
+class RateStep:
     """One contender at one rate, over all rounds.
 
     Args:
@@ -147,10 +148,10 @@ class Step:
 
 _QUARTILES_NEED: Final = 40
 """Ten beyond each."""
-Steps = dict[int, Step]
+Steps = dict[int, RateStep]
 
 
-def widening(steps: Mapping[int, Step]) -> float | None:
+def widening(steps: Mapping[int, RateStep]) -> float | None:
     """How many times as wide the distribution is at 1 kHz as at the paper's rates (the median of theirs)."""
     base = statistics.median(steps[rate].width for rate in PAPER if rate in steps)
     width = steps[1000].width if 1000 in steps else None
@@ -176,7 +177,7 @@ def _steps(results: Results, contender: Contender, client: str) -> Steps:
     for _, measured in contender.select(results, client=client):
         arrivals, sent = measured.tables["arrivals"], measured.tables["sent"]
         for rate in sent["rate"].unique().tolist():
-            step = steps.setdefault(rate, Step())
+            step = steps.setdefault(rate, RateStep())
             step.values += latencies(arrivals, rate=rate)
             step.lost += lost(arrivals, sent, rate=rate)
     return dict(sorted(steps.items()))

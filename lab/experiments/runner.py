@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from contextlib import AbstractContextManager
 
-    from lab.bed.system import Stage
-    from lab.experiments.model import Cell, Experiment, Plan
+    from lab.bed.plan import Plan
+    from lab.bed.stage import Stage
+    from lab.experiments.model import Cell, Experiment
     from lab.experiments.store import Store
 
 LATENESS: Final = "lateness"

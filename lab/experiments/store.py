@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
     from pandas import DataFrame
 
+    from lab.bed.plan import Plan
     from lab.experiments.code import Code
-    from lab.experiments.model import Plan
 
 _MANIFEST: Final = "manifest.json"
 _LOCK: Final = ".lock"

@@ -15,9 +15,10 @@ from lab.frames import counting_from
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from lab.bed.plan import Client
     from lab.bed.processes import Process
-    from lab.bed.system import Stage
-    from lab.experiments.model import Cell, Client, Value
+    from lab.bed.stage import Stage
+    from lab.experiments.model import Cell, Value
 
 HOSTS: Final = ("joystick", "pc")
 TOPIC: Final = "/cmd"
@@ -28,7 +29,7 @@ SETTLE: Final = 0.2
 QUEUE: Final = 1000
 
 
-class Stream:
+class SteppedStream:
     """A source and a sink that are connected, and what came of their steps.
 
     Args:
@@ -64,7 +65,7 @@ class Stream:
 
 
 @contextmanager
-def stream(cell: Cell, stage: Stage, step: str, *, link: str | None = None) -> Iterator[Stream]:
+def stream(cell: Cell, stage: Stage, step: str, *, link: str | None = None) -> Iterator[SteppedStream]:
     """Set up a cell's system with a source and a sink; messages flow when it is given out."""
     client, nodelay = cast("Client", cell.settings["client"]), nodelay_of(cell)
     with stage.system(system_of(cell), HOSTS, link=link) as system:
@@ -77,4 +78,4 @@ def stream(cell: Cell, stage: Stage, step: str, *, link: str | None = None) -> I
         source = system.node("joystick", "source", client, topic=TOPIC, queue=QUEUE)
         flow.wait_connected(source)
         flow.wait_flowing(source, sink, [end], stage.scratch)
-        yield Stream(stage, source, sink, end, step)
+        yield SteppedStream(stage, source, sink, end, step)

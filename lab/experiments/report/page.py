@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
+    from lab.bed.plan import Plan
     from lab.experiments.manifest import Manifest
-    from lab.experiments.model import Plan
     from lab.experiments.report.sections import Section
     from lab.findings import Claim, Figure, Grid
 

@@ -22,7 +22,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Failure:
+class FailedCell:
     """A cell that could not be measured.
 
     Args:
@@ -57,7 +57,7 @@ class Section:
     findings: Findings
     cells: int
     waiting: int
-    failures: Sequence[Failure]
+    failures: Sequence[FailedCell]
     lateness: Sequence[float]
     images: Mapping[str, tuple[Path, Path]]
     problem: str = ""
@@ -80,7 +80,7 @@ def gather(
     Returns:
         A section with a ``problem`` where the samples cannot be read or make no sense: the others can still be told.
     """
-    failures = [Failure(record.settings, record.error) for record in store.failed(name)]
+    failures = [FailedCell(record.settings, record.error) for record in store.failed(name)]
     title, about, cells = store.manifest.titles.get(name, name), "", 0
     late: list[float] = []
     images: dict[str, tuple[Path, Path]] = {}

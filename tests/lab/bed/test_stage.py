@@ -13,20 +13,18 @@ import psutil
 import pytest
 
 from lab.bed import namespaces, ros
+from lab.bed.plan import Kind, Plan
 from lab.bed.processes import Deadline, eventually, run
 from lab.bed.stage import make_stage, why_not
-from lab.bed.system import Kind
 from lab.experiments import flow
-from lab.experiments.model import Plan
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from lab.bed.plan import Client
     from lab.bed.processes import Process
-    from lab.bed.robot import Robot
-    from lab.bed.stage import PlannedStage
-    from lab.bed.system import Stage, System
-    from lab.experiments.model import Client
+    from lab.bed.stage import Stage
+    from lab.bed.system import System
 
 pytestmark = pytest.mark.timeout(180)
 HOSTS = ["joystick", "velocity", "pc"]
@@ -43,12 +41,12 @@ of_both_kinds = pytest.mark.parametrize("kind", KINDS)
 
 
 @contextmanager
-def _system(plan: Plan, kind: Kind) -> Iterator[tuple[PlannedStage, Robot]]:
+def _system(plan: Plan, kind: Kind) -> Iterator[tuple[Stage, System]]:
     with make_stage(plan) as stage, stage.system(kind, HOSTS) as robot:
         yield stage, robot
 
 
-def _nodes(robot: Robot, stage: PlannedStage) -> tuple[Process, Process]:
+def _nodes(robot: System, stage: Stage) -> tuple[Process, Process]:
     """A source on joystick, a velocity node on its host and a sink on pc, through which messages come."""
     client: Client = stage.plan.clients[0]
     sink = robot.node("pc", "sink", client, nodelay=True)
@@ -75,8 +73,7 @@ def _children() -> set[int]:
 def test_messages_flow_and_nothing_is_left_behind(plan: Plan, kind: Kind) -> None:
     before = _children()
     with _system(plan, kind) as (stage, robot):
-        as_asked_for: tuple[Stage, System] = (stage, robot)  # mypy holds both against the protocols
-        assert as_asked_for[1].kind == kind
+        assert robot.kind == kind
         assert robot.hosts == tuple(HOSTS)
         assert robot.master == ("pc" if kind == "classic" else "")
         source, sink = _nodes(robot, stage)
@@ -133,7 +130,7 @@ def test_classic_without_its_master_takes_no_new_node_until_it_is_back(plan: Pla
             flow.wait_flowing(fresh, sink, ["/cmd"], stage.scratch)
 
 
-def _all(robot: Robot, host: str) -> list[Process]:
+def _all(robot: System, host: str) -> list[Process]:
     return [*robot._shells[host].processes, *robot._own(host)]
 
 
@@ -255,7 +252,7 @@ class TestCables:
             assert time.monotonic() - began < 30
 
 
-def _connections(robot: Robot, address: str) -> set[str]:
+def _connections(robot: System, address: str) -> set[str]:
     """The established connections of joystick to an address, as ``ss`` names them."""
     here = robot._place.host("joystick")
     shown = run(here.command(["ss", "-Htn", "state", "established", "dst", address]))

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
     import pytest
 
-    from lab.bench.contenders import Contender
+    from lab.bench.contenders import RoundTripPath
 
 
-def unstartable(_bed: Bed) -> Contender:
+def unstartable(_bed: Bed) -> RoundTripPath:
     raise Deadline("it said nothing")
 
 

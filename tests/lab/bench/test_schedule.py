@@ -9,9 +9,9 @@ import pytest
 
 from lab.bed.bench import Bed
 from lab.bench import schedule
-from lab.bench.crosstraffic import Loaded, shape
+from lab.bench.crosstraffic import LoadedScore, shape
 from lab.bench.period import Evenness, paired
-from lab.bench.schedule import Arrivals, Score, Way, parse
+from lab.bench.schedule import Arrivals, LatencyScore, Way, parse
 from lab.frames import frame
 
 if TYPE_CHECKING:
@@ -73,13 +73,13 @@ def test_throughput_counts_what_came_between_two_moments() -> None:
 
 
 def test_a_message_that_never_came_is_past_every_deadline() -> None:
-    score = Score()
+    score = LatencyScore()
     score.add(made({0: 0.5, 1: 2.0, 2: 0.5}, sent=4))
     assert score.later_than(1000.0) == 0.5
 
 
 def test_one_bad_round_does_not_move_the_median_of_rounds() -> None:
-    score = Score()
+    score = LatencyScore()
     for late in (0.3, 0.2, 900.0):
         score.add(made({0: 0.1, 1: late}))
     assert score.median_of_rounds(99.9) == 300.0
@@ -94,7 +94,7 @@ def test_deviations_are_compared_round_by_round() -> None:
 
 
 def test_images_count_while_commands_were_due() -> None:
-    score = Loaded()
+    score = LoadedScore()
     score.add_images(made(dict.fromkeys(range(10), 0.0)), made(dict.fromkeys(range(2, 8), 0.0)))
     assert score.share == pytest.approx(8 * 1024 * 1024 * 100 / 100e6)
 

@@ -7,15 +7,16 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
+from lab.bed.plan import Plan
 from lab.experiments.code import Code
-from lab.experiments.model import Cell, Measured, Plan
+from lab.experiments.model import Cell, Measured
 from lab.findings import Claim, Findings
 from lab.frames import frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from lab.bed.system import Stage
+    from lab.bed.stage import Stage
     from lab.experiments.model import Results
 
 PLAN = Plan(size="short", bed="loopback", clients=("own",), link="")

@@ -27,7 +27,7 @@ from tests.lab.experiments.fakes import FakeExperiment
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from lab.experiments.model import Plan
+    from lab.bed.plan import Plan
 
 DEADLINE = 60.0
 ROOT = Path(__file__).parents[3]

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.bed.plan import Plan
 from lab.experiments.contenders import CLASSIC, DEFAULTS, RMPA
 from lab.experiments.control import CMD, EXPERIMENT, VEL, evaluate, phases, rounds
-from lab.experiments.model import Cell, Measured, Plan, Results
+from lab.experiments.model import Cell, Measured, Results
 from lab.frames import frame
 
 if TYPE_CHECKING:

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.bed.plan import Plan
 from lab.experiments.failure import EXPERIMENT, NODES
 from lab.experiments.failure_findings import FLOWS, RATE, SCENARIOS, Fate, fates
-from lab.experiments.model import Cell, Measured, Plan, Results, Value
+from lab.experiments.model import Cell, Measured, Results, Value
 from lab.findings import Claim, Findings
 from lab.frames import frame
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from lab.bed.plan import Plan
 from lab.experiments.images import EXPERIMENT, bits, bytes_per_second
-from lab.experiments.model import Cell, Measured, Plan, Results
+from lab.experiments.model import Cell, Measured, Results
 from lab.findings import Claim, Findings
 from lab.frames import frame
 

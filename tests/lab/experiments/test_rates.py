@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.experiments.model import Cell, Measured, Plan, Results
+from lab.bed.plan import Plan
+from lab.experiments.model import Cell, Measured, Results
 from lab.experiments.rates import EXPERIMENT, PAPER
 from lab.frames import frame
 

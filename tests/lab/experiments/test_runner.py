@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from lab.bed.system import Stage
+    from lab.bed.stage import Stage
     from lab.experiments.model import Cell
 
 

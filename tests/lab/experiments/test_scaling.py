@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from lab.experiments.model import Cell, Measured, Plan, Results, Value
+from lab.bed.plan import Plan
+from lab.experiments.model import Cell, Measured, Results, Value
 from lab.experiments.scaling import EXPERIMENT
 from lab.findings import Findings
 from lab.frames import frame

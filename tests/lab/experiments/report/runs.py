@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from lab.bed.plan import Plan
 from lab.experiments.code import Code
-from lab.experiments.model import Cell, Measured, Plan, Results
+from lab.experiments.model import Cell, Measured, Results
 from lab.experiments.store import Store
 from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 from lab.frames import frame
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from lab.bed.system import Stage
+    from lab.bed.stage import Stage
 
 MACHINE = {"cpu": "Some | CPU", "cores": 2, "kernel": "6.1", "load": [0.5, 0.2, 0.1]}
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.experiments.model import Plan
+from lab.bed.plan import Plan
 from lab.experiments.report import write_report
 from rmpa.core.errors import ConfigError
 from tests.lab.experiments.report.runs import Known, Latencies, make_run
