@@ -6,6 +6,8 @@ import re
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
     from lab.findings import Claim
 
 _VERDICTS: Final = {True: "✓ reached", False: "✗ **not reached**", None: "? too few samples to say"}
@@ -78,14 +80,15 @@ def plain(text: object) -> str:
     return re.sub(r"([\\`*_\[\]<>|#])", r"\\\1", line)
 
 
-def table_row(cells: list[str]) -> str:
+def table_row(cells: Sequence[str]) -> str:
     """A row of a Markdown table."""
     kept = [re.sub(r"(?<!\\)\|", r"\\|", " ".join(cell.split())) for cell in cells]
     return f"| {' | '.join(kept)} |"
 
 
-def table(columns: list[str], rows: list[list[str]]) -> str:
+def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A Markdown table; the first column is to the left, others too if they hold anything but figures."""
+    rows = list(rows)
     figures = [at > 0 and all(_is_figure(row[at]) for row in rows) for at in range(len(columns))]
     rule = "|" + "|".join("---:" if right else "---" for right in figures) + "|"
     return "\n".join([table_row(columns), rule, *map(table_row, rows)])

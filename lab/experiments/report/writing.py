@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from lab.experiments.registry import find_experiment
-from lab.experiments.report import html, page
+from lab.experiments.report import page
 from lab.experiments.report.sections import gather
 from lab.experiments.store import Store
 from lab.figures import drawing
@@ -78,5 +78,5 @@ def _write(store: Store, folder: Path, images: Path, find: Callable[[str], Exper
         missing,
     )
     report.markdown.write_text(text, encoding="utf-8")
-    report.html.write_text(html.page(text, page.TITLE, folder), encoding="utf-8")
+    report.html.write_text(page.page(text, page.TITLE, folder), encoding="utf-8")
     return report
