@@ -6,7 +6,7 @@ from typing import Final
 
 import click
 
-from rmpa.cli.lazy import LazyGroup
+from rmpa.cli.lazy_group import LazyGroup
 
 _HERE: Final = "rmpa.cli.experiment_commands"
 
