@@ -72,7 +72,7 @@ class LanesScenario(MeshScenario):
             for other in living:
                 if other is not peer:
                     self._check_messages(other, peer)
-            for link in peer.mesh._links.values():
+            for link in peer.mesh.links():
                 assert not link.queue_bytes, f"{peer.name} has not sent all"
 
     def _check_messages(self, source: Courier, peer: Courier) -> None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.core.serial_number import SERIAL_MASK
 from rmpa.mesh import limits
 
 if TYPE_CHECKING:
@@ -78,14 +79,14 @@ def pack_data_header(length: int, route: int, sequence: int, stamp_ns: int) -> b
     if length > limits.DATA_PAYLOAD_MAX:
         raise LocalProtocolError(f"a message of {length} bytes exceeds a frame's {limits.DATA_PAYLOAD_MAX}")
     try:
-        return _pack(length, 7, 3, 0, route, sequence & 0xFFFFFFFF, stamp_ns)
+        return _pack(length, 7, 3, 0, route, sequence & SERIAL_MASK, stamp_ns)
     except struct.error as error:
         raise LocalProtocolError(f"route {route} or stamp {stamp_ns} does not fit its field: {error}") from None
 
 
 def pack_fragment_header(parcel: QueuedMessage, length: int, flags: int) -> bytes:
     """The 24 bytes in front of a fragment of ``length`` bytes; the parcel's key is the route."""
-    return _pack(length, 7, flags, 0, parcel.key, parcel.sequence & 0xFFFFFFFF, parcel.stamp_ns)
+    return _pack(length, 7, flags, 0, parcel.key, parcel.sequence & SERIAL_MASK, parcel.stamp_ns)
 
 
 def check_header(length: int, kind: int, flags: int) -> None:

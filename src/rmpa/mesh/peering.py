@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import TYPE_CHECKING, Final, Literal
 
 from rmpa.core import limits as core_limits
@@ -33,8 +34,6 @@ _log = logging.getLogger(__name__)
 Endpoint = tuple[str, int]
 
 _SLOW: Final = frozenset({Refusal.VERSION, Refusal.DOMAIN, Refusal.DUPLICATE, Refusal.MALFORMED, Refusal.LANE})
-REPLACED: Final = "replaced by a newer link"
-"""Why a link ends whose peer, the same instance, has another one in the same moment."""
 _ELSEWHERE: Final = frozenset({Refusal.MYSELF, Refusal.WRONG_PEER})
 
 
@@ -67,12 +66,31 @@ class LinkUp:
     identity: Identity
 
 
+class LinkDownCause(Enum):
+    """Why a link is not used any more; the value is the text for people."""
+
+    REPLACED = "replaced by a newer link"
+    """The same run of the peer has another link in the same moment."""
+    RESTARTED = "the peer restarted"
+    """Another run of the peer has taken its place."""
+    ENDED = "the connection ended"
+    """The connection of its express lane ended; ``LinkDown.reason`` says how."""
+
+
 @dataclass(frozen=True, slots=True)
 class LinkDown:
-    """The link that was used with this peer is gone."""
+    """The link that was used with this peer is not used any more.
+
+    Args:
+        link_id: Its number.
+        identity: The peer.
+        cause: What kind of end it was.
+        reason: Why, for people.
+    """
 
     link_id: int
     identity: Identity
+    cause: LinkDownCause
     reason: str
 
 
@@ -249,8 +267,8 @@ class Peering:
             self._outputs.append(CloseLink(link_id, "we are linked already; the lower GUID's link stays"))
             return
         if old is not None:
-            reason = REPLACED if old.identity.instance == identity.instance else "the peer restarted"
-            self._drop(peer, old, reason, close=True)
+            same_run = old.identity.instance == identity.instance
+            self._replace(peer, old, LinkDownCause.REPLACED if same_run else LinkDownCause.RESTARTED)
         if peer.identity.instance != identity.instance:
             peer.identity = identity
             peer.lower = self._ours.guid < identity.guid
@@ -279,7 +297,7 @@ class Peering:
         if peer is None or peer.link is None:
             return
         link = peer.link
-        self._drop(peer, link, reason)
+        self._drop(peer, link, LinkDownCause.ENDED, reason)
         peer.fell = now
         peer.last_error = reason
         if silent or now - link.since >= limits.LINK_STABLE:
@@ -398,7 +416,7 @@ class Peering:
         link = peer.link
         ghost = link is not None and link.identity.instance != peer.identity.instance
         if link is not None and ghost and (link.identity.guid < peer.identity.guid or not self._alive(link.id)):
-            self._drop(peer, link, "the peer restarted", close=True)
+            self._replace(peer, link, LinkDownCause.RESTARTED)
         if peer.link is None and not peer.dialling:
             self._dial_at(peer, now if peer.lower else now + limits.DIAL_FALLBACK)
 
@@ -408,12 +426,15 @@ class Peering:
             return False
         return old.dialled == (self._ours.guid < old.identity.guid)
 
-    def _drop(self, peer: _Peer, link: _LinkInfo, reason: str, *, close: bool = False) -> None:
+    def _replace(self, peer: _Peer, link: _LinkInfo, cause: LinkDownCause) -> None:
+        """Close a link that another one, or another run of the peer, takes the place of."""
+        self._outputs.append(CloseLink(link.id, cause.value))
+        self._drop(peer, link, cause, cause.value)
+
+    def _drop(self, peer: _Peer, link: _LinkInfo, cause: LinkDownCause, reason: str) -> None:
         peer.link = None
         self._by_link.pop(link.id, None)
-        if close:
-            self._outputs.append(CloseLink(link.id, reason))
-        self._outputs.append(LinkDown(link.id, link.identity, reason))
+        self._outputs.append(LinkDown(link.id, link.identity, cause, reason))
 
     def _answered(self, guid: Guid, endpoint: Endpoint | None) -> _Peer | None:
         """The peer that was dialled. Who answered at one endpoint says nothing of the others."""

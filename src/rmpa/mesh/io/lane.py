@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.core import limits as core_limits
 from rmpa.core.outbox import FIRST, LAST, Outbox, QueuedMessage
+from rmpa.core.serial_number import SERIAL_MASK
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pack_fragment_header
 
@@ -88,7 +89,7 @@ class LaneSender:
         return parcel
 
     def _parcel(self, route: int, size: int, sequence: int, stamp_ns: int) -> QueuedMessage:
-        return QueuedMessage(route, size, sequence & 0xFFFFFFFF, stamp_ns, self._loop.time())
+        return QueuedMessage(route, size, sequence & SERIAL_MASK, stamp_ns, self._loop.time())
 
     def extend(self, parcel: QueuedMessage, data: Buffer) -> int:
         """Send further bytes of a message; return as for ``send``."""

@@ -21,6 +21,7 @@ from rmpa.core.contract import Contract, Durability, Priority, Reliability
 from rmpa.core.counters import Counters
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.core.serial_number import SERIAL_HALF, SERIAL_MASK, is_earlier
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ReliableReceiver
 from rmpa.ros import limits as ros_limits
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
     from rmpa.bridge.data.qos_events import QosEvent
     from rmpa.runtime.stream import Buffer
 
-_SEQUENCE_MASK: Final = (1 << 32) - 1
-_HALF: Final = 1 << 31
 _LENGTH: Final = 4
 _NONE: Final = -1
 """No sequence is expected: none came yet, or a message in parts is under way. The next one takes the long way."""
@@ -341,7 +340,7 @@ class ImportFlow:
         if self._plain:
             if sequence != self._expected and not self._follows(sequence):
                 return
-            self._expected = sequence + 1 & _SEQUENCE_MASK
+            self._expected = sequence + 1 & SERIAL_MASK
             if self._replay is not None and self._is_replay(framed):
                 return
             age = now_ns - stamp_ns + self._time.ahead_ns
@@ -367,7 +366,7 @@ class ImportFlow:
         if self._sequence is None:
             return  # of a message that is left out
         if self._sequence != sequence:
-            if sequence - self._sequence & _SEQUENCE_MASK >= _HALF:
+            if is_earlier(sequence, self._sequence):
                 return  # of one from before, by a lane that is about to end
             raise RemoteProtocolError(f"a part of message {sequence} comes in the middle of message {self._sequence}")
         if flags & ABORT:
@@ -406,8 +405,8 @@ class ImportFlow:
 
     def _follows(self, sequence: int) -> bool:
         """The long way of a sequence: count what is missing; whether the message is not one from before."""
-        gap = sequence - (self._next if self._expected == _NONE else self._expected) & _SEQUENCE_MASK
-        if gap >= _HALF:
+        gap = sequence - (self._next if self._expected == _NONE else self._expected) & SERIAL_MASK
+        if gap >= SERIAL_HALF:
             self._was_late()
             return False
         # Half a message is here, and its lane is gone, though we have not heard of that yet.
@@ -548,7 +547,7 @@ class ImportFlow:
         """The first part of a best-effort message; whether its parts are wanted."""
         if sequence != self._expected and not self._follows(sequence):
             return False
-        self._expected = sequence + 1 & _SEQUENCE_MASK
+        self._expected = sequence + 1 & SERIAL_MASK
         if self._outlived(stamp_ns):
             return False
         if self._stale is not None:
@@ -576,7 +575,7 @@ class ImportFlow:
         parts, self._parts, self._sequence = self._parts, None, None
         now_ns = time.time_ns()
         if self._plain:
-            self._expected = sequence + 1 & _SEQUENCE_MASK
+            self._expected = sequence + 1 & SERIAL_MASK
         elif not self._accept(sequence, stamp_ns, self._size, now_ns):
             return
         if parts is not None:
@@ -595,7 +594,7 @@ class ImportFlow:
         if sequence is None:
             return
         if self._plain:
-            self._next = sequence if missing else sequence + 1 & _SEQUENCE_MASK
+            self._next = sequence if missing else sequence + 1 & SERIAL_MASK
         if self._parts is not None:
             self._parts = None
         elif self._outlet.abort() and self._on_torn is not None:

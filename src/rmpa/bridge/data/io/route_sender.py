@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from rmpa.bridge.data.downsampling import Downsampler
 from rmpa.bridge.data.lane_switch import EXPRESS, LaneSwitch
 from rmpa.core.contract import Contract, History, Reliability
+from rmpa.core.serial_number import SERIAL_MASK, is_earlier
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ReliableSender
 from rmpa.runtime import limits as runtime_limits
@@ -21,9 +22,6 @@ if TYPE_CHECKING:
 
     from rmpa.core.outbox import QueuedMessage
     from rmpa.runtime.stream import Buffer
-
-_SEQUENCE_MASK: Final = (1 << 32) - 1
-_HALF: Final = 1 << 31
 
 
 class DataLane(Protocol):
@@ -124,7 +122,7 @@ class RouteSender:
     def message(self, stamp_ns: int, framed: Buffer) -> int:
         """Send one message; return how many older ones were dropped for it."""
         if self._direct and len(framed) <= self._small:
-            self.sequence = sequence = self.sequence + 1 & _SEQUENCE_MASK
+            self.sequence = sequence = self.sequence + 1 & SERIAL_MASK
             return self._lane.send(self.route, sequence, stamp_ns, framed)
         if self._throttle is not None and not self._throttle.admit(self._loop.time()):
             self._wait_for_turn(self._throttle, stamp_ns, framed)
@@ -138,7 +136,7 @@ class RouteSender:
         """Begin a message of ``size`` bytes; whether its parts can go as they come, else give it whole."""
         if self._throttle is not None or not self._lane_for(size):
             return False
-        self.sequence = self.sequence + 1 & _SEQUENCE_MASK
+        self.sequence = self.sequence + 1 & SERIAL_MASK
         self._parcel = self._lane.open(self.route, size, self.sequence, stamp_ns)
         return True
 
@@ -178,7 +176,7 @@ class RouteSender:
     # --- inside ---------------------------------------------------------------------------------------------
 
     def _send(self, stamp_ns: int, framed: Buffer) -> int:
-        self.sequence = sequence = self.sequence + 1 & _SEQUENCE_MASK
+        self.sequence = sequence = self.sequence + 1 & SERIAL_MASK
         if self._lane_for(len(framed)):
             return self._lane.send(self.route, sequence, stamp_ns, framed)
         return self._hold(sequence, stamp_ns, bytes(framed))
@@ -336,7 +334,7 @@ class ReliableRouteSender(RouteSender):
             RemoteProtocolError: It cannot have.
         """
         known = self.sender.confirmed
-        self.sender.resume(known if after - known & _SEQUENCE_MASK >= _HALF else after)
+        self.sender.resume(known if is_earlier(after, known) else after)
         self._keep = None
         self.link, self.route = link, route
         self._switch.restart()
@@ -368,7 +366,7 @@ class ReliableRouteSender(RouteSender):
         while self.link is not None and not self._switch.fencing:
             for message in self.sender.take(1):
                 if not self._lane_for(len(message.payload)):
-                    self.sender.untake()
+                    self.sender.put_back()
                     return
                 self._lane.send(self.route, message.sequence, message.stamp_ns, message.payload)
                 break
