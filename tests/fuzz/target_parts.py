@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rmpa.bridge.data.io.flows import ImportFlow
+from rmpa.bridge.data.io.import_flow import ImportFlow
 from rmpa.bridge.data.io.link_time import LinkTime
 from rmpa.core.contract import Contract, Reliability
 from rmpa.core.errors import RemoteProtocolError

@@ -37,7 +37,8 @@ class LanesScenario(MeshScenario):
         """And topics change their lanes after a few messages."""
         with (
             super().simulated(),
-            mock.patch("rmpa.bridge.data.io.flows.time", self.world),
+            mock.patch("rmpa.bridge.data.io.export_flow.time", self.world),
+            mock.patch("rmpa.bridge.data.io.import_flow.time", self.world),
             mock.patch.multiple(limits, EXPRESS_AGAIN_MESSAGES=3, EXPRESS_AGAIN_AFTER=0.1),
         ):
             yield

@@ -10,7 +10,8 @@ import json
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.bridge.data.io.flows import ExportFlow, ImportFlow
+from rmpa.bridge.data.io.export_flow import ExportFlow
+from rmpa.bridge.data.io.import_flow import ImportFlow
 from rmpa.bridge.data.io.link_time import LinkTime
 from rmpa.bridge.data.io.route_sender import ReliableRouteSender
 from rmpa.core.contract import Contract, Priority, Reliability

@@ -325,5 +325,7 @@ def made_up(loop: VirtualLoop) -> Iterator[None]:
         stack.enter_context(
             mock.patch("rmpa.bridge.topics.io.local_subscriptions.PublisherConnection", PublisherConnection)
         )
-        stack.enter_context(mock.patch("rmpa.bridge.data.io.flows.time", SimpleNamespace(time_ns=loop.time_ns)))
+        for flow in ("export_flow", "import_flow"):
+            wall = SimpleNamespace(time_ns=loop.time_ns)
+            stack.enter_context(mock.patch(f"rmpa.bridge.data.io.{flow}.time", wall))
         yield

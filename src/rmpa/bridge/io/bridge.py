@@ -59,7 +59,7 @@ from rmpa.runtime.event_loop import yield_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rmpa.bridge.data.io.flows import ExportFlow
+    from rmpa.bridge.data.io.export_flow import ExportFlow
     from rmpa.bridge.data.qos_events import QosEvent
     from rmpa.bridge.relay import Place
     from rmpa.bridge.session.part import DataHandler, Part

@@ -7,7 +7,7 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.data.io.flows import ExportFlow
+from rmpa.bridge.data.io.export_flow import ExportFlow
 from rmpa.bridge.data.io.route_sender import ReliableRouteSender
 from rmpa.bridge.data.losses import LossRecords
 from rmpa.bridge.messages import Description, Source
