@@ -6,7 +6,7 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, ConnectionState, Event, HelloReceived
+from rmpa.mesh.connection import ConnectionEvent, ConnectionProtocol, ConnectionRole, ConnectionState, HelloReceived
 from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pong
 from rmpa.mesh.handshake import Hello, Refuse
 
@@ -62,11 +62,11 @@ def fuzz(data: bytes) -> None:
 
 def _feed(role: ConnectionRole, pieces: list[bytes]) -> tuple[str, int, int, list[list[object]]]:
     """What the link says and how it ends; of parts, what they are put together."""
-    events: list[Event] = []
+    events: list[ConnectionEvent] = []
     parts: list[list[object]] = []
     data = 0
 
-    def on_event(event: Event) -> None:
+    def on_event(event: ConnectionEvent) -> None:
         events.append(event)
         if isinstance(event, HelloReceived):
             link.accept(0.0)

@@ -19,7 +19,7 @@ from tests.simulation.network import World
 from tests.simulation.process import Process
 
 if TYPE_CHECKING:
-    from rmpa.mesh.connection import Event
+    from rmpa.mesh.connection import ConnectionEvent
 
 _OURS = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")
 _THEIRS = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")
@@ -100,7 +100,7 @@ def _fuzz(data: bytes) -> None:
     flow = ImportFlow(subscribers, contract, LinkTime(), on_ack=acknowledged.append)
     flow.begin_epoch(int(reliable), 1)
 
-    def on_event(event: Event) -> None:
+    def on_event(event: ConnectionEvent) -> None:
         if isinstance(event, HelloReceived):
             link.accept(0.0)
 

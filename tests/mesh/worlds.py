@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, ConnectionState, Event
+from rmpa.mesh.connection import ConnectionEvent, ConnectionProtocol, ConnectionRole, ConnectionState
 from rmpa.mesh.handshake import Lane
 
 LOW = Identity(Guid.of("10.0.0.1", 40001, 1), b"L" * 16, "low")
@@ -21,11 +21,11 @@ class Side:
     """One link machine and what it said."""
 
     link: ConnectionProtocol
-    events: list[Event] = field(default_factory=list)
+    events: list[ConnectionEvent] = field(default_factory=list)
     data: list[tuple[int, int, int, bytes]] = field(default_factory=list)
     parts: list[tuple[int, int, int, int, bytes]] = field(default_factory=list)
 
-    def last(self) -> Event:
+    def last(self) -> ConnectionEvent:
         return self.events[-1]
 
     def messages(self) -> list[tuple[int, int, int, bytes]]:
@@ -75,7 +75,7 @@ def side(
     lease: float = 1.0,
     lane: Lane = Lane.EXPRESS,
 ) -> Side:
-    events: list[Event] = []
+    events: list[ConnectionEvent] = []
     data: list[tuple[int, int, int, bytes]] = []
     parts: list[tuple[int, int, int, int, bytes]] = []
     link = ConnectionProtocol(

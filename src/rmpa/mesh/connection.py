@@ -184,8 +184,10 @@ class MarkReceived:
     sequence: int
 
 
-Event = HelloReceived | HandshakeDone | ControlReceived | PongReceived | MarkReceived | Refused | ConnectionClosed
-OnEvent = Callable[[Event], None]
+ConnectionEvent = (
+    HelloReceived | HandshakeDone | ControlReceived | PongReceived | MarkReceived | Refused | ConnectionClosed
+)
+OnEvent = Callable[[ConnectionEvent], None]
 OnData = Callable[[int, int, int, memoryview], None]
 OnPart = Callable[[int, int, int, int, memoryview], None]
 

@@ -14,11 +14,11 @@ from rmpa.core.serial_number import SERIAL_MASK
 from rmpa.mesh import limits
 from rmpa.mesh.connection import (
     ConnectionClosed,
+    ConnectionEvent,
     ConnectionProtocol,
     ConnectionRole,
     ConnectionState,
     ControlReceived,
-    Event,
     HandshakeDone,
     HelloReceived,
     MarkReceived,
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from rmpa.core.guid import Guid
     from rmpa.core.identity import Identity
     from rmpa.mesh.connection import OnData, OnPart
-    from rmpa.mesh.handshake import Hello, Refuse, Verdict
+    from rmpa.mesh.handshake import Hello, Refuse
     from rmpa.mesh.timing import LinkClock
 
     OnMark = Callable[[FrameKind, int, int], None]
@@ -59,7 +59,7 @@ _ANSWERED: Final = -1
 class ConnectionOwner(Protocol):
     """What a connection tells the mesh; all methods are called from the event loop."""
 
-    def connection_judge(self, connection: Connection, hello: Hello) -> Verdict:
+    def connection_judge(self, connection: Connection, hello: Hello) -> Refuse | None:
         """Decide on the hello of a dialler: ``None`` accepts the connection."""
         ...
 
@@ -324,7 +324,7 @@ class Connection:
             self._send_output()
         return taken
 
-    def _event(self, event: Event) -> None:
+    def _event(self, event: ConnectionEvent) -> None:
         if isinstance(event, ControlReceived):
             self._owner.connection_control(self, event.payload)
         elif isinstance(event, MarkReceived):
@@ -419,5 +419,5 @@ def _ignore_mark(_kind: FrameKind, _route: int, _sequence: int) -> None:
     """Leaves a fence without an answer, because the messages before it were dropped."""
 
 
-def _ignore_event(_event: Event) -> None:
+def _ignore_event(_event: ConnectionEvent) -> None:
     """Drops what the machine of a connection that has ended still says."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from rmpa.config.settings import LaneSettings
     from rmpa.core.counters import Counters
-    from rmpa.mesh.peering import Endpoint
+    from rmpa.mesh.peering import SocketAddress
 
 
 class Dialler:
@@ -35,7 +35,9 @@ class Dialler:
         self._counters = counters
         self._attempts: set[asyncio.Task[socket.socket]] = set()
 
-    async def connect(self, endpoint: Endpoint, lane: Lane, within: float = limits.DIAL_TIMEOUT) -> socket.socket:
+    async def connect(
+        self, endpoint: SocketAddress, lane: Lane, within: float = limits.DIAL_TIMEOUT
+    ) -> socket.socket:
         """Connect once, for one lane.
 
         Raises:
@@ -54,11 +56,11 @@ class Dialler:
             raise
         return sock
 
-    async def dial(self, endpoints: Sequence[Endpoint]) -> tuple[socket.socket, Endpoint]:
+    async def dial(self, endpoints: Sequence[SocketAddress]) -> tuple[socket.socket, SocketAddress]:
         """Connect for the express lane where a peer answers first; raises as ``_race``."""
         return await self._race(endpoints, self._connect_repeatedly)
 
-    async def redial(self, endpoints: Sequence[Endpoint]) -> tuple[socket.socket, Endpoint]:
+    async def redial(self, endpoints: Sequence[SocketAddress]) -> tuple[socket.socket, SocketAddress]:
         """The same with one short attempt at each endpoint, for a peer that was linked until now."""
         return await self._race(endpoints, self._connect_briefly)
 
@@ -68,10 +70,10 @@ class Dialler:
             task.cancel()
         return list(self._attempts)
 
-    async def _connect_briefly(self, endpoint: Endpoint) -> socket.socket:
+    async def _connect_briefly(self, endpoint: SocketAddress) -> socket.socket:
         return await self.connect(endpoint, Lane.EXPRESS, limits.REDIAL_TIMEOUT)
 
-    async def _connect_repeatedly(self, endpoint: Endpoint) -> socket.socket:
+    async def _connect_repeatedly(self, endpoint: SocketAddress) -> socket.socket:
         """Connect; a lost SYN is repeated by new attempts, because TCP waits a second."""
         *short, last = limits.DIAL_ATTEMPTS
         for within in short:
@@ -80,8 +82,10 @@ class Dialler:
         return await self.connect(endpoint, Lane.EXPRESS, last)
 
     async def _race(
-        self, endpoints: Sequence[Endpoint], attempt: Callable[[Endpoint], Coroutine[object, object, socket.socket]]
-    ) -> tuple[socket.socket, Endpoint]:
+        self,
+        endpoints: Sequence[SocketAddress],
+        attempt: Callable[[SocketAddress], Coroutine[object, object, socket.socket]],
+    ) -> tuple[socket.socket, SocketAddress]:
         """Connect to the endpoint that answers first (RFC 8305).
 
         The next endpoint has its turn when the one before it failed, or was silent for ``limits.DIAL_STAGGER``.
@@ -92,7 +96,7 @@ class Dialler:
         left = list(endpoints)
         if len(left) == 1:
             return await attempt(left[0]), left[0]
-        running: dict[asyncio.Task[socket.socket], Endpoint] = {}
+        running: dict[asyncio.Task[socket.socket], SocketAddress] = {}
         first: OSError | None = None
         try:
             while left or running:

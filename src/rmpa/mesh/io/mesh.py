@@ -28,8 +28,8 @@ from rmpa.mesh.peering import (
     LinkDownCause,
     LinkRefused,
     LinkUp,
-    Output,
     Peering,
+    PeeringOutput,
     PeerStatus,
 )
 from rmpa.runtime import limits as runtime_limits
@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from rmpa.core.clock import Clock
     from rmpa.core.guid import Guid
     from rmpa.core.identity import Identity
-    from rmpa.mesh.handshake import Hello, Refuse, Verdict
-    from rmpa.mesh.peering import Endpoint
+    from rmpa.mesh.handshake import Hello, Refuse
+    from rmpa.mesh.peering import SocketAddress
 
 _log = logging.getLogger(__name__)
 
@@ -185,7 +185,7 @@ class Mesh:
 
     # --- events of connections (ConnectionOwner) ------------------------------------------------------------
 
-    def connection_judge(self, connection: Connection, hello: Hello) -> Verdict:  # noqa: ARG002 - the protocol's form
+    def connection_judge(self, connection: Connection, hello: Hello) -> Refuse | None:  # noqa: ARG002 - the protocol's form
         """Decide on a hello; the peering machine knows the links that are up."""
         return self._peering.judge(hello)
 
@@ -298,7 +298,7 @@ class Mesh:
         if self._running:
             self._timer.arm()
 
-    def _do(self, output: Output, ended: PeerLink | None) -> None:
+    def _do(self, output: PeeringOutput, ended: PeerLink | None) -> None:
         match output:
             case Dial():
                 if self._running:
@@ -435,7 +435,7 @@ class Mesh:
         sock.close()
         return True
 
-    def _endpoints(self, link: PeerLink) -> list[Endpoint]:
+    def _endpoints(self, link: PeerLink) -> list[SocketAddress]:
         """Where the peer of a link may be reached."""
         return list(dict.fromkeys([link.remote_endpoint, *self._peering.endpoints(link.guid)]))
 
@@ -443,7 +443,7 @@ class Mesh:
         self,
         sock: socket.socket,
         role: ConnectionRole,
-        endpoint: Endpoint,
+        endpoint: SocketAddress,
         expected: Guid | None = None,
         lane: Lane = Lane.EXPRESS,
     ) -> None:
@@ -465,7 +465,7 @@ class Mesh:
             segment=self.paths.segment(endpoint[0]),
         )
 
-    def _accepted(self, sock: socket.socket, address: Endpoint) -> None:
+    def _accepted(self, sock: socket.socket, address: SocketAddress) -> None:
         if not self._has_room(address[0]):
             sock.close()
             return
