@@ -13,7 +13,7 @@ from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.mesh import limits
 from rmpa.mesh.handshake import Hello, Refusal, Refuse
-from rmpa.mesh.peering import CloseLink, Dial, LinkDown, LinkDownCause, LinkRefused, LinkUp, Output, Peering
+from rmpa.mesh.peering import CloseLink, Dial, LinkDown, LinkDownCause, LinkRefused, LinkUp, Peering, PeeringOutput
 from tests.mesh.worlds import HIGH, LOW
 
 DUAL = replace(HIGH, addresses=(IPv4Address("192.168.0.2"),))
@@ -24,7 +24,7 @@ def of(ours: Identity, *, alive: bool = True) -> Peering:
     return Peering(ours, rng=lambda: 0.999999, alive=lambda _: alive)
 
 
-def dials(outputs: list[Output]) -> list[tuple[str, int]]:
+def dials(outputs: list[PeeringOutput]) -> list[tuple[str, int]]:
     return [o.endpoints[0] for o in outputs if isinstance(o, Dial)]
 
 

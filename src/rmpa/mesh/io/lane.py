@@ -46,7 +46,7 @@ class LaneSender:
         stream.adopt(self.outbox, pack_fragment_header)
 
     def disconnect(self) -> int:
-        """The connection is gone; return how many messages were cut in the middle, those in the kernel not counted."""
+        """The connection is gone; return how many messages were cut in two, those in the kernel not counted."""
         self._stream = None
         for parcel in self._open.values():
             if 0 < parcel.sent < parcel.size:
