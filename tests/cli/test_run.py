@@ -143,7 +143,7 @@ def agent_of(run: Process) -> psutil.Process:
     return agent
 
 
-def test_a_file_with_an_agent_of_its_own_works_and_ends_in_order(ground: Ground) -> None:
+def test_a_file_runs_with_its_own_agent_and_ends_in_order(ground: Ground) -> None:
     run = ground.run(HEAD + TALK, "--set", "volume=7")
     run.wait_for(f"nose: active on {ground.uri}", 60)
     agent = agent_of(run)
@@ -197,7 +197,7 @@ def test_a_bad_file_leaves_no_agent(ground: Ground) -> None:
     assert ground.place.run("peer", "list")[0] != 0, "no agent is left"
 
 
-def test_what_raises_harms_nobody_and_what_crashes_ends_in_order(ground: Ground) -> None:
+def test_exceptions_are_contained_and_a_crash_ends_in_order(ground: Ground) -> None:
     moody = TALK + '@nose.task(rate="2 Hz")\ndef sulk():\n    if volume.value == 5: raise OSError("no air")\n'
     crash = '@nose.task(rate="2 Hz", name="crash")\ndef crash():\n    if os.path.exists("now"): os.abort()\n'
     text = HEAD + moody + crash.replace('"now"', repr(str(ground.place.path / "now")))

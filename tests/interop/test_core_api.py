@@ -338,7 +338,7 @@ async def test_answers_and_callbacks_are_those_of_rosmaster(shell: ShellFactory)
 
 
 @pytest.mark.trap(33)
-async def test_a_parameter_kills_the_newer_node_at_rosmaster_and_not_at_ours(shell: ShellFactory) -> None:
+async def test_a_parameter_kills_the_newer_node_only_at_rosmaster(shell: ShellFactory) -> None:
     """The one difference by intent: what a pushed-out roscpp node does while it ends must not hit its successor."""
     real = shell(port=free_port())
     real.master()

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
 
-def test_killed_agent_is_retracted_and_its_nodes_go_on_among_themselves(modules: ModuleFactory) -> None:
+def test_a_killed_agent_is_retracted_and_its_nodes_go_on(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     a.ros.roscpp("talker", topic="/chatter", rate=100)
     at_home = a.ros.roscpp("listener", topic="/chatter")
@@ -29,7 +29,7 @@ def test_killed_agent_is_retracted_and_its_nodes_go_on_among_themselves(modules:
     assert (report["gaps"], report["doubled"]) == (0, 0)
 
 
-def test_restarted_agent_with_its_core_serves_new_nodes_and_its_peer_hears_them(modules: ModuleFactory) -> None:
+def test_a_restarted_agent_serves_new_nodes_and_its_peer(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     a.ros.roscpp("talker", "__name:=before", topic="/chatter", rate=100)
     abroad = b.ros.roscpp("listener", topic="/chatter")

@@ -66,7 +66,7 @@ def test_all_latched_sources_reach_each_late_joiner_once(
         once(last(listener))
 
 
-def test_who_has_a_latched_message_does_not_get_it_again_when_the_link_is_back(modules: ModuleFactory) -> None:
+def test_a_latched_message_is_not_repeated_when_the_link_is_back(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     for kind, source, size in (("rospy", 1, 300), ("roscpp", 2, 2_000_000)):
         a.ros.node(kind, "talker", topic=TF, count=1, latch=True, source=source, size=size).wait_event("done")

@@ -128,7 +128,7 @@ def test_the_file_says_how_much_of_it(agent: AgentFactory) -> None:
 
 
 @needs_root
-def test_root_without_the_capabilities_is_told_and_the_agent_runs_on(agent: AgentFactory) -> None:
+def test_root_without_capabilities_gets_a_warning(agent: AgentFactory) -> None:
     if not runs(WITHOUT_RIGHTS):
         pytest.skip("capabilities cannot be dropped here")
     made = agent(Prefixed("bare", "", prefix=WITHOUT_RIGHTS), flags=["--realtime"])

@@ -89,7 +89,7 @@ def runs(node: Process, profile: str, since: int = 0) -> None:
     node.wait_event("profile", LONG, where=lambda e: e["name"] == profile, since=since)
 
 
-def test_a_degraded_link_is_adapted_to_and_what_cannot_be_is_said(pair: tuple[Running, Running]) -> None:
+def test_a_resource_adapts_to_a_degraded_link(pair: tuple[Running, Running]) -> None:
     camera, viewer = pair
     camera.start()
     viewer.start()

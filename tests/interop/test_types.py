@@ -63,7 +63,7 @@ def hears(module: Module, topic: str, text: str, env: dict[str, str]) -> None:
     assert re.search(text, echo.output), echo.output
 
 
-def test_a_computer_without_the_package_works_with_the_robots_types(modules: ModuleFactory, tmp_path: Path) -> None:
+def test_types_of_the_robot_work_without_its_package(modules: ModuleFactory, tmp_path: Path) -> None:
     robot, pc = modules("robot", "pc")
     env = workspace(tmp_path / "ws")
     said = "{header: auto, poses: [{x: 1.5, name: dock}]}"
