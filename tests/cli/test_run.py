@@ -90,7 +90,7 @@ def test_a_parameter_that_cannot_be_given_is_refused(
 
 
 class Ground:
-    """Runs files and agents on this machine's loopback, and sees what of them is left."""
+    """Runs files and agents on this machine's loopback, and checks what they leave behind."""
 
     def __init__(self, place: Place) -> None:
         self.place = place
@@ -114,7 +114,7 @@ class Ground:
         return self.rmpa("run", str(path), *words, *(("--", *self.options) if options else ()))
 
     def hears(self, volume: str) -> None:
-        """Wait until a node of this core hears what the resource says."""
+        """Wait until a node of this core receives the resource's messages."""
 
         def echo() -> bool:
             code, out, _ = self.place.run("topic", "echo", "/nose/words", "-n", "1", "--json", "--master", self.uri)
@@ -129,7 +129,7 @@ def ground(place: Place) -> Iterator[Ground]:
     yield one
     for process in one.started:
         process.end()
-    # An agent of ours is in a session of its own; by its port it is known, whoever its parent is now.
+    # The agent is in a session of its own and may have another parent by now: it is found by its port.
     left = [p for p in psutil.process_iter(["cmdline"]) if str(one.port) in (p.info["cmdline"] or [])]
     _, alive = psutil.wait_procs(left, timeout=20)
     for orphan in alive:

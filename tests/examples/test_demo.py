@@ -261,7 +261,7 @@ def test_a_killed_demo_leaves_no_children_and_no_files(tidy: dict[str, str]) -> 
         os.kill(demo.pid, signal.SIGKILL)
         assert demo.wait() == -signal.SIGKILL
     assert_gone(processes, ports)
-    assert len(list(Path(tidy["TMPDIR"]).iterdir())) == 1, "nobody was left to remove it"
+    assert len(list(Path(tidy["TMPDIR"]).iterdir())) == 1, "no process was left to remove it"
     with Process([sys.executable, DEMO, "kill", "base"], env=tidy) as kill:
         assert kill.wait() == 1
         assert "no demo runs here" in kill.output

@@ -66,7 +66,7 @@ def fed_in_order(client: Process, goal: int, *, connected: bool, since: int = 0)
 
 
 def client_in(module: Module, kind: str, name: str = "client") -> Process:
-    """An action client that is told what to do."""
+    """An action client that follows the commands of a test."""
     return module.ros.node(kind, "action_client", name=name, commands=True)
 
 

@@ -97,7 +97,7 @@ def test_a_bad_link_keeps_the_peer_and_a_lost_one_comes_back(modules: ModuleFact
     assert "= - publisher /chatter" not in b.agent.process.output, "it came and went"
     for _ in range(2):
         b.host.outage(3.0)
-        flows(heard, 30)  # by the same listener: nobody started anything again
+        flows(heard, 30)  # by the same listener: nothing was restarted
     assert "= - publisher /chatter" in b.agent.process.output
     assert list(b.agent.peers()) == ["a"]
 

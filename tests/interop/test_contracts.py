@@ -1,4 +1,4 @@
-"""What ``rmpa.toml`` says of topics holds between real nodes, and what was broken is seen by the CLI."""
+"""Contracts of ``rmpa.toml`` hold between real nodes, and the commands show what breaks them."""
 
 from __future__ import annotations
 

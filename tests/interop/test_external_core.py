@@ -96,7 +96,9 @@ def test_a_new_node_is_seen_within_a_second_and_a_dead_one_hidden(joined: Callab
     talker.kill()
     # The listener's subscription to the proxy goes with the proxy: only then is the topic's last name gone there.
     eventually(lambda: "/rmpa/a/talker" not in b.ros.tool("rostopic", "info", "/chatter"), what="no proxy at b")
-    assert "/chatter" in a.topics(), "rosmaster keeps what nobody unregisters, and it is not ours to change"
+    assert "/chatter" in a.topics(), (
+        "rosmaster keeps registrations until they are removed, and these are not the agent's"
+    )
 
 
 def test_flows_outlive_the_roscore_and_the_next_one_gets_our_nodes(joined: Callable[..., Joined]) -> None:

@@ -1,4 +1,4 @@
-"""Agents, nodes, cores and cables fail; everything else goes on, and what comes back is found again."""
+"""Agents, nodes, cores and cables fail; everything else goes on, and a returning part is found again."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_killed_listener_ends_the_demand(modules: ModuleFactory) -> None:
     assert "Subscribers: None" not in a.ros.tool("rostopic", "info", "/chatter")
     heard.kill()
     eventually(
-        lambda: "Subscribers: None" in a.ros.tool("rostopic", "info", "/chatter"), what="nobody listens to the talker"
+        lambda: "Subscribers: None" in a.ros.tool("rostopic", "info", "/chatter"), what="the talker has no listener"
     )
 
 
@@ -169,7 +169,7 @@ def test_mismatched_types_are_refused_loudly_on_both_sides(modules: ModuleFactor
 
 
 def _wait_no_publisher(module: Module, topic: str) -> None:
-    """Wait until nobody publishes a topic in a module's graph (a listener there may keep its name alive)."""
+    """Wait until a topic has no publisher in a module's graph (a listener there may keep its name alive)."""
 
     def gone() -> bool:
         with module.ros.start("rostopic", "info", topic) as info:

@@ -1,4 +1,4 @@
-"""Messages of tens of megabytes between real nodes: each byte right, and never a half one, whoever dies meanwhile."""
+"""Messages of tens of megabytes between real nodes: each byte right, and never half a message, whichever process dies meanwhile."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who comes later finds what is there, whatever the order of agents and nodes."""
+"""Late agents and nodes find the earlier ones, in any order of starting."""
 
 from __future__ import annotations
 

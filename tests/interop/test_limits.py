@@ -1,4 +1,4 @@
-"""Limits with real nodes and stock tools: what is beyond them is told, and nothing else suffers."""
+"""Limits with real nodes and stock tools: what exceeds them is reported, and nothing else is affected."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def mismatches(module: Module) -> list[str]:
 
 
 def mended(module: Module) -> None:
-    """Wait until nothing is said any more."""
+    """Wait until the mismatch is no longer reported."""
     eventually(lambda: not mismatches(module), what=f"nothing wrong at {module.name}")
 
 

@@ -1,4 +1,4 @@
-"""What the agent measures of topics that cross, between real nodes; and what the stock tools read of it."""
+"""The agent's figures of topics between real nodes, and the stock tools' view of them."""
 
 from __future__ import annotations
 

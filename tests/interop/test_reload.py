@@ -1,4 +1,4 @@
-"""Settings that are read again while data flows: what they are about changes, and nothing else notices."""
+"""Settings that are read again while data flows: only what they concern changes."""
 
 from __future__ import annotations
 

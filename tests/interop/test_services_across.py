@@ -49,7 +49,7 @@ def _caller(module: Module, kind: str, service: str, **options: object) -> Proce
 
 
 def _calls(caller: Process, line: str, timeout: float = 20.0) -> Event:
-    """Let a caller make calls as of its line; what came of them."""
+    """Make a caller make the calls of its line, and return the outcomes."""
     since = caller.mark_events()
     caller.tell(line)
     return caller.wait_event("done", timeout, since=since)

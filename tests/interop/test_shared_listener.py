@@ -62,7 +62,7 @@ class Proxy:
         self.node.add_publication(self.publication)
 
     async def appear(self, subscribers: int) -> None:
-        """Be in the graph, and wait for who listens."""
+        """Register in the graph, and wait for subscribers."""
         await self.node.start()
         self._core.call("registerPublisher", "/proxy", "/chatter", BYTES, self.node.uri)
         async with asyncio.timeout(DEADLINE):

@@ -41,7 +41,7 @@ def linked(module: Module) -> set[str]:
 def test_one_seed_and_gossip_join_two_networks_behind_a_router(
     lab: Lab, agent: AgentFactory, shell: ShellFactory
 ) -> None:
-    """Only ``a`` knows one address of the other side; when that one is gone, who starts is still found by all."""
+    """Only ``a`` knows one address of the other side; when that one is gone, new agents are still found by all."""
     router = lab.router(0, 1)
     hosts = {name: lab.host(name, network) for name, network in (("a", 0), ("b", 0), ("c", 1), ("d", 1))}
     for host in hosts.values():
@@ -69,7 +69,7 @@ def test_one_seed_and_gossip_join_two_networks_behind_a_router(
 
 
 def test_a_peer_is_reached_by_its_remaining_cable(lab: Lab, agent: AgentFactory, shell: ShellFactory) -> None:
-    """Two modules share two networks; each cable in turn is out, and what is reliable loses nothing."""
+    """Two modules share two networks; each cable in turn is out, and reliable topics lose nothing."""
     config = '[[contract]]\ntopics = ["/chatter"]\nreliability = "reliable"\ndepth = 2000\n'
     hosts = [lab.host(name, 0, 1) for name in ("a", "b")]
     a, b = (Module(host, agent(host, name=host.name, config=config), shell(host)) for host in hosts)

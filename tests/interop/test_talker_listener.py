@@ -1,4 +1,4 @@
-"""The main job: a node publishes on one machine, a node receives on another, and nobody configured an address."""
+"""The main job: a node publishes on one machine, a node receives on another, without a configured address."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def test_types_of_the_robot_work_without_its_package(modules: ModuleFactory, tmp
     assert code == 1
     assert "message type my_msgs/Path: is not known here; looked in ROS_PACKAGE_PATH (not set)" in output
 
-    # A file of the computer waits until somebody, here or at a peer, publishes the type.
+    # A file on the computer waits until a node, here or at a peer, publishes the type.
     file = tmp_path / "twice.py"
     file.write_text(TWICE)
     resource = pc.ros.start(RMPA, "run", file, "--master", pc.ros.uri, "--no-state", env=pc.agent.env)

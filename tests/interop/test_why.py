@@ -1,4 +1,4 @@
-"""``rmpa why`` and ``rmpa doctor`` between real nodes on several hosts: what only those can bring about."""
+"""``rmpa why`` and ``rmpa doctor`` between real nodes on several hosts: the cases that need those."""
 
 from __future__ import annotations
 
