@@ -97,7 +97,7 @@ def test_a_new_node_is_seen_within_a_second_and_a_dead_one_hidden(joined: Callab
     # The listener's subscription to the proxy goes with the proxy: only then is the topic's last name gone there.
     eventually(lambda: "/rmpa/a/talker" not in b.ros.tool("rostopic", "info", "/chatter"), what="no proxy at b")
     assert "/chatter" in a.topics(), (
-        "rosmaster keeps registrations until they are removed, and these are not the agent's"
+        "rosmaster keeps registrations, and these are not the agent's"
     )
 
 

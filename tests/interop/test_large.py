@@ -1,4 +1,4 @@
-"""Messages of tens of megabytes between real nodes: each byte right, and never half a message, whichever process dies meanwhile."""
+"""Messages of tens of megabytes between real nodes: whole, or not at all if a process dies."""
 
 from __future__ import annotations
 

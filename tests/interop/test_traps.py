@@ -295,7 +295,7 @@ def test_many_remote_listeners_are_one_connection_to_a_rospy_talker(
 @pytest.mark.trap(14)
 @libraries
 def test_a_listener_stays_when_another_node_takes_the_talkers_name(two: Two, library: str) -> None:
-    """Its header differs (it latches), so the subscribers must be disconnected; rospy reconnects only when notified."""
+    """Its header differs (it latches), so subscribers must be disconnected; rospy reconnects only when notified."""
     heard = two.at_b.node(library, "listener")
     older = two.at_a.roscpp("talker", "__name:=speaker", rate=100)
     flows(heard)
