@@ -60,7 +60,7 @@ def refuse(load: Load, tmp_path: Path) -> Refuse:
     return refuse
 
 
-def test_nothing_given_gives_the_defaults_and_the_host_name(load: Load) -> None:
+def test_defaults_and_the_host_name_without_any_source(load: Load) -> None:
     assert load(host_name="my-robot.local").settings == Settings(name="my_robot")
 
 
@@ -207,7 +207,7 @@ def test_every_flag(load: Load) -> None:
     )
 
 
-def test_an_external_core_is_that_of_ROS_MASTER_URI_or_another_one_that_is_named(load: Load) -> None:  # noqa: N802
+def test_external_core_is_ROS_MASTER_URI_unless_named(load: Load) -> None:  # noqa: N802
     environ = {"ROS_MASTER_URI": "http://robot:11312", "RMPA_CORE": "external"}
     loaded = load(environ=environ)
     assert loaded.settings == Settings(name="base", core_mode="external", core_master="http://robot:11312")
@@ -218,7 +218,7 @@ def test_an_external_core_is_that_of_ROS_MASTER_URI_or_another_one_that_is_named
     assert loaded.notes == ()
 
 
-def test_what_does_not_fit_the_kind_of_core_is_told(load: Load) -> None:
+def test_settings_of_the_other_kind_of_core_are_reported(load: Load) -> None:
     with pytest.raises(ConfigError, match=r"--master: is of no use with the embedded core; .*--core external"):
         load(options={"master": "http://h:1/"})
     with pytest.raises(ConfigError, match=r"'robot:11311' is not a master's URI.*did you mean .*http://robot:11311/"):
@@ -428,7 +428,7 @@ def test_a_flag_outweighs_realtime_of_the_variable_and_of_the_file(load: Load) -
     assert load(text, environ={"RMPA_REALTIME": "1"}, options=options).settings.realtime == RealtimeSettings(False, 7)
 
 
-def test_a_mistake_in_the_file_is_told_even_where_a_flag_outweighs_it(refuse: Refuse) -> None:
+def test_file_mistake_is_reported_although_an_option_overrides_it(refuse: Refuse) -> None:
     assert refuse("domain = 999", options={"domain": "1"}).startswith("rmpa.toml:1: domain: 999")
 
 
@@ -515,7 +515,7 @@ def test_where_the_file_is_looked_for(tmp_path: Path) -> None:
     assert find_config_file(str(place("flag.toml")), environ, cwd, []) == tmp_path / "flag.toml"
 
 
-def test_a_place_that_this_user_may_not_look_into_counts_as_empty_and_is_told_of(
+def test_unreadable_directory_counts_as_empty_and_is_noted(
     load: Load, refuse: Refuse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = Path.is_file
@@ -580,7 +580,7 @@ def test_limits_come_from_variables_too_and_are_positive(load: Load, refuse: Ref
     assert "did you mean limits.nodes?" in refuse("[limits]\nnode = 1")
 
 
-def test_more_followed_parameters_than_their_limit_are_refused_with_it(load: Load, refuse: Refuse) -> None:
+def test_too_many_followed_parameters_are_refused(load: Load, refuse: Refuse) -> None:
     rules = "".join(f'[[param]]\nkey = "/a{n}"\nfrom = "arm"\n' for n in range(3))
     assert "3 rules, more than limits.params = 2; raise that" in refuse(f"{rules}[limits]\nparams = 2\n")
     assert len(load(f"{rules}[limits]\nparams = 3\n").settings.params.follow) == 3

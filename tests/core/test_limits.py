@@ -131,7 +131,7 @@ def test_each_row_has_the_codes_figure(row: Row) -> None:
 
 
 @pytest.mark.parametrize("row", rows(), ids=lambda row: row.name)
-def test_each_row_says_what_happens_and_names_settings_that_there_are(row: Row) -> None:
+def test_each_row_names_existing_settings(row: Row) -> None:
     assert row.happens not in ("", _NONE), f"line {row.line}: what happens at it?"
     assert row.told, f"line {row.line}: where is it told? ({_NONE} for nowhere)"
     known = {".".join(key) for key in SCHEMAS}

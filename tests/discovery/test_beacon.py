@@ -91,7 +91,7 @@ def test_another_domain_is_told_first() -> None:
         Beacon.parse(GOLDEN[:4] + b"\x02" + GOLDEN[5:8], 6)
 
 
-def test_another_version_is_told_from_eight_bytes_and_says_what_to_do() -> None:
+def test_other_version_is_recognised_by_eight_bytes() -> None:
     with pytest.raises(
         BeaconOtherVersion, match="speaks version 2 of the protocol, we speak 1: update the older one"
     ):

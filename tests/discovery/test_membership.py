@@ -88,7 +88,7 @@ def unicasts(outputs: list[Output], kind: BeaconKind) -> list[tuple[str, int]]:
     return [o.address for o in outputs if isinstance(o, SendUnicast) and o.beacon.kind is kind]
 
 
-def test_a_burst_then_silence_but_for_the_heartbeat() -> None:
+def test_burst_is_followed_by_heartbeats_only() -> None:
     harness = Harness()
     kinds = [(o.beacon.kind, o.beacon.sequence) for o in harness.run(4.9) if isinstance(o, SendMulticast)]
     assert kinds == [(BeaconKind.ANNOUNCE, n) for n in range(1, len(limits.BURST_OFFSETS) + 1)]
@@ -168,7 +168,7 @@ def test_a_lease_has_bounds(one: Harness, asked: float, granted: float) -> None:
     assert one.present() == []
 
 
-def test_a_linked_peer_is_never_lost_by_silence_and_its_lease_begins_when_the_link_falls(one: Harness) -> None:
+def test_lease_of_a_linked_peer_begins_when_the_link_falls(one: Harness) -> None:
     one.hear(Speaker(who(2))())
     one.membership.link_up(who(2), one.now)
     one.run(1000)
@@ -388,7 +388,7 @@ def moved(identity: Identity, port: int) -> Identity:
     return replace(identity, guid=Guid.of(identity.guid.address, port, 9), instance=bytes([port & 255] * 16))
 
 
-def test_a_killed_agent_that_starts_again_at_another_port_is_no_namesake_of_its_ghost(one: Harness) -> None:
+def test_agent_restarted_at_another_port_has_no_name_conflict(one: Harness) -> None:
     ghost = who(2, name="base")
     again = moved(ghost, 50000)
     one.hear(Speaker(ghost)())
@@ -410,7 +410,7 @@ def test_a_killed_agent_that_starts_again_at_another_port_is_no_namesake_of_its_
     assert one.present() == ["base"]
 
 
-def test_a_namesake_on_the_same_machine_that_lives_comes_back_and_is_said(one: Harness) -> None:
+def test_live_peer_of_the_same_name_and_machine_is_a_conflict(one: Harness) -> None:
     first = Speaker(who(2, name="base"))
     second = Speaker(moved(first.identity, 50000))
     one.hear(first())
@@ -424,7 +424,7 @@ def test_a_namesake_on_the_same_machine_that_lives_comes_back_and_is_said(one: H
     assert one.present() == ["base", "base"]
 
 
-def test_a_namesake_elsewhere_is_said_only_once_it_has_shown_to_live(one: Harness) -> None:
+def test_name_conflict_needs_proof_that_both_are_alive(one: Harness) -> None:
     first, second = Speaker(who(2, name="base")), Speaker(who(3, name="base"))
     one.hear(first())
     one.run(1)
@@ -460,7 +460,7 @@ def test_a_handshake_without_addresses_changes_nothing(one: Harness) -> None:
     assert one.membership.peers()[0].identity == full
 
 
-def test_gossip_only_leads_to_greetings_that_end(one: Harness) -> None:
+def test_gossip_leads_to_announcements_that_end(one: Harness) -> None:
     one.hear(Speaker(who(2))(BeaconKind.ANSWER, who(3).guid), multicast=False)
     sent = one.membership.outputs() + one.run(limits.CANDIDATE_LIFETIME)
     greeted = [a for a in unicasts(sent, BeaconKind.ANNOUNCE) if a == ("10.0.0.3", 40003)]
@@ -469,7 +469,7 @@ def test_gossip_only_leads_to_greetings_that_end(one: Harness) -> None:
     assert one.present() == []
 
 
-def test_greetings_go_on_while_somebody_speaks_of_the_address(one: Harness) -> None:
+def test_announcements_go_on_while_gossip_mentions_the_address(one: Harness) -> None:
     speaker = Speaker(who(2))
     for _ in range(20):
         one.hear(speaker(BeaconKind.HEARTBEAT, who(3).guid))
@@ -478,7 +478,7 @@ def test_greetings_go_on_while_somebody_speaks_of_the_address(one: Harness) -> N
     assert ("10.0.0.3", 40003) in unicasts(one.run(limits.CANDIDATE_RETRY_MAX), BeaconKind.ANNOUNCE)
 
 
-def test_a_greeted_peer_that_answers_is_found_by_gossip(one: Harness) -> None:
+def test_candidate_that_answers_is_found_by_gossip(one: Harness) -> None:
     one.hear(Speaker(who(2))(BeaconKind.ANSWER, who(3).guid), multicast=False)
     one.hear(Speaker(who(3))(BeaconKind.ANSWER), multicast=False)
     assert one.present() == ["peer2", "peer3"]
@@ -487,7 +487,7 @@ def test_a_greeted_peer_that_answers_is_found_by_gossip(one: Harness) -> None:
     assert unicasts(sent, BeaconKind.ANNOUNCE).count(("10.0.0.3", 40003)) == 1
 
 
-def test_a_lost_peer_that_multicast_cannot_bring_back_is_greeted_again(one: Harness) -> None:
+def test_lost_unicast_peer_becomes_a_candidate(one: Harness) -> None:
     one.hear(Speaker(who(2))(BeaconKind.ANNOUNCE), multicast=False)
     one.run(15.9)
     sent = one.run(10)
@@ -495,7 +495,7 @@ def test_a_lost_peer_that_multicast_cannot_bring_back_is_greeted_again(one: Harn
     assert unicasts(sent, BeaconKind.ANNOUNCE).count(("10.0.0.2", 40002)) >= 3
 
 
-def test_a_peer_that_is_heard_elsewhere_is_passed_on_with_where(one: Harness) -> None:
+def test_gossip_carries_the_observed_address(one: Harness) -> None:
     """Its GUID's address may be of a network that whoever is told cannot reach."""
     one.hear(Speaker(who(2))(), source=("172.16.0.2", 40002))
     one.hear(Speaker(who(3))(BeaconKind.ANNOUNCE), multicast=False)
@@ -505,7 +505,7 @@ def test_a_peer_that_is_heard_elsewhere_is_passed_on_with_where(one: Harness) ->
     assert [(b.gossip, b.observed) for b in answers] == [((who(2).guid,), (("172.16.0.2", 40002),))]
 
 
-def test_whoever_is_told_of_an_address_greets_it_unless_it_knows_who_is_there(one: Harness) -> None:
+def test_gossiped_address_of_an_unknown_peer_is_contacted(one: Harness) -> None:
     known = replace(who(4), addresses=(IPv4Address("172.16.0.4"),))
     one.hear(Speaker(known)())
     one.membership.outputs()
@@ -542,7 +542,7 @@ def test_an_answer_carries_gossip_but_not_the_listener(one: Harness) -> None:
     assert answer.beacon.gossip == (who(3).guid,)
 
 
-def test_seeds_are_greeted_at_start_and_with_each_heartbeat_until_met() -> None:
+def test_seeds_get_announcements_until_they_are_members() -> None:
     seed = ("10.9.0.1", 11411)
     one = Harness()
     one.membership.set_seeds([seed, seed])
@@ -553,7 +553,7 @@ def test_seeds_are_greeted_at_start_and_with_each_heartbeat_until_met() -> None:
     assert unicasts(one.run(10), BeaconKind.ANNOUNCE) == []
 
 
-def test_a_peer_not_heard_by_multicast_gets_unicast_heartbeats_with_gossip(one: Harness) -> None:
+def test_peer_without_multicast_gets_unicast_heartbeats(one: Harness) -> None:
     one.hear(Speaker(who(3))())
     far = Speaker(who(2))
     one.hear(far(BeaconKind.ANNOUNCE), multicast=False)
@@ -594,14 +594,14 @@ def test_without_multicast_nothing_is_shouted() -> None:
     assert ("10.0.0.2", 40002) in unicasts(sent, BeaconKind.HEARTBEAT)
 
 
-def test_a_change_of_interfaces_gives_a_shorter_burst_with_the_new_addresses(one: Harness) -> None:
+def test_change_of_interfaces_sends_a_shorter_burst(one: Harness) -> None:
     one.membership.interfaces_changed(one.now, (IPv4Address("10.8.0.1"),))
     sent = [o for o in one.run(1) if isinstance(o, SendMulticast)]
     assert [o.beacon.kind for o in sent] == [BeaconKind.ANNOUNCE] * len(limits.BURST_AGAIN_OFFSETS)
     assert sent[0].beacon.identity.addresses == (IPv4Address("10.8.0.1"),)
 
 
-def test_the_roster_is_bounded_and_links_go_first(one: Harness) -> None:
+def test_membership_is_bounded_and_links_go_first(one: Harness) -> None:
     for i in range(2 * core_limits.PEERS_MAX):
         guid = Guid.of(IPv4Address(0x0A010000 + i), 4000)
         one.hear(Speaker(replace(who(2), guid=guid, instance=i.to_bytes(16, "big"), name=f"n{i}"))())
@@ -645,7 +645,7 @@ def flood(one: Harness, count: int, *, first: int = 0) -> None:
         one.membership.events()
 
 
-def test_peers_without_a_link_that_do_not_hear_us_share_a_few_heartbeats(one: Harness) -> None:
+def test_unlinked_peers_share_a_few_unicast_heartbeats(one: Harness) -> None:
     flood(one, core_limits.PEERS_MAX - 2)
     one.hear(Speaker(who(2))(BeaconKind.ANNOUNCE), multicast=False)
     one.membership.link_up(who(2), one.now)
@@ -670,7 +670,7 @@ def test_who_spoke_once_and_has_no_link_is_not_passed_on_for_long(one: Harness) 
     assert answer.beacon.gossip == (who(3).guid,)
 
 
-def test_greetings_of_many_invented_addresses_are_few(one: Harness) -> None:
+def test_announcements_to_many_forged_addresses_are_few(one: Harness) -> None:
     speaker, sent = Speaker(who(2)), 0
     for second in range(60):
         for part in range(8):
@@ -681,7 +681,7 @@ def test_greetings_of_many_invented_addresses_are_few(one: Harness) -> None:
     assert sent >= 40 * limits.CANDIDATES_PER_SECOND
 
 
-def test_in_a_full_roster_who_missed_a_heartbeat_gives_way_but_not_to_many(one: Harness) -> None:
+def test_full_membership_evicts_silent_peers_at_a_limited_rate(one: Harness) -> None:
     flood(one, core_limits.PEERS_MAX - 1)
     one.hear(Speaker(who(3))())
     assert "peer3" not in one.present(), "all spoke a moment ago"
@@ -705,7 +705,7 @@ def test_a_linked_peer_gives_way_to_nobody(one: Harness) -> None:
     assert len(one.membership.peers()) == core_limits.PEERS_MAX - 1
 
 
-def test_a_beacon_that_was_forged_while_its_place_was_linked_takes_no_seat_when_the_link_falls(one: Harness) -> None:
+def test_old_forged_beacon_takes_no_endpoint_when_the_link_falls(one: Harness) -> None:
     one.hear(Speaker(who(2))())
     one.membership.link_up(who(2), one.now)
     one.run(1)
@@ -728,7 +728,7 @@ def test_whose_link_is_known(one: Harness) -> None:
     assert not one.membership.is_linked(who(2).guid, who(2).instance)
 
 
-def test_timers_and_names_are_those_of_the_seats_whatever_happens() -> None:
+def test_indexes_agree_with_the_endpoints() -> None:
     """The remembered answers against a look at every endpoint, over a thousand random events."""
     rng = random.Random(3)
     one = Harness()

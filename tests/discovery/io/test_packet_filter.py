@@ -62,7 +62,7 @@ def test_a_linked_peer_is_heard_through_a_flood() -> None:
     assert door.intake.parse(packet(again, 8), ("10.0.0.2", 4000), 10.0, multicast=True, interface=1) is None
 
 
-def test_what_is_no_beacon_of_ours_is_counted_as_what_it_is_during_a_flood() -> None:
+def test_malformed_packets_are_counted_by_kind_during_a_flood() -> None:
     door = Door()
     door.flood(3000, 10.0)
     good = packet(FRIEND, 9)
@@ -72,7 +72,7 @@ def test_what_is_no_beacon_of_ours_is_counted_as_what_it_is_during_a_flood() -> 
     assert counted == [2, 1, 1]
 
 
-def test_one_address_that_sends_too_much_is_ignored_for_the_rest_of_the_second() -> None:
+def test_flooding_address_is_ignored_for_the_rest_of_the_second() -> None:
     door = Door()
     taken = [
         door.intake.parse(packet(FRIEND, n), ("10.0.0.2", 4000), 10.0, multicast=True, interface=1)
