@@ -290,8 +290,8 @@ class Discovery:
 
     def _deliver(self, event: Event) -> None:
         if isinstance(event, PeerConflict):
-            who = str(event.identity.guid.address)
-            self._refusals.refuse(self._clock.now(), f"conflict.{event.kind.name.lower()}", who, str(event))
+            host = str(event.identity.guid.address)
+            self._refusals.refuse(self._clock.now(), f"conflict.{event.kind.name.lower()}", host, str(event))
         self._on_event(event)
 
     def _timer_due(self, now: float) -> None:
