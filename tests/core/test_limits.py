@@ -15,13 +15,14 @@ import pytest
 
 import rmpa
 from rmpa.config.file import SCHEMAS
+from rmpa.core import sizes
 from rmpa.core.sizes import KIB, MIB
 
 LIMITS: Final = {
     name: value
     for file in Path(rmpa.__path__[0]).glob("*/limits.py")
     for name, value in vars(import_module(f"rmpa.{file.parent.name}.limits")).items()
-    if name.isupper()
+    if name.isupper() and not hasattr(sizes, name)
 }
 """Of all rooms."""
 PAGE: Final = Path(__file__).parents[2] / "docs" / "limits.md"
