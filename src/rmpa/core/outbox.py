@@ -170,6 +170,11 @@ class Outbox:
         return self._committed_bytes + self._urgent_bytes + self._data_bytes + self._begun_bytes
 
     @property
+    def pending_entries(self) -> int:
+        """Entries that wait, urgent ones and committed parts included."""
+        return len(self._committed) + len(self._urgent) + sum(len(f.messages) for f in self._queues.values())
+
+    @property
     def waiting_entries(self) -> int:
         """Entries of all keys that wait, without marks and committed parts."""
         return sum(len(queue.messages) - queue.marks for queue in self._queues.values())
