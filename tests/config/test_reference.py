@@ -27,8 +27,8 @@ def validate() -> Any:
 
 def test_documentation_is_up_to_date() -> None:
     page = (DOCS / "settings.md").read_text()
-    assert page == with_settings_tables(page), "run scripts/write-reference"
-    assert (DOCS / SCHEMA_FILE).read_text() == schema_text(), "run scripts/write-reference"
+    assert page == with_settings_tables(page), "run make reference"
+    assert (DOCS / SCHEMA_FILE).read_text() == schema_text(), "run make reference"
 
 
 def test_documentation_has_every_setting_and_every_list_of_tables() -> None:
