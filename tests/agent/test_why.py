@@ -12,13 +12,14 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings, Settings
 from rmpa.core.errors import ConfigError
-from rmpa.observe.why.diagnosis import Diagnosis, StageResult
+from rmpa.observe.check import CheckLevel
 from tests.agent.test_agent import DEADLINE, node, running, settings, until  # noqa: F401 - a fixture among them
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.agent import Agent
+    from rmpa.observe.why.diagnosis import Diagnosis
 
 
 @pytest.fixture(autouse=True)
@@ -72,7 +73,7 @@ async def test_from_no_publisher_to_a_flowing_topic(settings: Callable[..., Sett
         publisher.publish(publisher.make({"data": "one"}))
         found = await flowing(b, "/chatter", "a")
         assert (found.peer, found.to, found.node) == ("a", "b", "/talker")
-        assert [stage.verdict for stage in found.stages] == [StageResult.OK] * len(found.stages)
+        assert [stage.level for stage in found.stages] == [CheckLevel.OK] * len(found.stages)
         assert found.stages[-1].text == "/hearer takes them"
         # Asked on the publisher's side, the subscriber's agent says the same.
         there = await flowing(a, "/chatter")

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 import pytest
 
+from rmpa.cli.doctor import _json as doctor_json
 from rmpa.cli.doctor import _lines as doctor_lines
 from rmpa.cli.doctor import _summary as doctor_summary
 from rmpa.cli.why import _lines as why_lines
+from rmpa.observe.check import exit_code
 from rmpa.observe.doctor.agents import judge_agents
-from rmpa.observe.doctor.finding import Finding, exit_code
 from rmpa.observe.doctor.firewall import judge_rules, read_iptables, read_nft
 from rmpa.observe.doctor.machine import KernelRights, WallClock, judge_clock, judge_rights
 from rmpa.observe.doctor.network import (
@@ -48,8 +49,9 @@ from tests.observe.samples import SNAPSHOT
 from tests.observe.why import test_services, test_topics
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
+    from rmpa.observe.check import Check
     from rmpa.observe.why.diagnosis import Diagnosis
 
 GOLDEN: Final = Path(__file__).with_name("golden")
@@ -76,7 +78,12 @@ def holed() -> PeerInfo:
     return msgspec.structs.replace(JOYSTICK, link=link)
 
 
-def findings() -> Iterator[Finding]:
+def document(value: Sequence[object], lines: Sequence[str]) -> bytes:
+    """As JSON, one object a line, and the lines behind it."""
+    return b"\n".join((msgspec.json.encode(value).replace(b"},{", b"},\n{"), *map(str.encode, lines), b""))
+
+
+def findings() -> Iterator[Check]:
     yield from judge_agents({}, "0.1.0")
     cam = UnreachableInfo(node="/cam", uri="http://nosuch:1/", problem="no such name", ago=3.0)
     gone = UnreachableInfo(node="/gone", uri="http://10.9.9.9:1/", problem="no answer", ago=60.0, withdrawn=True)
@@ -152,7 +159,9 @@ def doctor() -> bytes:
     found = list(findings())
     lines = [line for finding in found for line in doctor_lines(finding)]
     lines += [doctor_summary(found), f"exit code {exit_code(found)}"]
-    return b"\n".join((msgspec.json.encode(found).replace(b"},{", b"},\n{"), *map(str.encode, lines), b""))
+    return b"\n".join(
+        (msgspec.json.encode([*map(doctor_json, found)]).replace(b"},{", b"},\n{"), *map(str.encode, lines), b"")
+    )
 
 
 def diagnoses() -> Iterator[Diagnosis]:
@@ -173,7 +182,7 @@ def why() -> bytes:
     """What the control socket and the peers carry, and the lines of a terminal."""
     found = list(diagnoses())
     lines = [line for diagnosis in found for line in why_lines(diagnosis)]
-    return b"\n".join((msgspec.json.encode(found).replace(b"},{", b"},\n{"), *map(str.encode, lines), b""))
+    return document(found, lines)
 
 
 def snapshots() -> Iterator[Snapshot]:
@@ -204,7 +213,9 @@ def snapshots() -> Iterator[Snapshot]:
     called = ServiceInfo(name="/add", node="/adder", direction="in", peer="joystick", calls=3, type="a/Add")
     for failed in (0, 1):
         services = (msgspec.structs.replace(called, calls=3 + failed, failed=failed, problem="it sticks"),)
-        yield msgspec.structs.replace(with_files(near=True), topics=(refused,), unreachable=(gone,), services=services)
+        yield msgspec.structs.replace(
+            with_files(near=True), topics=(refused,), unreachable=(gone,), services=services
+        )
     lost = msgspec.structs.replace(JOYSTICK, state="linking", link=None, last_error="silent")
     yield with_peers(lost, msgspec.structs.replace(PC, state="refused"))
     yield with_files(near=True, problem="node /x has to wait")

@@ -7,16 +7,17 @@ from dataclasses import replace
 import msgspec
 import pytest
 
-from rmpa.observe.why.diagnosis import Diagnosis, PathStage, StageResult
+from rmpa.observe.check import Check, CheckLevel
+from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.observe.why.services import FarService, NearService, walk_service
 
-BEGIN = (PathStage("peer", StageResult.OK, "known"), PathStage("link", StageResult.OK, "linked"))
+BEGIN = (Check("peer", CheckLevel.OK, "known"), Check("link", CheckLevel.OK, "linked"))
 FAR = FarService(node="/arm", service="/move", rule="services.allow has '/**'")
 NEAR = NearService(wire="/move", offered=True, node="/arm", registered=True, answer="a/Move, md5 123", calls=3)
 ORDER = ("peer", "link", "server", "policy there", "offer", "shown", "graph", "answer", "calls")
 
 
-def walk(near: NearService = NEAR, far: FarService | None = FAR, begin: tuple[PathStage, ...] = BEGIN) -> Diagnosis:
+def walk(near: NearService = NEAR, far: FarService | None = FAR, begin: tuple[Check, ...] = BEGIN) -> Diagnosis:
     return walk_service(begin, "base", "robot", "/move", near, far, "" if far else "it is older")
 
 
@@ -85,7 +86,7 @@ def test_every_stage_behind_the_link_can_fail_but_the_calls() -> None:
 
 
 def test_nothing_is_looked_at_behind_a_link_that_is_not_there() -> None:
-    begin = (BEGIN[0], PathStage("link", StageResult.FAIL, "no link", "plug it in"))
+    begin = (BEGIN[0], Check("link", CheckLevel.FAIL, "no link", "plug it in"))
     assert walk(begin=begin).stages == begin
 
 
@@ -96,11 +97,11 @@ def test_failed_calls_and_mismatches_are_warned_of() -> None:
     ):
         found = walk(near)
         assert found.flows
-        assert found.stages[-1].verdict is StageResult.WARN
+        assert found.stages[-1].level is CheckLevel.WARN
         assert text in found.stages[-1].text
 
 
 def test_an_agent_that_does_not_tell_leaves_its_stage_open() -> None:
     found = walk(far=None)
     assert found.flows
-    assert found.stages[2].verdict is StageResult.UNKNOWN
+    assert found.stages[2].level is CheckLevel.UNKNOWN

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.config import limits as config_limits
+from rmpa.observe.check import Check, CheckLevel
 from rmpa.observe.snapshot import FilesInfo, LatencySpread, LinkInfo, PeerInfo, RouteInfo, Snapshot, TopicInfo
 from rmpa.observe.why.diagnosis import (
     BothSides,
@@ -19,9 +20,7 @@ from rmpa.observe.why.diagnosis import (
     FarSource,
     FarTopic,
     NearTopic,
-    PathStage,
     Reader,
-    StageResult,
 )
 from rmpa.observe.why.topics import walk_topic
 from tests.observe.samples import SNAPSHOT
@@ -133,7 +132,7 @@ def test_what_flows_passes_every_stage_in_order() -> None:
     assert found.flows
     assert found.failed is None
     assert [stage.name for stage in found.stages] == [name for name in ORDER if name not in ONLY_FAILS]
-    assert {stage.verdict for stage in found.stages} == {StageResult.OK}
+    assert {stage.level for stage in found.stages} == {CheckLevel.OK}
     assert (found.name, found.peer, found.to, found.node) == ("/cmd", "joystick", "base", "/joy")
     by_name = {stage.name: stage.text for stage in found.stages}
     assert by_name["arrived"] == "120 messages, the last 0.03 s ago, 20.0 Hz"
@@ -145,11 +144,11 @@ PATH = {"path_problem": "large packets do not get through", "path_remedy": "give
 
 def test_a_path_that_drops_large_packets_is_told_by_whichever_end_knows() -> None:
     here = one(Case(peer=msgspec.structs.replace(PEER, link=msgspec.structs.replace(LINK, **PATH))))
-    (stage,) = [stage for stage in here.stages if stage.verdict is StageResult.WARN]
+    (stage,) = [stage for stage in here.stages if stage.level is CheckLevel.WARN]
     assert (stage.name, stage.remedy) == ("link", "give it its true MTU")
     assert stage.text.endswith("large packets do not get through")
     there = one(Case(far=msgspec.structs.replace(FarTopic(), **PATH)))
-    (stage,) = [stage for stage in there.stages if stage.verdict is StageResult.WARN]
+    (stage,) = [stage for stage in there.stages if stage.level is CheckLevel.WARN]
     assert (stage.name, stage.text) == ("path", "joystick says: large packets do not get through")
     assert there.flows
 
@@ -444,27 +443,27 @@ WARNINGS: dict[str, tuple[Case, str, str]] = {
 def test_what_is_worth_knowing_though_it_flows(case: Case, stage: str, text: str) -> None:
     found = one(case)
     assert found.flows
-    warned = [s for s in found.stages if s.verdict is StageResult.WARN]
+    warned = [s for s in found.stages if s.level is CheckLevel.WARN]
     assert [s.name for s in warned] == [stage]
     assert text in warned[0].text
 
 
 def test_bytes_that_wait_at_one_look_alone_are_on_their_way() -> None:
     found = one(Case(readers_later=(Reader(number=1, node="/base", waiting=70_000),)))
-    assert found.stages[-1].verdict is StageResult.OK
+    assert found.stages[-1].level is CheckLevel.OK
 
 
 def test_an_agent_that_does_not_tell_leaves_stages_open() -> None:
     found = one(Case(far=None, refusal="it is older"))
     assert found.flows
-    unknown = [stage.name for stage in found.stages if stage.verdict is StageResult.UNKNOWN]
+    unknown = [stage.name for stage in found.stages if stage.level is CheckLevel.UNKNOWN]
     assert unknown == ["publisher", "policy there", "sent"]
 
 
 def test_a_latched_topic_of_one_old_message_flows() -> None:
     quiet = route(messages=1, age=3600.0, rate=None, period=None, latched=True)
     found = one(Case(**quiet, source_later=SOURCE))
-    assert {stage.verdict for stage in found.stages} == {StageResult.OK}
+    assert {stage.level for stage in found.stages} == {CheckLevel.OK}
 
 
 def test_a_message_that_is_on_its_way_is_not_missing() -> None:
@@ -566,12 +565,12 @@ def test_whatever_another_agent_says_there_is_an_answer(
     for diagnosis in found:
         assert diagnosis.flows is (diagnosis.failed is None)
         for stage in diagnosis.stages[:-1]:
-            assert stage.verdict is not StageResult.FAIL
+            assert stage.level is not CheckLevel.FAIL
         assert msgspec.convert(msgspec.to_builtins(diagnosis), Diagnosis) == diagnosis
 
 
 def test_a_stage_is_short_as_json() -> None:
-    assert msgspec.to_builtins(PathStage("peer", StageResult.OK, "known")) == {
+    assert msgspec.to_builtins(Check("peer", CheckLevel.OK, "known")) == {
         "name": "peer",
         "verdict": "ok",
         "text": "known",

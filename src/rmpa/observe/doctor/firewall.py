@@ -10,7 +10,7 @@ import re
 from dataclasses import dataclass, field
 from typing import Final
 
-from rmpa.observe.doctor.finding import Finding, FindingLevel
+from rmpa.observe.check import FAIL, OK, WARN, Check
 
 _DROPS: Final = re.compile(r"\b(drop|reject|DROP|REJECT)\b")
 _ACCEPTS: Final = re.compile(r"\b(accept|ACCEPT)\b")
@@ -87,7 +87,7 @@ def read_iptables(text: str, ports: frozenset[int]) -> FirewallRules:
     return rules
 
 
-def judge_rules(rules: FirewallRules, ports: str) -> Finding:
+def judge_rules(rules: FirewallRules, ports: str) -> Check:
     """Say what the rules mean for agents.
 
     Args:
@@ -96,15 +96,11 @@ def judge_rules(rules: FirewallRules, ports: str) -> Finding:
     """
     if rules.drops:
         remedy = f"take it out, or let {ports} in before it"
-        return Finding(
-            "firewall", rules.source, FindingLevel.FAIL, f"drops what agents send: {rules.drops[0]}", remedy
-        )
+        return Check("firewall", FAIL, f"drops what agents send: {rules.drops[0]}", remedy, where=rules.source)
     if rules.closed and not rules.accepts:
         text = f"{', '.join(rules.closed)} drops what no rule lets in, and no rule names our ports"
         remedy = f"let in {ports}; `rmpa up --port N` gives the mesh a port that rules can name"
-        return Finding("firewall", rules.source, FindingLevel.WARN, text, remedy)
+        return Check("firewall", WARN, text, remedy, where=rules.source)
     if rules.closed:
-        return Finding("firewall", rules.source, FindingLevel.OK, f"lets ours in: {rules.accepts[0]}")
-    return Finding(
-        "firewall", rules.source, FindingLevel.OK, f"{rules.count} rules, and none against agents that we see"
-    )
+        return Check("firewall", OK, f"lets ours in: {rules.accepts[0]}", where=rules.source)
+    return Check("firewall", OK, f"{rules.count} rules, and none against agents that we see", where=rules.source)

@@ -11,8 +11,9 @@ from rmpa.bridge.policy import OWN_NODE, Policy, is_own
 from rmpa.bridge.services.rules import ServiceRules
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import RmpaError
+from rmpa.observe.check import FAIL, Check
 from rmpa.observe.io.topic_facts import name_in
-from rmpa.observe.why.diagnosis import Diagnosis, PathStage, StageResult
+from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.observe.why.services import FarService, NearService
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.runtime.event_loop import yielding_to_data
@@ -66,7 +67,7 @@ class ServiceFacts:
         if own:
             text = f"{own[0]} of this module provides {service}; clients here call it without us"
             remedy = f"whether another module may call it: `rmpa why {here}:{service}` over there"
-        stage = PathStage("server", StageResult.FAIL, text, remedy)
+        stage = Check("server", FAIL, text, remedy)
         return Diagnosis(kind="service", name=service, peer="", to=here, flows=False, stages=(stage,))
 
     async def near(self, attached: PeerSession, service: str, wire: str) -> NearService:

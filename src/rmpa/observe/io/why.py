@@ -11,9 +11,10 @@ from rmpa.bridge import limits
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
 from rmpa.core.names import is_global_name
+from rmpa.observe.check import FAIL, Check
 from rmpa.observe.io.service_facts import ServiceFacts
 from rmpa.observe.io.topic_facts import TopicFacts, name_in
-from rmpa.observe.why.diagnosis import BothSides, Diagnosis, FarTopic, PathStage, StageResult
+from rmpa.observe.why.diagnosis import BothSides, Diagnosis, FarTopic
 from rmpa.observe.why.services import FarService, walk_service
 from rmpa.observe.why.topics import find_peer, walk_peer, walk_topic
 
@@ -133,18 +134,18 @@ class WhyService:
         here = self._view.snapshot(frozenset()).agent.name
         if self._topics.own(topic):
             text, remedy = "no peer is linked that it could go to", "`rmpa peer list` tells of the peers"
-            stage = PathStage("peer", StageResult.FAIL, text, remedy)
+            stage = Check("peer", FAIL, text, remedy)
             return Diagnosis(name=topic, peer=here, to="", flows=False, stages=(stage,))
         state = self._core.state()
         near = await asyncio.to_thread(did_you_mean, topic, {*state.publishers, *state.subscribers})
         if awaited := self._topics.awaited(topic):
             text = f"{', '.join(awaited)} published {topic} before this agent was restarted, and does not answer"
             remedy = "it is asked again by itself; is that program stopped or stuck? Else start it again"
-            stage = PathStage("publisher", StageResult.FAIL, text, remedy)
+            stage = Check("publisher", FAIL, text, remedy)
             return Diagnosis(name=topic, peer=here, to="", flows=False, stages=(stage,))
         text = f"neither {here} nor a linked peer ({', '.join(linked) or 'there is none'}) publishes {topic}"
         remedy = f"did you mean {near}?" if near else "`rmpa topic list` shows what there is, `rmpa peer list` who"
-        stage = PathStage("publisher", StageResult.FAIL, text, remedy)
+        stage = Check("publisher", FAIL, text, remedy)
         return Diagnosis(name=topic, peer="", to=here, flows=False, stages=(stage,))
 
     async def _arrives(self, name: str, topic: str) -> tuple[Diagnosis, ...]:
@@ -185,7 +186,7 @@ class WhyService:
         attached = self._carrier(peer) if peer is not None else None
         to = peer.name if peer is not None else name
         if attached is None or attached.link.name != to:
-            stages = begin if begin[-1].verdict is StageResult.FAIL else (*begin, _no_link(to))
+            stages = begin if begin[-1].level is FAIL else (*begin, _no_link(to))
             return (Diagnosis(name=topic, peer=here, to=to, flows=False, stages=stages),)
         question = {"topic": self._bridge.names.wire_name(to, topic, self._core.type_of(topic))}
         try:
@@ -195,7 +196,7 @@ class WhyService:
             return found[: limits.WHY_SOURCES_MAX]
         except RmpaError as error:
             remedy = f"run `rmpa why {here}:{topic}` there"
-            silent = PathStage("link", StageResult.FAIL, f"{to} does not tell: {error}", remedy)
+            silent = Check("link", FAIL, f"{to} does not tell: {error}", remedy)
             return (Diagnosis(name=topic, peer=here, to=to, flows=False, stages=(*begin, silent)),)
 
     async def _tell_here(self, attached: PeerSession, args: dict[str, Any]) -> tuple[Diagnosis, ...]:
@@ -250,6 +251,6 @@ class WhyService:
             raise RemoteProtocolError(f"it answers in another way: {error}; is it another version?") from None
 
 
-def _no_link(peer: str) -> PathStage:
+def _no_link(peer: str) -> Check:
     remedy = "ask on its own machine; or try again in a moment"
-    return PathStage("link", StageResult.FAIL, f"there is no link to {peer} that could be asked", remedy)
+    return Check("link", FAIL, f"there is no link to {peer} that could be asked", remedy)

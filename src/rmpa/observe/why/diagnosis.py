@@ -3,43 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import msgspec
+
+from rmpa.observe.check import FAIL, Check
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rmpa.observe.snapshot import Snapshot
-
-
-class StageResult(StrEnum):
-    """What became of a stage."""
-
-    OK = "ok"
-    WARN = "warn"
-    """It works, though something about it is worth knowing."""
-    FAIL = "fail"
-    """Here it ends."""
-    UNKNOWN = "unknown"
-    """Nobody could tell; the walk goes on."""
-
-
-class PathStage(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One stage on the way.
-
-    Attributes:
-        name: What it is about, a word or two.
-        verdict: What became of it.
-        text: The evidence, ready to read.
-        remedy: What to do, where something is to be done.
-    """
-
-    name: str
-    verdict: StageResult
-    text: str
-    remedy: str = ""
 
 
 class Diagnosis(msgspec.Struct, frozen=True, kw_only=True):
@@ -61,12 +34,12 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True):
     to: str
     node: str = ""
     flows: bool
-    stages: tuple[PathStage, ...]
+    stages: tuple[Check, ...]
 
     @property
-    def failed(self) -> PathStage | None:
+    def failed(self) -> Check | None:
         """The first stage that fails."""
-        return next((stage for stage in self.stages if stage.verdict is StageResult.FAIL), None)
+        return next((stage for stage in self.stages if stage.level is FAIL), None)
 
 
 class FarSource(msgspec.Struct, frozen=True, kw_only=True):

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.observe.why.diagnosis import Diagnosis, PathStage, StageResult
+from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
+from rmpa.observe.why.diagnosis import Diagnosis
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -70,13 +71,11 @@ class NearService:
     mismatch: str = ""
 
 
-_OK: Final = StageResult.OK
-_FAIL: Final = StageResult.FAIL
 _NOTHING: Final = NearService()
 
 
 def walk_service(
-    begin: tuple[PathStage, ...],
+    begin: tuple[Check, ...],
     to: str,
     peer: str,
     service: str,
@@ -96,55 +95,53 @@ def walk_service(
         refusal: Why it did not.
     """
     stages = list(begin)
-    if begin[-1].verdict is not _FAIL:
+    if begin[-1].level is not FAIL:
         for stage in _stages(peer, service, near, far, refusal):
             stages.append(stage)
-            if stage.verdict is _FAIL:
+            if stage.level is FAIL:
                 break
     node = (far.node if far is not None else "") or near.node
-    flows = stages[-1].verdict is not _FAIL
+    flows = stages[-1].level is not FAIL
     return Diagnosis(kind="service", name=service, peer=peer, to=to, node=node, flows=flows, stages=tuple(stages))
 
 
-def _stages(peer: str, service: str, near: NearService, far: FarService | None, refusal: str) -> Iterator[PathStage]:
+def _stages(peer: str, service: str, near: NearService, far: FarService | None, refusal: str) -> Iterator[Check]:
     yield from _there(peer, near.wire or service, near, far, refusal)
     if not near.offered:
         remedy = (
             f"if it stays so for more than {limits.RECONCILE_INTERVAL:g} s, it is a bug of ours: both logs, please"
         )
-        yield PathStage("offer", _FAIL, f"the offer of {peer} has not come here", remedy)
-    yield PathStage("offer", _OK, f"{peer} offers it")
+        yield Check("offer", FAIL, f"the offer of {peer} has not come here", remedy)
+    yield Check("offer", OK, f"{peer} offers it")
     if near.hidden:
-        yield PathStage("shown", _FAIL, f"it is not shown here: {near.hidden}", _unhide(near.hidden))
+        yield Check("shown", FAIL, f"it is not shown here: {near.hidden}", _unhide(near.hidden))
     was = f" (its {near.wire})" if near.wire not in ("", service) else ""
-    yield PathStage("shown", _OK, f"it is {service} here{was}")
+    yield Check("shown", OK, f"it is {service} here{was}")
     if not near.registered:
         remedy = f"it is put there again within {limits.RECONCILE_INTERVAL:g} s; if not, the agent's log says why"
-        yield PathStage("graph", _FAIL, "the local core does not have it", remedy)
-    yield PathStage("graph", _OK, "the local core sends clients to it")
+        yield Check("graph", FAIL, "the local core does not have it", remedy)
+    yield Check("graph", OK, "the local core sends clients to it")
     yield _answer(peer, near)
     yield _calls(near)
 
 
-def _there(peer: str, wire: str, near: NearService, far: FarService | None, refusal: str) -> Iterator[PathStage]:
+def _there(peer: str, wire: str, near: NearService, far: FarService | None, refusal: str) -> Iterator[Check]:
     if far is None:
-        verdict = StageResult.UNKNOWN if near.offered else _FAIL
-        yield PathStage(
-            "server", verdict, f"{peer} does not tell ({refusal})", f"ask on {peer}: rosservice info {wire}"
-        )
+        verdict = UNKNOWN if near.offered else FAIL
+        yield Check("server", verdict, f"{peer} does not tell ({refusal})", f"ask on {peer}: rosservice info {wire}")
         return
     if not far.node:
         remedy = f"did you mean {far.near}?" if far.near else f"start its server there (on {peer}: rosservice list)"
-        yield PathStage("server", _FAIL, f"no node of {peer} provides {wire}", remedy)
+        yield Check("server", FAIL, f"no node of {peer} provides {wire}", remedy)
     was = f" as {far.service}" if far.service not in ("", wire) else ""
     if far.refusal:
         text = f"{far.node} on {peer} is registered for it, and does not answer: {far.refusal}"
-        yield PathStage("server", _FAIL, text, f"is it stopped, or dead? on {peer}: rosnode ping {far.node}")
-    yield PathStage("server", _OK, f"{far.node} on {peer} provides it{was}")
+        yield Check("server", FAIL, text, f"is it stopped, or dead? on {peer}: rosnode ping {far.node}")
+    yield Check("server", OK, f"{far.node} on {peer} provides it{was}")
     if not far.crosses:
         remedy = f"change [services] or [[peer]] in the rmpa.toml of {peer}, and `rmpa reload` there"
-        yield PathStage("policy there", _FAIL, f"{peer} keeps it at home: {far.rule}", remedy)
-    yield PathStage("policy there", _OK, f"{peer} lets it cross: {far.rule}")
+        yield Check("policy there", FAIL, f"{peer} keeps it at home: {far.rule}", remedy)
+    yield Check("policy there", OK, f"{peer} lets it cross: {far.rule}")
 
 
 def _unhide(hidden: str) -> str:
@@ -153,18 +150,18 @@ def _unhide(hidden: str) -> str:
     return "a graph has one provider for each service; give one of them another name (prefix or remap_in of [[peer]])"
 
 
-def _answer(peer: str, near: NearService) -> PathStage:
+def _answer(peer: str, near: NearService) -> Check:
     if near.answer:
-        return PathStage("answer", _OK, f"its server answers: {near.answer}")
-    return PathStage(
-        "answer", _FAIL, near.refusal or "no answer", f"is the server on {peer} alive? its node's log may tell"
+        return Check("answer", OK, f"its server answers: {near.answer}")
+    return Check(
+        "answer", FAIL, near.refusal or "no answer", f"is the server on {peer} alive? its node's log may tell"
     )
 
 
-def _calls(near: NearService) -> PathStage:
+def _calls(near: NearService) -> Check:
     text = f"{near.calls} from here, {near.failed} of them failed"
     if near.mismatch:
-        return PathStage("calls", StageResult.WARN, near.mismatch, "build both sides with one version of the service")
+        return Check("calls", WARN, near.mismatch, "build both sides with one version of the service")
     if near.problem:
-        return PathStage("calls", StageResult.WARN, f"{text}; the last time: {near.problem}", "docs/services.md")
-    return PathStage("calls", _OK, text)
+        return Check("calls", WARN, f"{text}; the last time: {near.problem}", "docs/services.md")
+    return Check("calls", OK, text)

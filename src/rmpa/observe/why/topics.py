@@ -15,7 +15,8 @@ from rmpa.bridge import limits as bridge_limits
 from rmpa.config import limits as config_limits
 from rmpa.config.values import did_you_mean
 from rmpa.mesh import limits as mesh_limits
-from rmpa.observe.why.diagnosis import Diagnosis, PathStage, StageResult
+from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
+from rmpa.observe.why.diagnosis import Diagnosis
 from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from rmpa.observe.why.diagnosis import BothSides, FarSource, NearTopic
 
 
-_OK, _WARN, _FAIL, _UNKNOWN = StageResult.OK, StageResult.WARN, StageResult.FAIL, StageResult.UNKNOWN
 _SEVERAL: Final = 2
 """Messages of which one may be on its way."""
 _FLOWING: Final = frozenset({"open", "lingering"})
@@ -37,7 +37,7 @@ def find_peer(snapshot: Snapshot, name: str) -> PeerInfo | None:
     return min(fitting, key=lambda p: p.state != "linked", default=None)
 
 
-def walk_peer(snapshot: Snapshot, name: str) -> tuple[PathStage, ...]:
+def walk_peer(snapshot: Snapshot, name: str) -> tuple[Check, ...]:
     """The first two stages: whether the peer is known, and whether it is linked."""
     agent = snapshot.agent
     peer = find_peer(snapshot, name)
@@ -52,21 +52,21 @@ def walk_peer(snapshot: Snapshot, name: str) -> tuple[PathStage, ...]:
             f"see that `rmpa up` runs there with --domain {agent.domain}; `rmpa doctor` on both checks multicast, "
             "and --seed HOST:PORT reaches it where there is none"
         )
-        return (PathStage("peer", _FAIL, text, remedy),)
+        return (Check("peer", FAIL, text, remedy),)
     if peer.conflicts:
         texts, remedies = zip(*(conflict.partition("; ")[::2] for conflict in peer.conflicts), strict=True)
         remedy = "; ".join(filter(None, remedies)) or "give each module a --name and an address of its own"
-        return (PathStage("peer", _FAIL, "; ".join(texts), remedy),)
+        return (Check("peer", FAIL, "; ".join(texts), remedy),)
     if peer.state == "relayed":
-        heard = PathStage("peer", _OK, f"{peer.name} is known ({peer.guid})")
-        return (heard, PathStage("link", _OK, f"no link of its own; {peer.via} passes on what it publishes"))
-    found = PathStage("peer", _OK, f"{peer.name} is known, by {peer.source or 'its link'} ({peer.guid})")
+        heard = Check("peer", OK, f"{peer.name} is known ({peer.guid})")
+        return (heard, Check("link", OK, f"no link of its own; {peer.via} passes on what it publishes"))
+    found = Check("peer", OK, f"{peer.name} is known, by {peer.source or 'its link'} ({peer.guid})")
     if peer.state != "linked" or peer.link is None:
         return (found, _unlinked(peer))
     return (found, _linked(peer))
 
 
-def _unlinked(peer: PeerInfo) -> PathStage:
+def _unlinked(peer: PeerInfo) -> Check:
     text = f"{peer.name} is {peer.state}"
     if peer.last_error:
         text += f": {peer.last_error}"
@@ -79,10 +79,10 @@ def _unlinked(peer: PeerInfo) -> PathStage:
     )
     if peer.state == "refused":
         remedy = "do what the text says; both sides are asked again by themselves"
-    return PathStage("link", _FAIL, text, remedy)
+    return Check("link", FAIL, text, remedy)
 
 
-def _linked(peer: PeerInfo) -> PathStage:
+def _linked(peer: PeerInfo) -> Check:
     link = peer.link
     assert link is not None  # noqa: S101 - asked before
     text = f"linked by {link.remote} for {link.up_ago:.0f} s"
@@ -90,10 +90,10 @@ def _linked(peer: PeerInfo) -> PathStage:
         text += f", round trip {link.rtt * 1e3:.1f} ms"
     if link.heard_ago is not None and link.heard_ago > mesh_limits.LINK_LEASE / 2:
         text += f"; silent for {link.heard_ago:.1f} s"
-        return PathStage("link", _WARN, text, "if it stays so, the cable or the radio is the place to look at")
+        return Check("link", WARN, text, "if it stays so, the cable or the radio is the place to look at")
     if link.path_problem:
-        return PathStage("link", _WARN, f"{text}; {link.path_problem}", link.path_remedy)
-    return PathStage("link", _OK, text)
+        return Check("link", WARN, f"{text}; {link.path_problem}", link.path_remedy)
+    return Check("link", OK, text)
 
 
 def walk_topic(sight: BothSides, peer: str, later: BothSides | None = None, wire: str = "") -> tuple[Diagnosis, ...]:
@@ -115,9 +115,9 @@ def walk_topic(sight: BothSides, peer: str, later: BothSides | None = None, wire
     name = known.name if known is not None else peer
     wire = wire or near.topic
     begin = walk_peer(snapshot, peer)
-    if known is not None and begin[-1].verdict is not _FAIL:
+    if known is not None and begin[-1].level is not FAIL:
         begin += (_published(sight, name, wire),)
-    if known is None or begin[-1].verdict is _FAIL:
+    if known is None or begin[-1].level is FAIL:
         return (_diagnosis(near, name, to, "", begin),)
     nodes = _nodes(sight, name)
     found = []
@@ -125,14 +125,14 @@ def walk_topic(sight: BothSides, peer: str, later: BothSides | None = None, wire
         stages = list(begin)
         for stage in _source_stages(sight, later, name, node, wire):
             stages.append(stage)
-            if stage.verdict is _FAIL:
+            if stage.level is FAIL:
                 break
         found.append(_diagnosis(near, name, to, node, tuple(stages)))
     return tuple(found)
 
 
-def _diagnosis(near: NearTopic, peer: str, to: str, node: str, stages: tuple[PathStage, ...]) -> Diagnosis:
-    flows = all(stage.verdict is not _FAIL for stage in stages)
+def _diagnosis(near: NearTopic, peer: str, to: str, node: str, stages: tuple[Check, ...]) -> Diagnosis:
+    flows = all(stage.level is not FAIL for stage in stages)
     return Diagnosis(name=near.topic, peer=peer, to=to, node=node, flows=flows, stages=stages)
 
 
@@ -158,36 +158,36 @@ def _route(sight: BothSides | None, peer: str, node: str) -> RouteInfo | None:
     return next((route for route in routes if route.node == node), None)
 
 
-def _published(sight: BothSides, peer: str, wire: str) -> PathStage:
+def _published(sight: BothSides, peer: str, wire: str) -> Check:
     far = sight.far
     if far is None:
         offered = [route.node for route in _routes(sight.near, peer)]
         if offered:
             text = f"its agent does not tell ({sight.refusal}), but it offered {wire} of {', '.join(offered)}"
-            return PathStage("publisher", _UNKNOWN, text)
+            return Check("publisher", UNKNOWN, text)
         text = f"{peer} offers no {wire}, and its agent does not tell why ({sight.refusal})"
-        return PathStage("publisher", _FAIL, text, f"ask on {peer} itself: rostopic info {wire}")
+        return Check("publisher", FAIL, text, f"ask on {peer} itself: rostopic info {wire}")
     if far.sources:
         nodes = ", ".join(source.node for source in far.sources)
         text = f"{nodes} on {peer} publish{'' if len(far.sources) > 1 else 'es'} {wire}"
         others = {source.topic for source in far.sources} - {"", wire}
-        return PathStage("publisher", _OK, f"{text} ({', '.join(sorted(others))} over there)" if others else text)
+        return Check("publisher", OK, f"{text} ({', '.join(sorted(others))} over there)" if others else text)
     if far.awaited:
         text = (
             f"{', '.join(far.awaited)} published {wire} before the agent of {peer} was restarted, and does not answer"
         )
         remedy = "it is asked again by itself; is that program stopped or stuck? Else start it again"
-        return PathStage("publisher", _FAIL, text, remedy)
+        return Check("publisher", FAIL, text, remedy)
     text = f"no node of {peer} publishes {wire}"
     if far.subscribers:
         text += f"; {', '.join(far.subscribers)} there only subscribe to it"
     remedy = f"start its publisher there, or see `rmpa topic list {peer}:/`"
     if far.near:
         remedy = f"did you mean {far.near}?"
-    return PathStage("publisher", _FAIL, text, remedy)
+    return Check("publisher", FAIL, text, remedy)
 
 
-def _source_stages(sight: BothSides, later: BothSides | None, peer: str, node: str, wire: str) -> Iterator[PathStage]:
+def _source_stages(sight: BothSides, later: BothSides | None, peer: str, node: str, wire: str) -> Iterator[Check]:
     """The stages of one publisher, lazily: nobody looks behind the first that fails."""
     far = _far(sight, node)
     yield _policy_there(far, peer)
@@ -197,7 +197,7 @@ def _source_stages(sight: BothSides, later: BothSides | None, peer: str, node: s
     if route is None:
         yield _not_offered(sight, far, peer)
         return
-    yield PathStage("offer", _OK, f"{sight.near.snapshot.agent.name} knows of it, as {route.type}")
+    yield Check("offer", OK, f"{sight.near.snapshot.agent.name} knows of it, as {route.type}")
     if route.limit:
         yield _limit(sight.near, route)
         return
@@ -208,7 +208,7 @@ def _source_stages(sight: BothSides, later: BothSides | None, peer: str, node: s
     now, now_far = _route(later, peer, node) or route, _far(later, node) or far
     yield _open_route(now, now_far, peer)
     if sight.far is not None and sight.far.path_problem:
-        yield PathStage("path", _WARN, f"{peer} says: {sight.far.path_problem}", sight.far.path_remedy)
+        yield Check("path", WARN, f"{peer} says: {sight.far.path_problem}", sight.far.path_remedy)
     if now.state in _FLOWING:
         yield _sent(now, now_far, peer, wire)
         yield _arrived(route, now, far, now_far, peer, sight.near.snapshot.agent.name)
@@ -216,90 +216,88 @@ def _source_stages(sight: BothSides, later: BothSides | None, peer: str, node: s
         yield _reading(sight, later, node)
 
 
-def _policy_there(far: FarSource | None, peer: str) -> PathStage:
+def _policy_there(far: FarSource | None, peer: str) -> Check:
     if far is None:
-        return PathStage("policy there", _UNKNOWN, f"{peer} did not tell")
+        return Check("policy there", UNKNOWN, f"{peer} did not tell")
     if far.crosses:
-        return PathStage("policy there", _OK, f"{peer} lets it cross: {far.rule}")
+        return Check("policy there", OK, f"{peer} lets it cross: {far.rule}")
     remedy = f"change [bridge] in the rmpa.toml of {peer}, and `rmpa reload` there"
     if far.rule.startswith("built in"):
         remedy = "no rule of yours can let it cross; republish it there under another name (topic_tools relay)"
-    return PathStage("policy there", _FAIL, f"{peer} keeps it at home: {far.rule}", remedy)
+    return Check("policy there", FAIL, f"{peer} keeps it at home: {far.rule}", remedy)
 
 
-def _unreachable(far: FarSource, peer: str) -> PathStage:
+def _unreachable(far: FarSource, peer: str) -> Check:
     """The node is registered over there, and nothing there can connect to it."""
     text = f"{far.node} is registered on {peer}, but cannot be reached at {far.unreachable}"
     remedy = (
         "if it is alive, start it with ROS_IP=127.0.0.1 (and no ROS_HOSTNAME) in its shell; if it is dead, "
         f"`rosnode cleanup` on {peer} removes it"
     )
-    return PathStage("reachable", _FAIL, text, remedy)
+    return Check("reachable", FAIL, text, remedy)
 
 
-def _not_offered(sight: BothSides, far: FarSource | None, peer: str) -> PathStage:
+def _not_offered(sight: BothSides, far: FarSource | None, peer: str) -> Check:
     if far is not None and far.type in ("", "*"):
         text = f"its node has not told {peer}'s core what type it is"
-        return PathStage("offer", _FAIL, text, "a publisher tells its type when it registers; is it an old script?")
+        return Check("offer", FAIL, text, "a publisher tells its type when it registers; is it an old script?")
     if far is not None and far.beyond:
         text = f"{peer} does not offer it: it has more topics than limits.topics = {far.beyond} of that module"
-        return PathStage(
-            "offer", _FAIL, text, "raise it over there and `rmpa reload`, or deny some by bridge.deny there"
-        )
+        return Check("offer", FAIL, text, "raise it over there and `rmpa reload`, or deny some by bridge.deny there")
     if far is not None and not far.offered:
         text = f"{peer} does not offer it: its name or type is none that can cross, or is too long"
-        return PathStage("offer", _FAIL, text, f"names of at most {config_limits.CROSSING_NAME_MAX} characters cross")
+        return Check("offer", FAIL, text, f"names of at most {config_limits.CROSSING_NAME_MAX} characters cross")
     peers = [p for p in sight.near.snapshot.peers if p.name == peer]
     for bound in (bound for p in peers for bound in p.beyond if bound.here and bound.kind == "topics"):
         text, _, remedy = bound.text.partition("; ")
-        return PathStage("limit", _FAIL, text, remedy)
+        return Check("limit", FAIL, text, remedy)
     count = peers[0].topics_in if peers else 0
     text = f"the offer of it has not come here ({count} topics of {peer} have)"
     remedy = (
         f"if it stays so for more than {bridge_limits.RECONCILE_INTERVAL:g} s, it is a bug of ours: both logs, please"
     )
-    return PathStage("offer", _FAIL, text, remedy)
+    return Check("offer", FAIL, text, remedy)
 
 
-def _limit(near: NearTopic, route: RouteInfo) -> PathStage:
+def _limit(near: NearTopic, route: RouteInfo) -> Check:
     """The place that there is none of: the setting, and how much else it hides."""
     peers = [p for p in near.snapshot.peers if p.name == route.peer]
     hidden = [b.hidden for p in peers for b in p.beyond if b.here and b.kind == route.limit]
     text = route.problem + (f"; {hidden[0]} {route.limit} of it are hidden" if hidden else "")
     remedy = f"raise limits.{route.limit} in this module's rmpa.toml and `rmpa reload`, or deny what is not needed"
-    return PathStage("limit", _FAIL, text, remedy)
+    return Check("limit", FAIL, text, remedy)
 
 
-def _policy_here(near: NearTopic, route: RouteInfo) -> PathStage:
+def _policy_here(near: NearTopic, route: RouteInfo) -> Check:
     if route.state == "hidden" and route.node not in near.conflict:
         remedy = "change [bridge] in this module's rmpa.toml, and `rmpa reload`"
-        return PathStage("policy here", _FAIL, f"this module does not take it: {route.problem}", remedy)
+        return Check("policy here", FAIL, f"this module does not take it: {route.problem}", remedy)
     was = f" (its {route.wire})" if route.wire else ""
-    return PathStage("policy here", _OK, f"this module takes it as {near.topic}{was}")
+    return Check("policy here", OK, f"this module takes it as {near.topic}{was}")
 
 
-def _type(near: NearTopic, route: RouteInfo) -> PathStage:
+def _type(near: NearTopic, route: RouteInfo) -> Check:
     if route.node in near.conflict:
         text, _, remedy = route.problem.partition("; ")
-        return PathStage("type", _FAIL, text, remedy)
-    return PathStage("type", _OK, f"no local publisher has another type than {route.type}")
+        return Check("type", FAIL, text, remedy)
+    return Check("type", OK, f"no local publisher has another type than {route.type}")
 
 
-def _in_graph(near: NearTopic, route: RouteInfo) -> PathStage:
+def _in_graph(near: NearTopic, route: RouteInfo) -> Check:
     proxy = near.proxies.get(route.node, f"/rmpa/{route.peer}{route.node}")
     if route.node not in near.registered:
         text = f"its proxy {proxy} is not in the local graph as a publisher of {near.topic}"
         if route.problem:
             problem, _, remedy = route.problem.partition("; ")
-            return PathStage("graph", _FAIL, f"{text}: {problem}", remedy)
+            return Check("graph", FAIL, f"{text}: {problem}", remedy)
         remedy = (
             f"it is put there again within {bridge_limits.RECONCILE_INTERVAL:g} s; if not, the agent's log says why"
         )
-        return PathStage("graph", _FAIL, text, remedy)
-    return PathStage("graph", _OK, f"its proxy {proxy} stands in the local graph")
+        return Check("graph", FAIL, text, remedy)
+    return Check("graph", OK, f"its proxy {proxy} stands in the local graph")
 
 
-def _subscriber(near: NearTopic, route: RouteInfo) -> Iterator[PathStage]:
+def _subscriber(near: NearTopic, route: RouteInfo) -> Iterator[Check]:
     """Who listens here, and whether somebody was refused."""
     readers = near.readers.get(route.node, ())
     topics = [topic for topic in near.snapshot.topics if topic.name == near.topic]
@@ -307,17 +305,17 @@ def _subscriber(near: NearTopic, route: RouteInfo) -> Iterator[PathStage]:
     refused = near.mismatches.get(route.node, ())
     if not readers:
         if refused:
-            yield PathStage("subscriber", _OK, f"{', '.join(listed) or 'a node'} wants it")
+            yield Check("subscriber", OK, f"{', '.join(listed) or 'a node'} wants it")
             remedy = "build both sides with one version of the message; `rosmsg md5 TYPE` on both shows which differs"
-            yield PathStage("md5", _FAIL, "; ".join(refused), remedy)
+            yield Check("md5", FAIL, "; ".join(refused), remedy)
         elif listed:
             text = f"{', '.join(listed)} subscribes, but has not connected to its proxy"
             files = near.snapshot.agent.files
             if files is not None and files.problem:
                 problem, _, remedy = files.problem.partition("; ")
-                yield PathStage(
+                yield Check(
                     "subscriber",
-                    _FAIL,
+                    FAIL,
                     f"{text}; the agent has no file descriptor to accept it with: {problem}",
                     remedy,
                 )
@@ -326,62 +324,60 @@ def _subscriber(near: NearTopic, route: RouteInfo) -> Iterator[PathStage]:
                 "look into that node's log; its ROS_IP and ROS_HOSTNAME must be of this machine, and its "
                 f"ROS_MASTER_URI {near.snapshot.agent.core_uri}: `rmpa doctor`"
             )
-            yield PathStage("subscriber", _FAIL, text, remedy)
+            yield Check("subscriber", FAIL, text, remedy)
         else:
             text = f"no node here subscribes to {near.topic}, so nothing is sent"
-            yield PathStage("subscriber", _FAIL, text, f"that is no fault; to try it: rmpa topic echo {near.topic}")
+            yield Check("subscriber", FAIL, text, f"that is no fault; to try it: rmpa topic echo {near.topic}")
         return
-    yield PathStage("subscriber", _OK, f"{', '.join(dict.fromkeys(r.node for r in readers))} connected to its proxy")
+    yield Check("subscriber", OK, f"{', '.join(dict.fromkeys(r.node for r in readers))} connected to its proxy")
     if refused:
-        yield PathStage("md5", _WARN, "; ".join(refused), "build both sides with one version of the message")
+        yield Check("md5", WARN, "; ".join(refused), "build both sides with one version of the message")
     elif route.md5:
-        yield PathStage("md5", _OK, f"{route.md5} on both sides")
+        yield Check("md5", OK, f"{route.md5} on both sides")
 
 
-def _open_route(route: RouteInfo, far: FarSource | None, peer: str) -> PathStage:
+def _open_route(route: RouteInfo, far: FarSource | None, peer: str) -> Check:
     if route.state in _FLOWING:
         lane = f", {route.lane} lane" if route.lane else ""
-        return PathStage("route", _OK, f"open{lane}{', latched' if route.latched else ''}")
+        return Check("route", OK, f"open{lane}{', latched' if route.latched else ''}")
     if route.state == "opening":
         text = f"{peer} has been asked for it and has not answered"
         if far is not None and far.route == "opening":
-            return PathStage(
+            return Check(
                 "route",
-                _FAIL,
+                FAIL,
                 f"{peer}'s agent waits for the publisher {route.node} to answer its connection",
                 f"is that node stopped or stuck? on {peer}: rosnode ping {route.node}",
             )
-        return PathStage("route", _FAIL, text, "ask again in a moment; if it stays so, see the log there")
+        return Check("route", FAIL, text, "ask again in a moment; if it stays so, see the log there")
     problem = route.problem or "nobody has asked for it yet"
     remedy = f"it is tried again by itself; on {peer}: rosnode info {route.node}"
-    return PathStage("route", _FAIL, f"{route.state}: {problem}", remedy)
+    return Check("route", FAIL, f"{route.state}: {problem}", remedy)
 
 
-def _sent(route: RouteInfo, far: FarSource | None, peer: str, wire: str) -> PathStage:
+def _sent(route: RouteInfo, far: FarSource | None, peer: str, wire: str) -> Check:
     if far is None:
-        return PathStage("sent", _UNKNOWN, f"{peer} did not tell")
+        return Check("sent", UNKNOWN, f"{peer} did not tell")
     if far.oversized:
         text = f"{far.oversized} messages of its publisher {route.node} are too long, the last has "
         text += f"{far.oversized_bytes} bytes, and at most {ros_limits.TCPROS_MESSAGE_MAX} cross"
         text += f"; {far.messages} others came" if far.messages else ""
-        return PathStage("sent", _WARN if far.messages else _FAIL, text, "send them in parts, or compressed")
+        return Check("sent", WARN if far.messages else FAIL, text, "send them in parts, or compressed")
     if not far.messages and not route.messages:
         text = f"its publisher {route.node} is connected, and has published nothing since"
-        return PathStage("sent", _FAIL, text, f"look at that node; on {peer}: rostopic hz {wire}")
+        return Check("sent", FAIL, text, f"look at that node; on {peer}: rostopic hz {wire}")
     text = f"{far.messages} messages from its publisher so far"
     if far.lost:
         text += f"; {far.lost} of them given up, while {peer} had no link to this module or a slow one"
-        return PathStage("sent", _WARN, text, "a longer outage, or more depth, in [[contract]] keeps more")
+        return Check("sent", WARN, text, "a longer outage, or more depth, in [[contract]] keeps more")
     if far.dropped:
-        return PathStage(
-            "sent", _WARN, f"{text}; {far.dropped} given up over there", "the link is slower than the topic"
-        )
-    return PathStage("sent", _OK, text)
+        return Check("sent", WARN, f"{text}; {far.dropped} given up over there", "the link is slower than the topic")
+    return Check("sent", OK, text)
 
 
 def _arrived(
     before: RouteInfo, now: RouteInfo, far: FarSource | None, far_now: FarSource | None, peer: str, here: str
-) -> PathStage:
+) -> Check:
     moved = now.messages - before.messages
     sent = far_now.messages - far.messages if far is not None and far_now is not None else None
     rarely = (
@@ -391,7 +387,7 @@ def _arrived(
         text = f"{peer} has {'sent ' + str(sent) if sent else 'sent some'} meanwhile, and none arrived at {here}"
         dropped = f" ({far_now.dropped} were given up over there)" if far_now is not None and far_now.dropped else ""
         remedy = "is the link too slow? `rmpa peer info`; a max_rate or priority helps (docs/contracts.md)"
-        return PathStage("arrived", _FAIL, text + dropped, remedy)
+        return Check("arrived", FAIL, text + dropped, remedy)
     age = now.age or 0.0
     usual = now.period.p99 if now.period is not None else None
     text = f"{now.messages} messages, the last {age:.2f} s ago"
@@ -403,40 +399,40 @@ def _arrived(
         and age > max(bridge_limits.WHY_SILENT, bridge_limits.WHY_SILENT_PERIODS * usual)
     ):
         text = f"nothing for {age:.1f} s; until then a message came every {usual * 1e3:.0f} ms at the latest"
-        return PathStage("arrived", _FAIL, text, f"its publisher {now.node} on {peer} has fallen silent: look at it")
+        return Check("arrived", FAIL, text, f"its publisher {now.node} on {peer} has fallen silent: look at it")
     if usual is None and not now.latched and age > bridge_limits.WHY_SILENT:
-        return PathStage("arrived", _WARN, text, "a topic of few messages? nothing tells how often they should come")
-    return PathStage("arrived", _OK, text)
+        return Check("arrived", WARN, text, "a topic of few messages? nothing tells how often they should come")
+    return Check("arrived", OK, text)
 
 
-def _contract(route: RouteInfo) -> PathStage:
+def _contract(route: RouteInfo) -> Check:
     missing = {key: getattr(route, key) for key in ("lost", "late", "expired") if getattr(route, key)}
     events = {kind: count for kind, count in route.events.items() if kind != "messages_lost"}
     if not missing and not events:
         said = ", ".join(f"{key} {value}" for key, value in route.contract.items())
-        return PathStage("contract", _OK, f"kept ({said})" if said else "nothing lost, late or expired")
+        return Check("contract", OK, f"kept ({said})" if said else "nothing lost, late or expired")
     parts = [f"{count} {key}" for key, count in missing.items()]
     parts += [f"{kind.replace('_', ' ')} {count} times" for kind, count in events.items()]
     remedy = "`rmpa topic info` tells when; docs/contracts.md what to do"
     if "lost" in missing and route.contract.get("reliability") == "reliable":
         remedy = "a longer outage, or more depth, in [[contract]] keeps more; `rmpa topic info` tells when"
-    return PathStage("contract", _WARN, ", ".join(parts), remedy)
+    return Check("contract", WARN, ", ".join(parts), remedy)
 
 
-def _reading(sight: BothSides, later: BothSides | None, node: str) -> PathStage:
+def _reading(sight: BothSides, later: BothSides | None, node: str) -> Check:
     before = {reader.number: reader for reader in sight.near.readers.get(node, ())}
     after = (later or sight).near.readers.get(node, ())
     if not after:
-        return PathStage("reader", _FAIL, "its subscribers have just left", "start them again")
+        return Check("reader", FAIL, "its subscribers have just left", "start them again")
     stuck = [reader for reader in after if reader.waiting and before.get(reader.number, reader).waiting]
     slow = [reader for reader in after if reader.dropped]
     names = ", ".join(f"{reader.node} ({reader.waiting} B wait, {reader.dropped} dropped)" for reader in stuck)
     remedy = "its callbacks are too slow, or it is stopped; nobody else waits for it"
     if stuck and len(stuck) == len(after):
-        return PathStage("reader", _FAIL, f"{names} does not read", remedy)
+        return Check("reader", FAIL, f"{names} does not read", remedy)
     if stuck:
-        return PathStage("reader", _WARN, f"{names} does not keep up; others do", remedy)
+        return Check("reader", WARN, f"{names} does not keep up; others do", remedy)
     if slow:
         text = ", ".join(f"{reader.node} has missed {reader.dropped}" for reader in slow)
-        return PathStage("reader", _WARN, text, remedy)
-    return PathStage("reader", _OK, f"{', '.join(dict.fromkeys(r.node for r in after))} takes them")
+        return Check("reader", WARN, text, remedy)
+    return Check("reader", OK, f"{', '.join(dict.fromkeys(r.node for r in after))} takes them")

@@ -11,8 +11,8 @@ from rmpa.config.settings import Settings
 from rmpa.config.sources import Flags, load_settings
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.observe import limits
+from rmpa.observe.check import FAIL, OK, WARN, Check
 from rmpa.observe.doctor.agents import judge_agents
-from rmpa.observe.doctor.finding import Finding, FindingLevel
 from rmpa.observe.doctor.io import machine, network
 from rmpa.observe.doctor.io.programs import resolve
 from rmpa.observe.doctor.machine import judge_clock, judge_rights
@@ -39,7 +39,7 @@ class DoctorInput:
 
     environ: Mapping[str, str]
     settings: Settings
-    problems: tuple[Finding, ...]
+    problems: tuple[Check, ...]
     agents: Mapping[str, Snapshot | str]
 
     @property
@@ -59,13 +59,13 @@ def look_at(environ: Mapping[str, str], config: str | None = None) -> DoctorInpu
     try:
         loaded = load_settings(Flags(config=config), environ, host_name=socket.gethostname())
     except ConfigError as error:
-        problems.append(Finding("settings", error.source, FindingLevel.FAIL, str(error), "`rmpa up` will not start"))
+        problems.append(Check("settings", FAIL, str(error), "`rmpa up` will not start", where=error.source))
     else:
         settings = loaded.settings
         where = f"read from {settings.config_file}" if settings.config_file else "no file; defaults and variables"
         text = f"{where}: name {settings.name}, domain {settings.domain}"
-        problems.append(Finding("settings", "", FindingLevel.OK, text))
-        problems += [Finding("settings", "", FindingLevel.WARN, note) for note in loaded.notes]
+        problems.append(Check("settings", OK, text))
+        problems += [Check("settings", WARN, note) for note in loaded.notes]
     agents: dict[str, Snapshot | str] = {}
     for found in find_agents(environ):
         try:
@@ -76,7 +76,7 @@ def look_at(environ: Mapping[str, str], config: str | None = None) -> DoctorInpu
     return DoctorInput(environ, settings, tuple(problems), agents)
 
 
-def examine(patient: DoctorInput) -> Iterator[Finding]:
+def examine(patient: DoctorInput) -> Iterator[Check]:
     """Each finding as soon as it is there; the whole takes some two seconds."""
     settings, snapshots = patient.settings, patient.snapshots
     yield from patient.problems

@@ -14,7 +14,7 @@ import psutil
 from rmpa.core.errors import StartError
 from rmpa.discovery.io.interfaces import choose, list_interfaces
 from rmpa.discovery.io.sockets import open_receiver
-from rmpa.observe.doctor.finding import Finding, FindingLevel
+from rmpa.observe.check import FAIL, SKIPPED, WARN, Check
 from rmpa.observe.doctor.firewall import judge_rules, read_iptables, read_nft
 from rmpa.observe.doctor.io.multicast import hear_ourselves
 from rmpa.observe.doctor.io.programs import ask_program
@@ -68,15 +68,15 @@ def in_container() -> bool:
     return False
 
 
-def look_at_multicast(settings: Settings) -> list[Finding]:
+def look_at_multicast(settings: Settings) -> list[Check]:
     """Send and hear on each interface that an agent would use, at the agents' own port."""
     usable = choose(list_interfaces(), settings.interfaces)
     if not settings.multicast:
-        return [Finding("multicast", "", FindingLevel.SKIPPED, "the settings switch it off (discovery.multicast)")]
+        return [Check("multicast", SKIPPED, "the settings switch it off (discovery.multicast)")]
     try:
         heard = hear_ourselves(usable, settings.group, settings.discovery_port)
     except StartError as error:
-        return [Finding("multicast", "", FindingLevel.FAIL, f"{error.what} {error.problem}", error.remedy)]
+        return [Check("multicast", FAIL, f"{error.what} {error.problem}", error.remedy)]
     echoes = [MulticastEcho(one.interface.name, one.problem, one.after) for one in heard]
     return judge_multicast(echoes, settings.group, settings.discovery_port)
 
@@ -172,7 +172,7 @@ def _name(pid: int | None, agents: Mapping[int, str]) -> str:
     return f"a program (pid {pid})"
 
 
-def look_at_firewall(settings: Settings) -> list[Finding]:
+def look_at_firewall(settings: Settings) -> list[Check]:
     """What nftables, iptables and their front ends say."""
     numbers = frozenset({settings.discovery_port, *((settings.port,) if settings.port else ())})
     needed = f"UDP port {settings.discovery_port}, and the mesh's port (TCP and UDP"
@@ -184,21 +184,17 @@ def look_at_firewall(settings: Settings) -> list[Finding]:
             found.append(judge_rules(read(text, numbers), needed))
     if not found:
         why = "only root may read them" if os.geteuid() else "neither nft nor iptables is here, or they do not answer"
-        found.append(
-            Finding("firewall", "rules", FindingLevel.SKIPPED, why, "" if not os.geteuid() else "run it by sudo")
-        )
+        found.append(Check("firewall", SKIPPED, why, "" if not os.geteuid() else "run it by sudo", where="rules"))
     return found + _front_ends(needed)
 
 
-def _front_ends(needed: str) -> list[Finding]:
+def _front_ends(needed: str) -> list[Check]:
     found = []
     with contextlib.suppress(OSError):
         if "ENABLED=yes" in Path("/etc/ufw/ufw.conf").read_text(encoding="utf-8", errors="replace"):
             text = f"is switched on: it must let in {needed}"
-            found.append(Finding("firewall", "ufw", FindingLevel.WARN, text, "`sudo ufw status` shows its rules"))
+            found.append(Check("firewall", WARN, text, "`sudo ufw status` shows its rules", where="ufw"))
     if any(process.info["name"] == "firewalld" for process in psutil.process_iter(["name"])):
         text = f"runs: its zone must let in {needed}"
-        found.append(
-            Finding("firewall", "firewalld", FindingLevel.WARN, text, "`firewall-cmd --list-all` shows its zone")
-        )
+        found.append(Check("firewall", WARN, text, "`firewall-cmd --list-all` shows its zone", where="firewalld"))
     return found
