@@ -33,7 +33,7 @@ from rmpa.observe.doctor.network import (
     judge_rp_filter,
 )
 from rmpa.observe.doctor.ros_environment import judge_shell
-from rmpa.observe.health import Health
+from rmpa.observe.health import Health, diagnostic_status
 from rmpa.observe.snapshot import (
     EventInfo,
     FilesInfo,
@@ -226,7 +226,8 @@ def diagnostics() -> bytes:
     """The messages on /diagnostics as TCPROS sends them, one after the other."""
     health, messages = Health(), []
     for second, snapshot in enumerate(snapshots()):
-        parts = [status.serialize() for status in health.judge(snapshot, float(second))]
+        checks = health.judge(snapshot, float(second))
+        parts = [diagnostic_status(check, snapshot.agent.name).serialize() for check in checks]
         messages.append(frame_array(second, second * 1_000_000_000, parts))
     return b"".join(messages)
 

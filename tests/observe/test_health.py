@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from rmpa.observe import limits
-from rmpa.observe.health import HERE, Health
+from rmpa.observe.health import HERE, Health, diagnostic_status
 from rmpa.observe.snapshot import EventInfo, FilesInfo, PeerInfo, RouteInfo, ServiceInfo, Snapshot, UnreachableInfo
 from rmpa.ros.types.diagnostic_array import DiagnosticLevel, DiagnosticStatus
 from tests.observe.samples import SNAPSHOT
@@ -23,7 +23,7 @@ def with_routes(*routes: RouteInfo, peers: tuple[PeerInfo, ...] = SNAPSHOT.peers
 
 
 def judged(health: Health, snapshot: Snapshot, now: float = 0.0) -> dict[str, DiagnosticStatus]:
-    statuses = list(health.judge(snapshot, now))
+    statuses = [diagnostic_status(check, snapshot.agent.name) for check in health.judge(snapshot, now)]
     found = {status.name: status for status in statuses}
     assert len(found) == len(statuses), "names are unique"
     return found

@@ -178,7 +178,7 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
     beyond: tuple[BoundInfo, ...] = ()
 
 
-class LatencySpread(msgspec.Struct, kw_only=True, frozen=True):
+class SampleSpread(msgspec.Struct, kw_only=True, frozen=True):
     """How samples are spread, in seconds. The percentiles are linear between neighbours.
 
     Attributes:
@@ -200,7 +200,7 @@ class LatencySpread(msgspec.Struct, kw_only=True, frozen=True):
     p99: float
 
 
-class LatencyInfo(LatencySpread, kw_only=True, frozen=True):
+class LatencyInfo(SampleSpread, kw_only=True, frozen=True):
     """One-way latencies, from the publisher's agent taking a message to this agent handing it on.
 
     Attributes:
@@ -294,7 +294,7 @@ class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
     age: float | None = None
     rate: float | None = None
     bandwidth: float | None = None
-    period: LatencySpread | None = None
+    period: SampleSpread | None = None
     jitter: float | None = None
     latency: LatencyInfo | None = None
     latched: bool = False
@@ -377,7 +377,7 @@ class ServiceInfo(msgspec.Struct, kw_only=True, frozen=True):
     calls: int = 0
     failed: int = 0
     active: int = 0
-    latency: LatencySpread | None = None
+    latency: SampleSpread | None = None
     crosses: bool = True
     policy: str = ""
     hidden: str = ""

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rmpa.bridge import limits as bridge_limits
 from rmpa.config import limits as config_limits
 from rmpa.observe.check import Check, CheckLevel
-from rmpa.observe.snapshot import FilesInfo, LatencySpread, LinkInfo, PeerInfo, RouteInfo, Snapshot, TopicInfo
+from rmpa.observe.snapshot import FilesInfo, LinkInfo, PeerInfo, RouteInfo, SampleSpread, Snapshot, TopicInfo
 from rmpa.observe.why.diagnosis import (
     BothSides,
     Diagnosis,
@@ -55,7 +55,7 @@ ROUTE = RouteInfo(
     messages=100,
     age=0.05,
     rate=20.0,
-    period=LatencySpread(count=99, mean=0.05, sd=0.001, min=0.049, max=0.052, p50=0.05, p99=0.0515),
+    period=SampleSpread(count=99, mean=0.05, sd=0.001, min=0.049, max=0.052, p50=0.05, p99=0.0515),
     lane="express",
 )
 SOURCE = FarSource(node="/joy", type="sensor_msgs/Joy", rule="bridge.allow has '/**'", route="open", messages=100)

@@ -10,7 +10,7 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from rmpa.observe import limits
-from rmpa.observe.health import Health
+from rmpa.observe.health import Health, diagnostic_status
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.types.diagnostic_array import ARRAY_DEFINITION, ARRAY_MD5, ARRAY_TYPE, frame_array
 from rmpa.ros.wire.tcpros import TopicDescription
@@ -84,8 +84,8 @@ class Diagnostics:
 
     def _publish(self) -> None:
         self._sequence += 1
-        parts = []
-        for status in self._health.judge(self._view.snapshot(), self._clock.now()):
-            parts.append(status.serialize())
+        snapshot, parts = self._view.snapshot(), []
+        for check in self._health.judge(snapshot, self._clock.now()):
+            parts.append(diagnostic_status(check, snapshot.agent.name).serialize())
             yield_to_data()
         self._publication.publish_framed(frame_array(self._sequence, self._clock.wall_ns(), parts))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rmpa.observe.snapshot import LatencySpread, ServiceInfo
+from rmpa.observe.snapshot import SampleSpread, ServiceInfo
 from rmpa.runtime.event_loop import yield_to_data
 
 if TYPE_CHECKING:
@@ -88,11 +88,11 @@ class ServicesSection:
         )
 
 
-def _latency(stats: CallStats | None) -> LatencySpread | None:
+def _latency(stats: CallStats | None) -> SampleSpread | None:
     if stats is None or not stats.latencies.total:
         return None
     summary = stats.latencies.summary()
-    return LatencySpread(
+    return SampleSpread(
         count=summary.count,
         mean=summary.mean,
         sd=summary.sd,

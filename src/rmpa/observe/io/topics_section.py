@@ -16,7 +16,7 @@ from rmpa.bridge.topics.imports import RouteState
 from rmpa.config.param_rules import CLOCK
 from rmpa.core import limits
 from rmpa.core.contract import KEYS, Contract, Contracts
-from rmpa.observe.snapshot import EventInfo, LatencyInfo, LatencySpread, RouteInfo, TopicInfo, UnreachableInfo
+from rmpa.observe.snapshot import EventInfo, LatencyInfo, RouteInfo, SampleSpread, TopicInfo, UnreachableInfo
 from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.runtime.event_loop import breathing_sorted, yield_to_data, yielding_to_data
 from rmpa.runtime.system_clock import SystemClock
@@ -274,10 +274,10 @@ def _known(figure: float) -> float | None:
     return None if math.isnan(figure) else figure
 
 
-def _spread(summary: SampleSummary) -> LatencySpread | None:
+def _spread(summary: SampleSummary) -> SampleSpread | None:
     if not summary.count:
         return None
-    return LatencySpread(
+    return SampleSpread(
         count=summary.count,
         mean=summary.mean,
         sd=summary.sd,
