@@ -25,7 +25,7 @@ from rmpa.observe.doctor.network import (
     MulticastEcho,
     NetworkInterface,
     Port,
-    judge_cards,
+    judge_interfaces,
     judge_mtu_probing,
     judge_multicast,
     judge_ports,
@@ -98,14 +98,14 @@ def findings() -> Iterator[Check]:
     }
     yield from judge_agents(shown, "0.1.0")
     yield from judge_agents({"older": SNAPSHOT}, "0.2.0")
-    yield from judge_cards((LO, WLAN, ETH), ())
-    yield from judge_cards((LO, NetworkInterface("eth0", up=False, used=False)), ())
-    yield from judge_cards((LO,), ())
-    yield from judge_cards((LO, replace(ETH, used=False)), ("lo",))
-    yield from judge_cards((LO, WLAN), ("wlan0", "eth7"))
+    yield from judge_interfaces((LO, WLAN, ETH), ())
+    yield from judge_interfaces((LO, NetworkInterface("eth0", up=False, used=False)), ())
+    yield from judge_interfaces((LO,), ())
+    yield from judge_interfaces((LO, replace(ETH, used=False)), ("lo",))
+    yield from judge_interfaces((LO, WLAN), ("wlan0", "eth7"))
     odd = {"tun0": "10.8.0.2/32", "docker0": "172.17.0.1/16", "usb0": "169.254.3.4/16", "eth1": "10.0.0.2/24"}
     cards = (LO, ETH, *(NetworkInterface(name, (IPv4Interface(at),)) for name, at in odd.items()))
-    yield from judge_cards(cards, (), container=True)
+    yield from judge_interfaces(cards, (), container=True)
     echoes = (MulticastEcho("lo", after=0.0002), MulticastEcho("eth0"), MulticastEcho("wlan0", "not permitted"))
     yield from judge_multicast(echoes, "239.255.82.77", 11411)
     for rules in (

@@ -11,7 +11,7 @@ from rmpa.observe.doctor.network import (
     MulticastEcho,
     NetworkInterface,
     Port,
-    judge_cards,
+    judge_interfaces,
     judge_mtu_probing,
     judge_multicast,
     judge_ports,
@@ -32,26 +32,26 @@ def only(found: list[Check], level: CheckLevel) -> Check:
 
 
 def test_two_ordinary_interfaces_are_fine() -> None:
-    found = judge_cards((LO, WLAN, ETH), ())
+    found = judge_interfaces((LO, WLAN, ETH), ())
     assert {finding.level for finding in found} == {CheckLevel.OK}
     assert [finding.where for finding in found] == ["wlan0", "eth0"]
     assert exit_code(found) == 0
 
 
 def test_no_network_at_all() -> None:
-    warned = only(judge_cards((LO, NetworkInterface("eth0", up=False, used=False)), ()), CheckLevel.WARN)
+    warned = only(judge_interfaces((LO, NetworkInterface("eth0", up=False, used=False)), ()), CheckLevel.WARN)
     assert "none but loopback" in warned.text
     assert "eth0" in warned.remedy
-    assert only(judge_cards((LO,), ()), CheckLevel.WARN).remedy == "plug in a network"
+    assert only(judge_interfaces((LO,), ()), CheckLevel.WARN).remedy == "plug in a network"
 
 
 def test_settings_that_keep_to_loopback_mean_it() -> None:
-    (found,) = judge_cards((LO, NetworkInterface("eth0", ETH.networks, used=False)), ("lo",))
+    (found,) = judge_interfaces((LO, NetworkInterface("eth0", ETH.networks, used=False)), ("lo",))
     assert (found.where, found.level) == ("lo", CheckLevel.OK)
 
 
 def test_an_interface_that_the_settings_name_and_that_is_not_there() -> None:
-    warned = only(judge_cards((LO, WLAN), ("wlan0", "eth7")), CheckLevel.WARN)
+    warned = only(judge_interfaces((LO, WLAN), ("wlan0", "eth7")), CheckLevel.WARN)
     assert warned.where == "eth7"
     assert "there are lo, wlan0" in warned.text
 
@@ -59,35 +59,36 @@ def test_an_interface_that_the_settings_name_and_that_is_not_there() -> None:
 @pytest.mark.parametrize("name", ["tun0", "wg0", "tailscale0", "ztabc"])
 def test_a_tunnel_carries_no_multicast(name: str) -> None:
     warned = only(
-        judge_cards((LO, WLAN, NetworkInterface(name, (IPv4Interface("10.8.0.2/32"),))), ()), CheckLevel.WARN
+        judge_interfaces((LO, WLAN, NetworkInterface(name, (IPv4Interface("10.8.0.2/32"),))), ()), CheckLevel.WARN
     )
     assert warned.where == name
     assert "--seed" in warned.remedy
 
 
 def test_interfaces_of_containers_are_named_but_no_trouble() -> None:
-    found = judge_cards((LO, WLAN, NetworkInterface("docker0", (IPv4Interface("172.17.0.1/16"),))), ())
+    found = judge_interfaces((LO, WLAN, NetworkInterface("docker0", (IPv4Interface("172.17.0.1/16"),))), ())
     assert exit_code(found) == 0
     assert "containers" in next(finding.text for finding in found if finding.where == "docker0")
 
 
 def test_an_address_that_no_dhcp_gave() -> None:
     warned = only(
-        judge_cards((LO, NetworkInterface("eth0", (IPv4Interface("169.254.3.4/16"),))), ()), CheckLevel.WARN
+        judge_interfaces((LO, NetworkInterface("eth0", (IPv4Interface("169.254.3.4/16"),))), ()), CheckLevel.WARN
     )
     assert "DHCP" in warned.text
 
 
 def test_two_interfaces_in_one_network() -> None:
     warned = only(
-        judge_cards((LO, WLAN, NetworkInterface("eth0", (IPv4Interface("192.168.1.6/24"),))), ()), CheckLevel.WARN
+        judge_interfaces((LO, WLAN, NetworkInterface("eth0", (IPv4Interface("192.168.1.6/24"),))), ()),
+        CheckLevel.WARN,
     )
     assert warned.where == "wlan0+eth0"
     assert "192.168.1.0/24" in warned.text
 
 
 def test_a_container_with_a_network_of_its_own() -> None:
-    warned = only(judge_cards((LO, ETH), (), container=True), CheckLevel.WARN)
+    warned = only(judge_interfaces((LO, ETH), (), container=True), CheckLevel.WARN)
     assert "--network host" in warned.remedy
 
 

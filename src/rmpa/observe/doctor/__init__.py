@@ -1,1 +1,1 @@
-"""TODO room."""
+"""Everything that ``rmpa doctor`` looks at."""

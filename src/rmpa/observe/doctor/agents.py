@@ -1,4 +1,4 @@
-"""Judges the agents that run on this machine, by what they show of themselves."""
+"""Judges the agents of this machine by their snapshots."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 
 def judge_agents(agents: Mapping[str, Snapshot | str], version: str) -> list[Check]:
-    """Whether agents run, are healthy, and have found others.
+    """Whether agents run, are healthy, and have found peers.
 
     Args:
-        agents: What each shows, by its name; or why it does not answer.
-        version: Of this program.
+        agents: The snapshot of each by its name, or why it does not answer.
+        version: The version of this program.
     """
     if not agents:
         text = "none runs here, so what only an agent knows was not looked at"

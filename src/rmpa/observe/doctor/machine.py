@@ -1,4 +1,4 @@
-"""Judges the machine: clock, rights for real time, open files."""
+"""Judges the machine: wall clock, rights for real time, limit of open files."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 
 @dataclass(frozen=True, slots=True)
 class WallClock:
-    """What is known of the wall clock.
+    """The state of the wall clock.
 
     Args:
-        stepped: Seconds that it went apart from the monotonic one while it was looked at.
-        synchronised: Whether the kernel is told that it follows another one (NTP); ``None`` if it does not tell.
-        error: The bound of its error that the kernel was told, seconds.
-        year: That it shows.
+        stepped: Seconds by which it moved against the monotonic clock while it was watched.
+        synchronised: Whether it follows another clock (NTP), as the kernel says; ``None`` if it does not say.
+        error: The bound of its error, as the kernel says; seconds.
+        year: The year that it shows.
     """
 
     stepped: float
@@ -27,9 +27,9 @@ class WallClock:
 
 
 def judge_clock(clock: WallClock) -> list[Check]:
-    """Whether stamps made here can be trusted."""
+    """Whether time stamps made here can be trusted."""
     found = []
-    if clock.year < 2020:  # a board without a battery begins in 1970, or at its image's date
+    if clock.year < 2020:  # without a battery a board starts in 1970, or at its image's date
         text = f"it is the year {clock.year} here: this machine has no clock that outlives its power"
         found.append(Check("clock", FAIL, text, "let chrony or systemd-timesyncd set it", where="date"))
     if abs(clock.stepped) > limits.DOCTOR_CLOCK_STEP:
@@ -50,7 +50,7 @@ def judge_clock(clock: WallClock) -> list[Check]:
 
 
 def judge_peer_clock(agent: str, peer: str, offset: float, error: float | None) -> Check:
-    """Whether two modules' clocks agree well enough for tf and for message filters."""
+    """Whether two modules' clocks agree well enough for tf and message filters; both in seconds."""
     subject = f"{agent}-{peer}"
     bound = f" ±{error * 1e3:.1f} ms" if error is not None else ""
     text = f"{peer}'s clock is {abs(offset) * 1e3:.1f} ms{bound} {'ahead of' if offset > 0 else 'behind'} ours"
@@ -62,14 +62,14 @@ def judge_peer_clock(agent: str, peer: str, offset: float, error: float | None) 
 
 @dataclass(frozen=True, slots=True)
 class KernelRights:
-    """What this user may ask of the kernel.
+    """What the kernel allows this user.
 
     Args:
         fifo: Why SCHED_FIFO is refused, or empty.
-        memlock: Bytes that may be locked; ``None`` for any number.
+        memlock: Bytes that may be locked in memory; ``None`` for any number.
         wanted: Whether the settings ask for real time.
-        files: Open files that a program started here may have at the most; ``None`` where agents run, which tell
-            theirs.
+        files: Files that a program started here may open; ``None`` where an agent runs, whose snapshot has its own
+            limit.
     """
 
     fifo: str
@@ -79,7 +79,7 @@ class KernelRights:
 
 
 def judge_rights(rights: KernelRights) -> list[Check]:
-    """Whether ``rmpa up --realtime`` would get what it asks for, and whether there are files enough."""
+    """Whether ``rmpa up --realtime`` would get what it asks for, and whether an agent may open enough files."""
     missing = []
     if rights.fifo:
         missing.append(f"no SCHED_FIFO ({rights.fifo})")
