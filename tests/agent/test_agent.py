@@ -235,7 +235,7 @@ async def test_another_md5_is_refused_on_both_sides_and_remembered(settings: Cal
         await until(lambda: a.bridge.counters["mismatch.remote"])
         assert b.bridge.counters["mismatch.md5"] == 1
         for agent in (a, b):
-            [topic] = [t for t in agent._view.snapshot().topics if t.name == "/chatter"]
+            [topic] = [t for t in agent.snapshots.build().topics if t.name == "/chatter"]
             assert len(topic.mismatches) == 1
         await until(lambda: publisher.subscribers == 0)
 
@@ -307,11 +307,11 @@ async def test_the_control_socket_tells_and_pings(settings: Callable[..., Settin
         [topic] = [t for t in snapshot.topics if t.name == "/chatter"]
         assert (topic.type, topic.publishers, topic.peers) == ("std_msgs/String", (), ("a",))
         assert snapshot.agent.core_uri == b.core.uri
-        answer = await b._ping({"peer": "a", "count": 2})
+        answer = await b.operations.ping({"peer": "a", "count": 2})
         assert len(answer.times) == 2
         assert all(time is not None and 0 <= time < DEADLINE for time in answer.times)
         with pytest.raises(UnreachableError, match="did you mean a"):
-            await b._ping({"peer": "aa"})
+            await b.operations.ping({"peer": "aa"})
 
 
 async def test_the_agents_own_node_tells_what_it_is_connected_to(settings: Callable[..., Settings]) -> None:

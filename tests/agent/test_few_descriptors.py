@@ -226,7 +226,7 @@ async def test_a_topic_without_a_proxy_says_why_and_comes_later(
             await until(lambda: any(at.inbound.problems for at in b.bridge.attached()))
             await until(lambda: len(routes(b)) == 5)
             assert all("no file descriptor is left for its proxy" in route.problem for route in routes(b))
-            (found,) = await b._whys.answer({"peer": "a", "name": "/t1"})
+            (found,) = await b.operations.why({"peer": "a", "name": "/t1"})
             assert found.failed is not None
             assert found.failed.name == "graph"
             assert "LimitNOFILE=" in found.failed.remedy
@@ -247,7 +247,7 @@ async def test_proxies_at_shared_sockets_need_no_descriptor(settings: Callable[.
 
 
 def routes(agent: Agent) -> list[RouteInfo]:
-    topics = [topic for topic in agent._view.snapshot().topics if topic.name.startswith("/t")]
+    topics = [topic for topic in agent.snapshots.build().topics if topic.name.startswith("/t")]
     return [route for topic in topics for route in topic.routes if route.direction == "in"]
 
 

@@ -268,11 +268,11 @@ async def plans_are_reconciled(world: World) -> None:
 async def other_rules_hold(world: World) -> None:
     """Every topic gets another name here, and is kept home over there; and back."""
     for rules in ((PeerRule("far", "/moved"),), ()) * 3:
-        world.near._take(replace(world.near._settings, peers=rules))
+        world.near._apply(replace(world.near._settings, peers=rules))
         await world.until(lambda rules=rules: world.shown() == (0 if rules else TOPICS))  # type: ignore[misc]
         await world.until(lambda rules=rules: world.shown("/moved/fleet/") == (TOPICS if rules else 0))  # type: ignore[misc]
     for policy in (PolicySettings(deny=("/fleet/**",)), PolicySettings()) * 3:
-        world.far._take(replace(world.far._settings, policy=policy))
+        world.far._apply(replace(world.far._settings, policy=policy))
         await world.until(lambda policy=policy: world.shown() == (0 if policy.deny else TOPICS))  # type: ignore[misc]
 
 
@@ -298,8 +298,8 @@ async def many_peers_shout(world: World) -> None:
                 time.sleep(0.2)
 
     await world.beside(work)
-    assert world.near.station is not None
-    assert len(world.near.station.discovery.peers()) > 25
+    assert world.near.network.endpoint is not None
+    assert len(world.near.network.endpoint.discovery.peers()) > 25
 
 
 async def thousands_of_peers_are_invented(world: World) -> None:
@@ -327,9 +327,9 @@ async def thousands_of_peers_are_invented(world: World) -> None:
                 time.sleep(2 * discovery_limits.HEARTBEAT_INTERVAL / 4)
 
     await world.beside(work)
-    assert world.near.station is not None
-    assert len(world.near.station.discovery.peers()) > core_limits.ROSTER_PEERS_MAX / 2
-    assert world.near.station.discovery.counters["roster.full"] > 0
+    assert world.near.network.endpoint is not None
+    assert len(world.near.network.endpoint.discovery.peers()) > core_limits.ROSTER_PEERS_MAX / 2
+    assert world.near.network.endpoint.discovery.counters["roster.full"] > 0
     assert world.linked()
 
 

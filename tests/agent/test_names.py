@@ -36,7 +36,7 @@ def publishers(agent: Agent, topic: str) -> list[str]:
 
 
 def info(agent: Agent, topic: str) -> TopicInfo:
-    return next(found for found in agent._view.snapshot().topics if found.name == topic)
+    return next(found for found in agent.snapshots.build().topics if found.name == topic)
 
 
 def imported(agent: Agent, topic: str) -> RemoteTopic:
@@ -80,7 +80,7 @@ async def test_a_peer_is_told_of_no_more_than_its_rules_allow(settings: Callable
             await ours.advertise(topic, "std_msgs/String")
         await until(lambda: publishers(other, "/pose") and publishers(friend, "/secret"))
         assert not publishers(other, "/secret")
-        counts = {peer.name: peer.topics_out for peer in pc._view.snapshot().peers}
+        counts = {peer.name: peer.topics_out for peer in pc.snapshots.build().peers}
         assert counts == {"guest": 1, "friend": 2}
 
 
@@ -115,7 +115,7 @@ async def test_what_a_reload_is_not_about_keeps_its_route_and_its_connections(
         agent, prefix = (robot, "/") if far else (pc, "/robot/")
         near_rule = replace(PREFIX[0], remap_in=(Remap("/named", "/robot/other"),))
         far_rule = PeerRule("pc", "", (), (Remap("/named", "/other"),))
-        agent._take(
+        agent._apply(
             replace(
                 agent._settings,
                 policy=PolicySettings(deny=(f"{prefix}denied",)),

@@ -28,7 +28,9 @@ __all__ = ["settings"]
 
 
 async def ask(agent: Agent, kind: Any, what: str, name: str = "", peer: str | None = "b") -> Any:
-    return msgspec.convert(msgspec.to_builtins(await agent._node({"what": what, "peer": peer, "node": name})), kind)
+    return msgspec.convert(
+        msgspec.to_builtins(await agent.operations.node({"what": what, "peer": peer, "node": name})), kind
+    )
 
 
 @asynccontextmanager
@@ -138,7 +140,7 @@ async def test_what_a_module_does_not_allow_lives_on(settings: Callable[..., Set
         with pytest.raises(PeerRefused, match=refusal):
             await ask(a, NodeEnd, "node.kill", "/talker")
         assert not ended.is_set()
-        b._take(replace(b_settings, nodes=NodeSettings()))
+        b._apply(replace(b_settings, nodes=NodeSettings()))
         assert (await ask(a, NodeEnd, "node.kill", "/talker")).gone
 
 

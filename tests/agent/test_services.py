@@ -97,8 +97,8 @@ async def test_a_call_goes_there_and_back_and_is_counted_on_both_sides(settings:
             assert await connection.call(body, 20.0) == (True, body)
         connection.close()
         assert len(server.calls) == 4
-        (there,) = [i for i in a._snapshot({}).services if i.name == "/add"]
-        (here,) = [i for i in b._snapshot({}).services if i.name == "/add"]
+        (there,) = [i for i in a.operations.snapshot({}).services if i.name == "/add"]
+        (here,) = [i for i in b.operations.snapshot({}).services if i.name == "/add"]
         assert (there.direction, there.state, there.callers, there.calls, there.failed) == (
             "out",
             "open",
@@ -167,7 +167,7 @@ async def test_a_local_service_is_never_pushed_out_and_ours_comes_when_it_goes(
             b.services.reconcile()
             await asyncio.sleep(0.05)
             assert provider(b) == "/mine"
-            (info,) = [i for i in b._snapshot({}).services if i.peer == "a"]
+            (info,) = [i for i in b.operations.snapshot({}).services if i.peer == "a"]
             assert (info.state, info.hidden) == ("hidden", "/mine of this module provides it itself")
         await until(lambda: provider(b) == "/rmpa/a/adder")
         assert seen == ["/mine", "/mine", "", "/rmpa/a/adder"], "ours went, its came; its went, ours came"
@@ -205,7 +205,7 @@ async def test_another_md5_sum_is_refused_and_both_sides_say_so(
             await connect(b, md5sum="f" * 32)
         await until(lambda: a.bridge.counters["service.mismatch_remote"])
         assert b.bridge.counters["service.mismatch"] == 1
-        (info,) = [i for i in b._snapshot({}).services if i.name == "/add"]
+        (info,) = [i for i in b.operations.snapshot({}).services if i.name == "/add"]
         assert "md5sum" in info.problem
         said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
         assert sum(MD5 in line for line in said) == 2

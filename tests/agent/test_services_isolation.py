@@ -55,16 +55,16 @@ async def plans_are_reconciled(world: World) -> None:
 
 async def somebody_looks_at_everything(world: World) -> None:
     for _ in range(4):
-        assert len(world.near._snapshot({}).services) > SERVICES
+        assert len(world.near.operations.snapshot({}).services) > SERVICES
         await asyncio.sleep(0)
 
 
 async def other_rules_hold(world: World) -> None:
     for rules in ((PeerRule("far", "/moved"),), ()) * 2:
-        world.near._take(replace(world.near._settings, peers=rules))
+        world.near._apply(replace(world.near._settings, peers=rules))
         await world.until(lambda rules=rules: shown(world) == (0 if rules else SERVICES))  # type: ignore[misc]
     for services in (ServiceSettings(deny=("/fleet/**",)), ServiceSettings()) * 2:
-        world.far._take(replace(world.far._settings, services=services))
+        world.far._apply(replace(world.far._settings, services=services))
         await world.until(lambda services=services: shown(world) == (0 if services.deny else SERVICES))  # type: ignore[misc]
 
 

@@ -87,7 +87,7 @@ def findings() -> Iterator[Check]:
     yield from judge_agents({}, "0.1.0")
     cam = UnreachableInfo(node="/cam", uri="http://nosuch:1/", problem="no such name", ago=3.0)
     gone = UnreachableInfo(node="/gone", uri="http://10.9.9.9:1/", problem="no answer", ago=60.0, withdrawn=True)
-    shown = {
+    shown: dict[str, Snapshot | str] = {
         "base": msgspec.structs.replace(SNAPSHOT, unreachable=(cam, gone)),
         "stopped": "no agent answers in time",
         "few": with_files(near=True),
@@ -170,12 +170,12 @@ def diagnoses() -> Iterator[Diagnosis]:
         yield from topic.walk()
     for topic, *_ in test_topics.WARNINGS.values():
         yield from topic.walk()
-    yield from test_topics.Case(far=None, refusal="it is older").walk()
+    yield from test_topics.Case(there=None, refusal="it is older").walk()
     yield test_services.walk()
-    for near, far, *_ in test_services.FAILURES.values():
-        yield test_services.walk(near, far)
-    yield test_services.walk(far=None)
-    yield test_services.walk(replace(test_services.NEAR, failed=1, problem="took more than 60 s"))
+    for here, there, *_ in test_services.FAILURES.values():
+        yield test_services.walk(here, there)
+    yield test_services.walk(there=None)
+    yield test_services.walk(replace(test_services.HERE, failed=1, problem="took more than 60 s"))
 
 
 def why() -> bytes:

@@ -1,1 +1,1 @@
-"""Everything that ``rmpa doctor`` looks at."""
+"""What ``rmpa doctor`` reads of a machine, and what that means."""

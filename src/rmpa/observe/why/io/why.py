@@ -1,4 +1,4 @@
-"""Answers ``rmpa why``: gathers what this side knows, asks the other agent, and has ``monitor`` judge it."""
+"""Answers ``rmpa why``: gathers what this agent knows, asks the agent at the other end, and has both judged."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
 from rmpa.core.names import is_global_name
 from rmpa.observe.check import FAIL, Check
-from rmpa.observe.io.service_facts import ServiceFacts
-from rmpa.observe.io.topic_facts import TopicFacts, name_in
-from rmpa.observe.why.diagnosis import BothSides, Diagnosis, FarTopic
-from rmpa.observe.why.services import FarService, walk_service
-from rmpa.observe.why.topics import find_peer, walk_peer, walk_topic
+from rmpa.observe.why.diagnosis import BothEnds, Diagnosis, TopicAtPublisher
+from rmpa.observe.why.io.service_evidence import ServiceEvidence
+from rmpa.observe.why.io.topic_evidence import TopicEvidence, name_in
+from rmpa.observe.why.services import ServiceAtServer, diagnose_service
+from rmpa.observe.why.topics import diagnose_topic, find_peer, peer_stages
 
 if TYPE_CHECKING:
     from rmpa.bridge.io.bridge import Bridge, PeerSession
@@ -28,36 +28,36 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 TOPIC: Final = "why.topic"
-"""The question to a publisher's agent: what it knows of a topic (``FarTopic``)."""
+"""The request to a publisher's agent: what it knows of a topic. Replied by ``TopicAtPublisher``."""
 SERVICE: Final = "why.service"
-"""The question to a server's agent: what it knows of a service (``FarService``)."""
+"""The request to a server's agent: what it knows of a service. Replied by ``ServiceAtServer``."""
 HERE: Final = "why.here"
-"""The question to a subscriber's agent: why a topic of the asker does not arrive there (``Diagnosis``, a list)."""
+"""The request to a subscriber's agent: how a topic of this module arrives there. Replied by ``Diagnosis``, a list."""
 _MOVING: Final = frozenset({"open", "lingering", "opening"})
 
 
 class WhyService:
-    """Reads the rooms and asks peers; changes nothing.
+    """The op ``why`` of the control socket, and the peers' requests about it. Changes nothing.
 
     Args:
         settings: The agent's.
         core: Its ROS core.
         bridge: Its bridge.
         services: The bridge's part for services.
-        view: Its snapshots.
+        snapshots: Its snapshots.
     """
 
     def __init__(
-        self, settings: Settings, core: Core, bridge: Bridge, services: Services, view: SnapshotBuilder
+        self, settings: Settings, core: Core, bridge: Bridge, services: Services, snapshots: SnapshotBuilder
     ) -> None:
         self._core = core
         self._bridge = bridge
-        self._view = view
-        self._topics = TopicFacts(settings, core, bridge, view)
-        self._services = ServiceFacts(settings, core, bridge, services)
-        bridge.asks.on(TOPIC, self._topics.tell)
-        bridge.asks.on(SERVICE, self._services.tell)
-        bridge.asks.on(HERE, self._tell_here)
+        self._snapshots = snapshots
+        self._topics = TopicEvidence(settings, core, bridge, snapshots)
+        self._services = ServiceEvidence(settings, core, bridge, services)
+        bridge.asks.on(TOPIC, self._topics.answer)
+        bridge.asks.on(SERVICE, self._services.answer)
+        bridge.asks.on(HERE, self._answer_here)
 
     def reload(self, settings: Settings) -> None:
         """Other settings hold from now on."""
@@ -68,11 +68,11 @@ class WhyService:
         """The control socket's op ``why``.
 
         Args:
-            args: ``name``: a topic, or a service; ``peer``: one peer's name or GUID, or ``None`` for all that have to
-                do with it; ``service``: whether a service is meant even where a topic has that name.
+            args: ``name``: a topic or a service; ``peer``: one peer's name or GUID, or ``None`` for all peers that
+                have it or receive it; ``service``: whether a service is meant even where a topic has that name.
 
         Raises:
-            ConfigError: The name is none.
+            ConfigError: The name is not a ROS name.
         """
         name, peer = args.get("name"), args.get("peer")
         if not isinstance(name, str) or not is_global_name(name):
@@ -83,7 +83,7 @@ class WhyService:
         found = await (self._everywhere(name) if wanted is None else self._one(wanted, name))
         failed = found[0].failed
         if failed is not None and failed.name == "publisher":
-            # No topic has this name anywhere: perhaps a service that does not cross has.
+            # No topic has this name anywhere; a service that does not cross may have it.
             service = await self._service(name, wanted)
             if any(diagnosis.node for diagnosis in service):
                 return service
@@ -95,10 +95,10 @@ class WhyService:
             return False
         return name in state.services or self._services.known(name)
 
-    # --- topics: this side ------------------------------------------------------------------------------------
+    # --- topics of peers --------------------------------------------------------------------------------------
 
     async def _one(self, peer: str, topic: str) -> tuple[Diagnosis, ...]:
-        """A topic of one peer; or, where that has no publisher and we have, our own topic on its way there."""
+        """A topic of one peer; or, where only this module has a publisher, its own topic on its path to that peer."""
         found = await self._arrives(peer, topic)
         failed = found[0].failed
         if failed is not None and failed.name == "publisher" and self._topics.own(topic):
@@ -106,21 +106,21 @@ class WhyService:
         return found
 
     def _carrier(self, peer: PeerInfo) -> PeerSession | None:
-        """Whose link brings what a peer publishes: its own, or that of the relay which passes it on."""
+        """The link that carries what a peer publishes: its own, or that of the relay that passes it on."""
         for attached in self._bridge.attached():
             if str(attached.link.guid) == peer.guid or (peer.via and attached.link.name == peer.via):
                 return attached
         return None
 
     async def _everywhere(self, topic: str) -> tuple[Diagnosis, ...]:
-        """Each way that a topic has, in and out; where there is none, what is known of it."""
-        peers = [peer for peer in self._view.snapshot(frozenset()).peers if peer.state in ("linked", "relayed")]
+        """All paths of a topic, in and out; where there is none, what is known of it."""
+        peers = [peer for peer in self._snapshots.build(frozenset()).peers if peer.state in ("linked", "relayed")]
         own = self._topics.own(topic)
         coming = [peer.guid for peer in peers if self._offers(peer, topic)]
         if not coming and not own:
-            # Nobody offers it: perhaps somebody has it and keeps it at home.
-            sights = await asyncio.gather(*(self._sight(peer, topic) for peer in peers))
-            coming = [p.guid for p, s in zip(peers, sights, strict=True) if s.far is not None and s.far.sources]
+            # No peer offers it; one may have it, and not let it cross.
+            known = await asyncio.gather(*(self._both_ends(peer, topic) for peer in peers))
+            coming = [p.guid for p, e in zip(peers, known, strict=True) if e.there is not None and e.there.sources]
         ways = [self._arrives(guid, topic) for guid in coming]
         ways += [self._leaves(topic, peer.guid) for peer in peers if own and peer.state == "linked"]
         found = [diagnosis for diagnoses in await asyncio.gather(*ways) for diagnosis in diagnoses]
@@ -128,66 +128,68 @@ class WhyService:
 
     def _offers(self, peer: PeerInfo, topic: str) -> bool:
         attached = self._carrier(peer)
-        return attached is not None and bool(self._topics.near(attached, peer, topic).only)
+        return attached is not None and bool(self._topics.here(attached, peer, topic).only)
 
     async def _nowhere(self, topic: str, linked: list[str]) -> Diagnosis:
-        here = self._view.snapshot(frozenset()).agent.name
+        here = self._snapshots.build(frozenset()).agent.name
         if self._topics.own(topic):
             text, remedy = "no peer is linked that it could go to", "`rmpa peer list` tells of the peers"
             stage = Check("peer", FAIL, text, remedy)
-            return Diagnosis(name=topic, peer=here, to="", flows=False, stages=(stage,))
+            return Diagnosis.of((stage,), name=topic, peer=here, to="")
         state = self._core.state()
-        near = await asyncio.to_thread(did_you_mean, topic, {*state.publishers, *state.subscribers})
+        similar = await asyncio.to_thread(did_you_mean, topic, {*state.publishers, *state.subscribers})
         if awaited := self._topics.awaited(topic):
             text = f"{', '.join(awaited)} published {topic} before this agent was restarted, and does not answer"
             remedy = "it is asked again by itself; is that program stopped or stuck? Else start it again"
             stage = Check("publisher", FAIL, text, remedy)
-            return Diagnosis(name=topic, peer=here, to="", flows=False, stages=(stage,))
+            return Diagnosis.of((stage,), name=topic, peer=here, to="")
         text = f"neither {here} nor a linked peer ({', '.join(linked) or 'there is none'}) publishes {topic}"
-        remedy = f"did you mean {near}?" if near else "`rmpa topic list` shows what there is, `rmpa peer list` who"
+        remedy = (
+            f"did you mean {similar}?" if similar else "`rmpa topic list` shows what there is, `rmpa peer list` who"
+        )
         stage = Check("publisher", FAIL, text, remedy)
-        return Diagnosis(name=topic, peer="", to=here, flows=False, stages=(stage,))
+        return Diagnosis.of((stage,), name=topic, peer="", to=here)
 
     async def _arrives(self, name: str, topic: str) -> tuple[Diagnosis, ...]:
-        """Walk the ways from a peer to here."""
-        peer = find_peer(self._view.snapshot(frozenset()), name)
+        """Judge the paths from a peer to here."""
+        peer = find_peer(self._snapshots.build(frozenset()), name)
         if peer is None:
-            return walk_topic(BothSides(self._topics.near(None, None, topic)), name)
+            return diagnose_topic(BothEnds(self._topics.here(None, None, topic)), name)
         topic, wire = self._topics.there(peer.name, topic)
-        sight = await self._sight(peer, topic)
+        ends = await self._both_ends(peer, topic)
         later = None
-        if any(r.state in _MOVING for t in sight.near.snapshot.topics for r in t.routes if r.direction == "in"):
-            # What moves is told from what stands by looking twice.
+        if any(r.state in _MOVING for t in ends.here.snapshot.topics for r in t.routes if r.direction == "in"):
+            # Only a second look shows whether messages move.
             await asyncio.sleep(limits.WHY_WINDOW)
-            later = await self._sight(peer, topic)
-        return walk_topic(sight, peer.guid, later, wire)
+            later = await self._both_ends(peer, topic)
+        return diagnose_topic(ends, peer.guid, later, wire)
 
-    async def _sight(self, peer: PeerInfo, topic: str) -> BothSides:
-        """Both sides now."""
+    async def _both_ends(self, peer: PeerInfo, topic: str) -> BothEnds:
+        """What both ends know now."""
         attached = self._carrier(peer)
         if attached is None:
-            return BothSides(self._topics.near(None, peer, topic), refusal="it is not linked")
+            return BothEnds(self._topics.here(None, peer, topic), refusal="it is not linked")
         _, wire = self._topics.there(peer.name, topic)
         question = {"topic": wire, "instance": peer.instance if peer.state == "relayed" else ""}
         try:
-            far, refusal = await self._ask(attached, TOPIC, question, FarTopic), ""
+            there, refusal = await self._ask(attached, TOPIC, question, TopicAtPublisher), ""
         except RmpaError as error:
-            far, refusal = None, str(error)
-        return BothSides(self._topics.near(attached, peer, topic), far, refusal)
+            there, refusal = None, str(error)
+        return BothEnds(self._topics.here(attached, peer, topic), there, refusal)
 
-    # --- topics: the other side -------------------------------------------------------------------------------
+    # --- topics of this module -------------------------------------------------------------------------------
 
     async def _leaves(self, topic: str, name: str) -> tuple[Diagnosis, ...]:
-        """Let a peer walk the ways from here to it."""
-        snapshot = self._view.snapshot(frozenset())
+        """Have a peer judge the paths from here to it."""
+        snapshot = self._snapshots.build(frozenset())
         here = snapshot.agent.name
-        begin = walk_peer(snapshot, name)
+        begin = peer_stages(snapshot, name)
         peer = find_peer(snapshot, name)
         attached = self._carrier(peer) if peer is not None else None
         to = peer.name if peer is not None else name
         if attached is None or attached.link.name != to:
             stages = begin if begin[-1].level is FAIL else (*begin, _no_link(to))
-            return (Diagnosis(name=topic, peer=here, to=to, flows=False, stages=stages),)
+            return (Diagnosis.of(stages, name=topic, peer=here, to=to),)
         question = {"topic": self._bridge.names.wire_name(to, topic, self._core.type_of(topic))}
         try:
             found = await self._ask(attached, HERE, question, tuple[Diagnosis, ...], limits.WHY_TIMEOUT)
@@ -197,17 +199,17 @@ class WhyService:
         except RmpaError as error:
             remedy = f"run `rmpa why {here}:{topic}` there"
             silent = Check("link", FAIL, f"{to} does not tell: {error}", remedy)
-            return (Diagnosis(name=topic, peer=here, to=to, flows=False, stages=(*begin, silent)),)
+            return (Diagnosis.of((*begin, silent), name=topic, peer=here, to=to),)
 
-    async def _tell_here(self, attached: PeerSession, args: dict[str, Any]) -> tuple[Diagnosis, ...]:
+    async def _answer_here(self, attached: PeerSession, args: dict[str, Any]) -> tuple[Diagnosis, ...]:
         topic = self._bridge.names.local_name(attached.link.name, name_in(args, "topic"))
         return (await self._arrives(str(attached.link.guid), topic))[: limits.WHY_SOURCES_MAX]
 
     # --- services ---------------------------------------------------------------------------------------------
 
     async def _service(self, service: str, name: str | None) -> tuple[Diagnosis, ...]:
-        """Walk the way of a service from each peer, or from one, to here."""
-        peers = [peer for peer in self._view.snapshot(frozenset()).peers if peer.state in ("linked", "relayed")]
+        """Judge the path of a service from one peer, or from each, to here."""
+        peers = [peer for peer in self._snapshots.build(frozenset()).peers if peer.state in ("linked", "relayed")]
         if name is None:
             carried = [(peer, at) for peer in peers if (at := self._carrier(peer)) is not None]
             offering = [p.guid for p, at in carried if self._services.offers(at, service, p.instance)]
@@ -215,26 +217,26 @@ class WhyService:
                 *(self._calls(guid, service) for guid in offering or [p.guid for p in peers])
             )
             served = tuple(diagnosis for diagnosis in found if diagnosis.node)
-            here = self._view.snapshot(frozenset()).agent.name
+            here = self._snapshots.build(frozenset()).agent.name
             return served or (await self._services.nowhere(here, service, [p.name for p in peers]),)
         return (await self._calls(name, service),)
 
     async def _calls(self, name: str, service: str) -> Diagnosis:
-        snapshot = self._view.snapshot(frozenset())
+        snapshot = self._snapshots.build(frozenset())
         peer = find_peer(snapshot, name)
         attached = self._carrier(peer) if peer is not None else None
         if peer is None or attached is None:
-            return walk_service(walk_peer(snapshot, name), snapshot.agent.name, name, service)
+            return diagnose_service(peer_stages(snapshot, name), snapshot.agent.name, name, service)
         service, wire = self._topics.there(peer.name, service)
-        far: FarService | None = None
+        there: ServiceAtServer | None = None
         refusal = ""
         try:
-            far = await self._ask(attached, SERVICE, {"service": wire}, FarService)
+            there = await self._ask(attached, SERVICE, {"service": wire}, ServiceAtServer)
         except RmpaError as error:
             refusal = str(error)
-        near = await self._services.near(attached, service, wire)
-        begin = walk_peer(snapshot, name)
-        return walk_service(begin, snapshot.agent.name, peer.name, service, near, far, refusal)
+        here = await self._services.here(attached, service, wire)
+        begin = peer_stages(snapshot, name)
+        return diagnose_service(begin, snapshot.agent.name, peer.name, service, here, there, refusal)
 
     async def _ask(
         self,
