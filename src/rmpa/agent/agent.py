@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.agent.core_choice import make_core
 from rmpa.agent.network import Network
-from rmpa.agent.reload import Hangups, Reloader
+from rmpa.agent.reload import Reloader, SighupHandler
 from rmpa.bridge.io.bounds import Bounds
 from rmpa.bridge.io.bridge import Bridge
 from rmpa.bridge.naming import Names
@@ -152,7 +152,7 @@ class Agent:
         await self._undo.aclose()
 
     def _bytes_carried(self) -> int:
-        links = (attached.link for attached in self.bridge.attached())
+        links = (session.link for session in self.bridge.attached())
         return sum(link.bytes_in + link.bytes_out for link in links)
 
     def _notes(self) -> Iterator[str]:
@@ -176,16 +176,16 @@ async def _serve(
     loop.set_default_executor(realtime.worker_pool())
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop.set)
-    hangups = Hangups(agent.reloader, stop.set)
+    sighup = SighupHandler(agent.reloader, stop.set)
     await agent.start()
-    hangups.start()
+    sighup.start()
     try:
         notify_service_manager("READY=1")
         await stop.wait()
         notify_service_manager("STOPPING=1")
         _log.info("= ending")
     finally:
-        await hangups.close()
+        await sighup.close()
         await agent.close()
 
 
@@ -193,11 +193,11 @@ def run(settings: Settings, load: Callable[[], Loaded] | None = None) -> int:
     """Run an agent until SIGINT or SIGTERM; return the exit code.
 
     Args:
-        settings: Complete.
-        load: Reads them again, at SIGHUP and `rmpa reload`.
+        settings: Complete: the name is filled in.
+        load: Reads the settings again, at SIGHUP and ``rmpa reload``.
 
     Raises:
-        StartError: It cannot start on this machine as asked.
+        StartError: The agent cannot start on this machine with these settings.
     """
     raise_file_limit()
     sys.setswitchinterval(runtime_limits.THREAD_SWITCH)

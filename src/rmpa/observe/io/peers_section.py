@@ -53,7 +53,7 @@ class PeersSection:
     def infos(self, endpoint: Endpoint) -> tuple[PeerInfo, ...]:
         """Every peer that is known, by name."""
         now = self._clock.now()
-        links = {attached.link.guid: attached for attached in self._bridge.attached()}
+        links = {session.link.guid: session for session in self._bridge.attached()}
         yield_to_data()  # a millisecond each with a full roster
         roster = {view.identity.guid: view for view in endpoint.discovery.peers()}
         yield_to_data()
@@ -61,14 +61,14 @@ class PeersSection:
         infos = []
         for guid in {*roster, *statuses, *links}:
             yield_to_data()
-            attached = links.get(guid)
-            info = self._peer(roster.get(guid), statuses.get(guid), attached, now)
-            if attached is not None:
-                info = msgspec.structs.replace(info, link=self._link(attached.link, endpoint.mesh.paths, now))
-                theirs = len(self._bridge.imports.offered_by(attached.peer))
-                ours = self._bridge.exports.topics_for(attached.peer)
+            session = links.get(guid)
+            info = self._peer(roster.get(guid), statuses.get(guid), session, now)
+            if session is not None:
+                info = msgspec.structs.replace(info, link=self._link(session.link, endpoint.mesh.paths, now))
+                theirs = len(self._bridge.imports.offered_by(session.peer))
+                ours = self._bridge.exports.topics_for(session.peer)
                 yield_to_data()
-                beyond = self._beyond(attached)
+                beyond = self._beyond(session)
                 info = msgspec.structs.replace(info, topics_in=theirs, topics_out=ours, beyond=beyond)
             infos.append(info)
         relayed = self._relayed({info.instance: info for info in infos})
@@ -76,8 +76,8 @@ class PeersSection:
         own = {str(address) for address in (endpoint.identity.guid.address, *endpoint.identity.addresses)}
         return mark_shared_addresses(sorted((*infos, *relayed), key=lambda info: (info.name, info.guid)), own)
 
-    def _beyond(self, attached: PeerSession) -> tuple[BoundInfo, ...]:
-        name, peer = attached.link.name, attached.peer
+    def _beyond(self, session: PeerSession) -> tuple[BoundInfo, ...]:
+        name, peer = session.link.name, session.peer
         here = [_bound_here(name, one) for one in self._bounds.here(peer)]
         return (*here, *(_bound_there(name, one) for one in self._bounds.there(peer)))
 
@@ -92,13 +92,13 @@ class PeersSection:
         return infos
 
     def _peer(
-        self, view: PeerView | None, status: PeerStatus | None, attached: PeerSession | None, now: float
+        self, view: PeerView | None, status: PeerStatus | None, session: PeerSession | None, now: float
     ) -> PeerInfo:
-        identity = (view or status or attached.link).identity  # type: ignore[union-attr] # one of the three is there
+        identity = (view or status or session.link).identity  # type: ignore[union-attr] # one of the three is there
         conflicts = view.conflicts if view is not None else ()
         unlinked = status.since if status is not None and status.since is not None else view.since if view else now
-        if attached is not None:
-            state, since = "linked", attached.link.since or now
+        if session is not None:
+            state, since = "linked", session.link.since or now
         elif view is not None and not view.present:
             state, since = "conflict", view.since
         elif status is not None and status.state == "refused":

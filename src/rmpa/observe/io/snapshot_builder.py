@@ -133,7 +133,7 @@ class SnapshotBuilder:
     def _agent(self, endpoint: Endpoint | None) -> AgentInfo:
         identity = endpoint.identity if endpoint is not None else None
         bridge, core = self._of.bridge, self._of.core
-        proxies = sum(attached.inbound.count for attached in bridge.everyone())
+        proxies = sum(session.inbound.count for session in bridge.everyone())
         return AgentInfo(
             name=self._settings.name,
             guid=str(identity.guid) if identity else "",

@@ -50,12 +50,12 @@ class ServiceEvidence:
         """Whether a peer offers a service; ``service`` is its name here."""
         return any(remote.name == service for _, remote in self._services.imports)
 
-    def offers(self, attached: PeerSession, service: str, instance: str) -> bool:
+    def offers(self, session: PeerSession, service: str, instance: str) -> bool:
         """Whether a link carries a service of the module with this instance id: the peer's own, or a relayed one."""
-        remote = self._services.imports.get(attached.peer, service)
+        remote = self._services.imports.get(session.peer, service)
         if remote is None:
             return False
-        return (remote.origin.instance if remote.origin else attached.link.identity.instance.hex()) == instance
+        return (remote.origin.instance if remote.origin else session.link.identity.instance.hex()) == instance
 
     async def nowhere(self, here: str, service: str, linked: list[str]) -> Diagnosis:
         """The diagnosis of a service that no peer has."""
@@ -72,12 +72,12 @@ class ServiceEvidence:
         stage = Check("server", FAIL, text, remedy)
         return Diagnosis.of((stage,), kind="service", name=service, peer="", to=here)
 
-    async def here(self, attached: PeerSession, service: str, wire: str) -> ServiceAtClient:
+    async def here(self, session: PeerSession, service: str, wire: str) -> ServiceAtClient:
         """What is known here of a service of a peer; its proxy is probed as a client would."""
-        remote = self._services.imports.get(attached.peer, service)
+        remote = self._services.imports.get(session.peer, service)
         if remote is None:
             return ServiceAtClient(wire=wire)
-        shown = self._services.shown(attached.peer, service)
+        shown = self._services.shown(session.peer, service)
         if shown is None or shown.proxy is None:
             return ServiceAtClient(wire=wire, offered=True, node=remote.node, hidden=remote.hidden)
         uri = self._core.state().services.get(service, {}).get(shown.proxy.name, "")
@@ -96,15 +96,15 @@ class ServiceEvidence:
             mismatch=shown.mismatch,
         )
 
-    async def answer(self, attached: PeerSession, args: dict[str, Any]) -> ServiceAtServer:
+    async def answer(self, session: PeerSession, args: dict[str, Any]) -> ServiceAtServer:
         """The reply to ``why.service``; the server is probed.
 
         Args:
-            attached: The peer that asks.
+            session: The peer that asks.
             args: ``service``: its name on the wire.
         """
         wire = name_in(args, "service")
-        peer = attached.link.name
+        peer = session.link.name
         seen = self._services.exports.seen
         for service in self._bridge.names.of(peer).locals_of(wire):
             server = seen.get(service)

@@ -63,40 +63,40 @@ class TopicEvidence:
         wires = names.wires_of(topic)
         return (topic, wires[0]) if wires else (names.local_name(topic), topic)
 
-    def here(self, attached: PeerSession | None, peer: PeerInfo | None, topic: str) -> TopicAtSubscriber:
+    def here(self, session: PeerSession | None, peer: PeerInfo | None, topic: str) -> TopicAtSubscriber:
         """What is known here of a topic that a peer publishes.
 
         Args:
-            attached: The session whose link carries it, if one does.
+            session: The session whose link carries it, if one does.
             peer: The module of its publishers.
             topic: Its name here.
         """
         snapshot = self._snapshots.build(frozenset({topic}))
-        if attached is None or peer is None:
+        if session is None or peer is None:
             return TopicAtSubscriber(snapshot, topic)
         only, registered, conflict = set(), set(), set()
         connections, mismatches, proxies = {}, {}, {}
-        publishers, standing = self._core.publishers(topic), dict(attached.inbound)
+        publishers, standing = self._core.publishers(topic), dict(session.inbound)
         for number, source in list(self._bridge.imports.at(topic)):
             entry = self._bridge.imports.get(number, source)
-            if number != attached.peer or entry is None:
+            if number != session.peer or entry is None:
                 continue
-            if (entry.origin.instance if entry.origin else attached.link.identity.instance.hex()) != peer.instance:
+            if (entry.origin.instance if entry.origin else session.link.identity.instance.hex()) != peer.instance:
                 continue
             node = source.node
             only.add(node)
             if entry.conflict:
                 conflict.add(node)
-            name = attached.inbound.names.get(node) or proxy_name(attached.inbound.prefix, node)
+            name = session.inbound.names.get(node) or proxy_name(session.inbound.prefix, node)
             proxies[node] = name
             if node in standing and publishers.get(name) == standing[node].node.uri:
                 registered.add(node)
-            connections[node] = self._connections(attached, source)
+            connections[node] = self._connections(session, source)
             mismatches[node] = self._bridge.mismatches(source)
         return TopicAtSubscriber(
             snapshot,
             topic,
-            attached.link.name,
+            session.link.name,
             frozenset(only),
             proxies,
             frozenset(registered),
@@ -106,8 +106,8 @@ class TopicEvidence:
         )
 
     @staticmethod
-    def _connections(attached: PeerSession, source: Source) -> tuple[SubscriberConnection, ...]:
-        publication = attached.inbound.publication(source)
+    def _connections(session: PeerSession, source: Source) -> tuple[SubscriberConnection, ...]:
+        publication = session.inbound.publication(source)
         return tuple(
             SubscriberConnection(
                 number=link.number,
@@ -120,17 +120,17 @@ class TopicEvidence:
             for link in (publication.connections() if publication is not None else ())
         )
 
-    async def answer(self, attached: PeerSession, args: dict[str, Any]) -> TopicAtPublisher:
+    async def answer(self, session: PeerSession, args: dict[str, Any]) -> TopicAtPublisher:
         """The reply to ``why.topic``.
 
         Args:
-            attached: The peer that asks.
+            session: The peer that asks.
             args: ``topic``: its name on the wire; ``instance``: the instance id of its module, if this module only
                 relays it.
         """
         wire = name_in(args, "topic")
         instance = args.get("instance") or ""
-        asker = attached.link.name
+        asker = session.link.name
         names = self._bridge.names.of(asker)
         state = self._core.state()
         sources: list[PublisherReport] = []
@@ -140,17 +140,17 @@ class TopicEvidence:
             kind = self._core.type_of(topic)
             nodes = self._relayed(topic, instance) if instance else list(self.own(topic))
             if names.wire_name(topic, kind) == wire:
-                sources += [self._report(attached, Source(topic, node), wire) for node in nodes]
+                sources += [self._report(session, Source(topic, node), wire) for node in nodes]
                 subscribers += [node for node in state.subscribers.get(topic, {}) if not is_own(node)]
                 awaited += self.awaited(topic)
         endpoint = self._snapshots.endpoint
-        problem = endpoint.mesh.paths.problem(attached.link) if endpoint is not None else None
+        problem = endpoint.mesh.paths.problem(session.link) if endpoint is not None else None
         return TopicAtPublisher(
             path_problem=problem.text if problem is not None else "",
             path_remedy=problem.remedy if problem is not None else "",
             sources=tuple(sources[: bridge_limits.WHY_SOURCES_MAX]),
             subscribers=tuple(subscribers[: bridge_limits.WHY_SOURCES_MAX]),
-            similar="" if sources else await self._similar(attached.link.name, wire),
+            similar="" if sources else await self._similar(session.link.name, wire),
             awaited=tuple(awaited[: bridge_limits.WHY_SOURCES_MAX]),
         )
 
@@ -176,17 +176,17 @@ class TopicEvidence:
             and local.origin.instance == instance
         ]
 
-    def _report(self, attached: PeerSession, source: Source, wire: str) -> PublisherReport:
+    def _report(self, session: PeerSession, source: Source, wire: str) -> PublisherReport:
         exports = self._bridge.exports
         local = exports.offered.get(source)
         kind = local.type if local is not None else self._core.type_of(source.topic)
         node = source.node if local is None or local.origin is None else local.origin.node
         decision = self._policy.judge(source.topic, kind, node)
         if decision.allowed:
-            special = self._policy.judge_for(attached.link.name, source.topic, kind, wire)
+            special = self._policy.judge_for(session.link.name, source.topic, kind, wire)
             decision = special if special.rule else decision
         flow = self._bridge.outbound.flows.get(source)
-        contract = exports.contract(source, attached.peer)
+        contract = exports.contract(source, session.peer)
         reliable = contract is not None and contract.reliability is Reliability.RELIABLE
         return PublisherReport(
             node=source.node,
@@ -194,11 +194,11 @@ class TopicEvidence:
             type=kind,
             crosses=decision.allowed,
             rule=decision.rule,
-            offered=exports.offer(attached.peer, source) is not None,
-            route="open" if attached.peer in exports.flowing(source) else "opening" if contract is not None else "",
+            offered=exports.offer(session.peer, source) is not None,
+            route="open" if session.peer in exports.flowing(source) else "opening" if contract is not None else "",
             messages=flow.messages if flow is not None else 0,
             dropped=flow.dropped if flow is not None and not reliable else 0,
-            lost=self._bridge.outbound.lost(source, attached.peer),
+            lost=self._bridge.outbound.lost(source, session.peer),
             oversized=flow.oversized if flow is not None else 0,
             oversized_bytes=flow.oversized_bytes if flow is not None else 0,
             beyond=exports.beyond.limit if exports.is_beyond(source) else 0,

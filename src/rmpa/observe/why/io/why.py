@@ -107,14 +107,14 @@ class WhyService:
 
     def _carrier(self, peer: PeerInfo) -> PeerSession | None:
         """The link that carries what a peer publishes: its own, or that of the relay that passes it on."""
-        for attached in self._bridge.attached():
-            if str(attached.link.guid) == peer.guid or (peer.via and attached.link.name == peer.via):
-                return attached
+        for session in self._bridge.attached():
+            if str(session.link.guid) == peer.guid or (peer.via and session.link.name == peer.via):
+                return session
         return None
 
     async def _everywhere(self, topic: str) -> tuple[Diagnosis, ...]:
         """All paths of a topic, in and out; where there is none, what is known of it."""
-        peers = [peer for peer in self._snapshots.build(frozenset()).peers if peer.state in ("linked", "relayed")]
+        peers = self._reachable_peers()
         own = self._topics.own(topic)
         coming = [peer.guid for peer in peers if self._offers(peer, topic)]
         if not coming and not own:
@@ -126,29 +126,28 @@ class WhyService:
         found = [diagnosis for diagnoses in await asyncio.gather(*ways) for diagnosis in diagnoses]
         return tuple(found) or (await self._nowhere(topic, [peer.name for peer in peers]),)
 
+    def _reachable_peers(self) -> list[PeerInfo]:
+        return [peer for peer in self._snapshots.build(frozenset()).peers if peer.state in ("linked", "relayed")]
+
     def _offers(self, peer: PeerInfo, topic: str) -> bool:
-        attached = self._carrier(peer)
-        return attached is not None and bool(self._topics.here(attached, peer, topic).only)
+        session = self._carrier(peer)
+        return session is not None and bool(self._topics.here(session, peer, topic).only)
 
     async def _nowhere(self, topic: str, linked: list[str]) -> Diagnosis:
         here = self._snapshots.build(frozenset()).agent.name
         if self._topics.own(topic):
             text, remedy = "no peer is linked that it could go to", "`rmpa peer list` tells of the peers"
-            stage = Check("peer", FAIL, text, remedy)
-            return Diagnosis.of((stage,), name=topic, peer=here, to="")
+            return Diagnosis.of((Check("peer", FAIL, text, remedy),), name=topic, peer=here, to="")
         state = self._core.state()
         similar = await asyncio.to_thread(did_you_mean, topic, {*state.publishers, *state.subscribers})
         if awaited := self._topics.awaited(topic):
             text = f"{', '.join(awaited)} published {topic} before this agent was restarted, and does not answer"
             remedy = "it is asked again by itself; is that program stopped or stuck? Else start it again"
-            stage = Check("publisher", FAIL, text, remedy)
-            return Diagnosis.of((stage,), name=topic, peer=here, to="")
+            return Diagnosis.of((Check("publisher", FAIL, text, remedy),), name=topic, peer=here, to="")
         text = f"neither {here} nor a linked peer ({', '.join(linked) or 'there is none'}) publishes {topic}"
-        remedy = (
-            f"did you mean {similar}?" if similar else "`rmpa topic list` shows what there is, `rmpa peer list` who"
-        )
-        stage = Check("publisher", FAIL, text, remedy)
-        return Diagnosis.of((stage,), name=topic, peer="", to=here)
+        remedy = "`rmpa topic list` shows what there is, `rmpa peer list` who"
+        remedy = f"did you mean {similar}?" if similar else remedy
+        return Diagnosis.of((Check("publisher", FAIL, text, remedy),), name=topic, peer="", to=here)
 
     async def _arrives(self, name: str, topic: str) -> tuple[Diagnosis, ...]:
         """Judge the paths from a peer to here."""
@@ -166,16 +165,16 @@ class WhyService:
 
     async def _both_ends(self, peer: PeerInfo, topic: str) -> BothEnds:
         """What both ends know now."""
-        attached = self._carrier(peer)
-        if attached is None:
+        session = self._carrier(peer)
+        if session is None:
             return BothEnds(self._topics.here(None, peer, topic), refusal="it is not linked")
         _, wire = self._topics.there(peer.name, topic)
         question = {"topic": wire, "instance": peer.instance if peer.state == "relayed" else ""}
         try:
-            there, refusal = await self._ask(attached, TOPIC, question, TopicAtPublisher), ""
+            there, refusal = await self._ask(session, TOPIC, question, TopicAtPublisher), ""
         except RmpaError as error:
             there, refusal = None, str(error)
-        return BothEnds(self._topics.here(attached, peer, topic), there, refusal)
+        return BothEnds(self._topics.here(session, peer, topic), there, refusal)
 
     # --- topics of this module -------------------------------------------------------------------------------
 
@@ -185,14 +184,14 @@ class WhyService:
         here = snapshot.agent.name
         begin = peer_stages(snapshot, name)
         peer = find_peer(snapshot, name)
-        attached = self._carrier(peer) if peer is not None else None
+        session = self._carrier(peer) if peer is not None else None
         to = peer.name if peer is not None else name
-        if attached is None or attached.link.name != to:
+        if session is None or session.link.name != to:
             stages = begin if begin[-1].level is FAIL else (*begin, _no_link(to))
             return (Diagnosis.of(stages, name=topic, peer=here, to=to),)
         question = {"topic": self._bridge.names.wire_name(to, topic, self._core.type_of(topic))}
         try:
-            found = await self._ask(attached, HERE, question, tuple[Diagnosis, ...], limits.WHY_TIMEOUT)
+            found = await self._ask(session, HERE, question, tuple[Diagnosis, ...], limits.WHY_TIMEOUT)
             if not found:
                 raise RemoteProtocolError("it walked no way at all")
             return found[: limits.WHY_SOURCES_MAX]
@@ -201,15 +200,15 @@ class WhyService:
             silent = Check("link", FAIL, f"{to} does not tell: {error}", remedy)
             return (Diagnosis.of((*begin, silent), name=topic, peer=here, to=to),)
 
-    async def _answer_here(self, attached: PeerSession, args: dict[str, Any]) -> tuple[Diagnosis, ...]:
-        topic = self._bridge.names.local_name(attached.link.name, name_in(args, "topic"))
-        return (await self._arrives(str(attached.link.guid), topic))[: limits.WHY_SOURCES_MAX]
+    async def _answer_here(self, session: PeerSession, args: dict[str, Any]) -> tuple[Diagnosis, ...]:
+        topic = self._bridge.names.local_name(session.link.name, name_in(args, "topic"))
+        return (await self._arrives(str(session.link.guid), topic))[: limits.WHY_SOURCES_MAX]
 
     # --- services ---------------------------------------------------------------------------------------------
 
     async def _service(self, service: str, name: str | None) -> tuple[Diagnosis, ...]:
         """Judge the path of a service from one peer, or from each, to here."""
-        peers = [peer for peer in self._snapshots.build(frozenset()).peers if peer.state in ("linked", "relayed")]
+        peers = self._reachable_peers()
         if name is None:
             carried = [(peer, at) for peer in peers if (at := self._carrier(peer)) is not None]
             offering = [p.guid for p, at in carried if self._services.offers(at, service, p.instance)]
@@ -224,29 +223,29 @@ class WhyService:
     async def _calls(self, name: str, service: str) -> Diagnosis:
         snapshot = self._snapshots.build(frozenset())
         peer = find_peer(snapshot, name)
-        attached = self._carrier(peer) if peer is not None else None
-        if peer is None or attached is None:
+        session = self._carrier(peer) if peer is not None else None
+        if peer is None or session is None:
             return diagnose_service(peer_stages(snapshot, name), snapshot.agent.name, name, service)
         service, wire = self._topics.there(peer.name, service)
         there: ServiceAtServer | None = None
         refusal = ""
         try:
-            there = await self._ask(attached, SERVICE, {"service": wire}, ServiceAtServer)
+            there = await self._ask(session, SERVICE, {"service": wire}, ServiceAtServer)
         except RmpaError as error:
             refusal = str(error)
-        here = await self._services.here(attached, service, wire)
+        here = await self._services.here(session, service, wire)
         begin = peer_stages(snapshot, name)
         return diagnose_service(begin, snapshot.agent.name, peer.name, service, here, there, refusal)
 
     async def _ask(
         self,
-        attached: PeerSession,
+        session: PeerSession,
         what: str,
         args: dict[str, Any],
         kind: type[_T],
         limit: float = limits.ASK_TIMEOUT,
     ) -> _T:
-        value = await self._bridge.asks.ask(attached, what, args, limit)
+        value = await self._bridge.asks.ask(session, what, args, limit)
         try:
             return msgspec.convert(value, kind)
         except (msgspec.ValidationError, RecursionError) as error:
