@@ -31,7 +31,7 @@ async def test_a_followed_clock_does_not_stay_home(settings: Callable[..., Setti
         assert (there.crosses, there.policy) == (True, "time.share = true: peers may follow this module's time")
 
 
-async def test_a_clock_that_nobody_follows_stays_home(settings: Callable[..., Settings]) -> None:
+async def test_a_clock_without_followers_stays_home(settings: Callable[..., Settings]) -> None:
     async with running(settings("a"), settings("b")) as (a, _), node("simulator", a) as simulator:
         await simulator.advertise("/clock", "rosgraph_msgs/Clock")
         (shown,) = a.snapshots.build(frozenset({"/clock"})).topics

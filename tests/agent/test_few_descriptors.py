@@ -167,7 +167,7 @@ async def test_the_control_socket_answers_again(
 
 
 @pytest.mark.usefixtures("fresh")
-async def test_who_dials_says_why_it_cannot_and_tries_again(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_failed_dial_is_logged_and_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ros_limits, "TCPROS_RETRY_FIRST", 0.01)
     monkeypatch.setattr(ros_limits, "TCPROS_RETRY_MAX", 0.02)
     core = RosCore("127.0.0.1", 0)
@@ -190,7 +190,7 @@ async def test_who_dials_says_why_it_cannot_and_tries_again(monkeypatch: pytest.
 
 
 @pytest.mark.usefixtures("fresh")
-async def test_a_node_is_not_taken_for_dead_for_want_of_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_without_descriptors_no_node_is_taken_for_dead(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ros_limits, "NODE_UNREACHABLE_AFTER", 0.0)
     core = RosCore("127.0.0.1", 0)
     await core.start()

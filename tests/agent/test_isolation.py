@@ -354,7 +354,7 @@ PHASES: Final[tuple[Callable[[World], Awaitable[None]], ...]] = (
 )
 
 
-def test_no_work_of_a_thousand_topics_goes_on_without_a_look_at_the_data(tmp_path: Path) -> None:
+def test_work_on_a_thousand_topics_yields_to_data(tmp_path: Path) -> None:
     found: dict[str, list[tuple[float, str]]] = {}
 
     async def main() -> None:
@@ -393,7 +393,7 @@ async def its_master_is_started_anew(world: World) -> None:
         await world.until(lambda looks=looks: world.near.core.counters.as_dict()["master.looks"] > looks)  # type: ignore[misc]
 
 
-def test_no_look_at_an_external_core_goes_on_without_one_at_the_data(tmp_path: Path) -> None:
+def test_reading_an_external_core_yields_to_data(tmp_path: Path) -> None:
     found: dict[str, list[tuple[float, str]]] = {}
 
     async def main() -> None:

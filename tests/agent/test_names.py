@@ -66,7 +66,7 @@ async def test_topics_have_each_sides_names_both_ways(agents: tuple[Agent, Agent
         assert [(r.direction, r.wire) for r in info(robot, "/odom").routes] == [("out", "")]
 
 
-async def test_a_peer_is_told_of_no_more_than_its_rules_allow(settings: Callable[..., Settings]) -> None:
+async def test_a_peer_is_offered_only_what_its_rules_allow(settings: Callable[..., Settings]) -> None:
     guest = PeerRule("guest", policy=PolicySettings(allow=("/pose",)))
     async with (
         running(replace(settings("pc"), peers=(guest,)), settings("guest"), settings("friend")) as (
@@ -84,7 +84,7 @@ async def test_a_peer_is_told_of_no_more_than_its_rules_allow(settings: Callable
         assert counts == {"guest": 1, "friend": 2}
 
 
-async def test_a_mismatch_is_told_under_each_sides_name(agents: tuple[Agent, Agent]) -> None:
+async def test_a_mismatch_has_each_sides_names(agents: tuple[Agent, Agent]) -> None:
     pc, robot = agents
     async with node("base", robot) as base, node("driver", pc) as driver:
         cmd = await driver.advertise("/robot/cmd", "std_msgs/String")
@@ -97,9 +97,7 @@ async def test_a_mismatch_is_told_under_each_sides_name(agents: tuple[Agent, Age
 
 
 @pytest.mark.parametrize("far", [False, True], ids=["here", "there"])
-async def test_what_a_reload_is_not_about_keeps_its_route_and_its_connections(
-    agents: tuple[Agent, Agent], far: bool
-) -> None:
+async def test_a_reload_keeps_unchanged_routes_and_connections(agents: tuple[Agent, Agent], far: bool) -> None:
     pc, robot = agents
     async with node("base", robot) as base, node("driver", pc) as driver:
         names = ("steady", "named", "denied", "tuned")

@@ -111,7 +111,7 @@ PHASES: Final[tuple[Callable[[World], Awaitable[None]], ...]] = (
 )
 
 
-def test_no_work_of_a_thousand_services_goes_on_without_a_look_at_the_data(tmp_path: Path) -> None:
+def test_work_on_a_thousand_services_yields_to_data(tmp_path: Path) -> None:
     found: dict[str, list[tuple[float, str]]] = {}
 
     async def main() -> None:

@@ -51,7 +51,7 @@ def stopped_at(found: tuple[Diagnosis, ...]) -> tuple[str, str]:
     return diagnosis.failed.name, diagnosis.failed.text
 
 
-async def test_from_no_publisher_to_a_flowing_topic(settings: Callable[..., Settings]) -> None:  # noqa: F811
+async def test_each_stage_until_a_topic_flows(settings: Callable[..., Settings]) -> None:  # noqa: F811
     async with (
         running(settings("a"), settings("b")) as (a, b),
         node("talker", a) as talker,

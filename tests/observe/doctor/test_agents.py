@@ -74,7 +74,7 @@ def test_alone_and_of_another_version() -> None:
     assert warned == ["it is RMPA 0.1.0, this command is 0.2.0", "knows no peer (domain 3, looking on wlan0)"]
 
 
-def test_the_descriptors_of_the_agent_are_judged_not_those_of_the_doctor() -> None:
+def test_the_agents_descriptors_are_judged() -> None:
     def files(problem: str = "", *, near: bool = False) -> Check:
         few = FilesInfo(open=60, limit=64, hard=64, reserved=16, near=near, problem=problem)
         agent = msgspec.structs.replace(SNAPSHOT.agent, files=few)

@@ -47,7 +47,7 @@ def test_clocks_of_two_modules(offset: float, error: float | None, level: CheckL
         assert "extrapolation" in found.remedy
 
 
-def test_rights_are_missed_only_by_who_asks_for_them() -> None:
+def test_missing_rights_matter_only_where_wanted() -> None:
     assert {finding.level for finding in judge_rights(FREE)} == {CheckLevel.OK}
     poor = replace(FREE, fifo="Operation not permitted", memlock=65536)
     realtime, files = judge_rights(poor)

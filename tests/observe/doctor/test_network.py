@@ -107,7 +107,7 @@ def test_multicast_by_interface() -> None:
     assert exit_code([lo, eth]) == 1
 
 
-def test_strict_filters_matter_where_there_are_two_ways() -> None:
+def test_strict_filters_matter_with_two_interfaces() -> None:
     strict = {"all": 1, "wlan0": 0, "eth0": 0}
     warned = only(judge_rp_filter(strict, (LO, WLAN, ETH)), CheckLevel.WARN)
     assert "rp_filter=2" in warned.remedy

@@ -86,13 +86,13 @@ def test_ros_master_uri_of_a_roscore_that_the_agent_uses() -> None:
         ("ROS_HOSTNAME", "http://base:11311", CheckLevel.FAIL, "is a URI"),
     ],
 )
-def test_under_which_name_nodes_are_reached(variable: str, value: str, level: CheckLevel, part: str) -> None:
+def test_ros_hostname_and_ros_ip(variable: str, value: str, level: CheckLevel, part: str) -> None:
     found = judged(**{variable: value})[variable]
     assert found.level is level
     assert part in found.text
 
 
-def test_both_names_at_once() -> None:
+def test_ros_ip_beside_ros_hostname() -> None:
     found = judged(ROS_IP="10.0.0.1", ROS_HOSTNAME="base.local")
     assert found["ROS_IP"].level is CheckLevel.WARN
     assert found["ROS_HOSTNAME"].level is CheckLevel.OK
@@ -102,7 +102,7 @@ def test_both_names_at_once() -> None:
     ("addresses", "level"),
     [(("127.0.1.1",), CheckLevel.OK), (("10.0.0.9",), CheckLevel.FAIL), ((), CheckLevel.FAIL)],
 )
-def test_the_host_name_counts_where_no_variable_does(addresses: tuple[str, ...], level: CheckLevel) -> None:
+def test_the_host_name_counts_without_variables(addresses: tuple[str, ...], level: CheckLevel) -> None:
     shell = replace(SHELL, resolved={"base": addresses})
     assert judged(shell)["host name"].level is level
     assert "host name" not in judged(shell, ROS_IP="127.0.0.1")
@@ -125,11 +125,11 @@ def test_domain(value: str, level: CheckLevel) -> None:
         ("ROS_NAMESPACE", "/robot"),
     ],
 )
-def test_what_else_misleads(variable: str, value: str) -> None:
+def test_other_misleading_variables(variable: str, value: str) -> None:
     assert judged(**{variable: value})[variable].level is CheckLevel.WARN
 
 
-def test_names_that_have_to_be_looked_up() -> None:
+def test_names_to_resolve() -> None:
     assert names_of({"ROS_MASTER_URI": "http://robot2:11311", "ROS_HOSTNAME": "10.0.0.1"}, "base") == (
         "robot2",
         "base",

@@ -23,7 +23,7 @@ def walk(
     return diagnose_service(begin, "base", "robot", "/move", here, there, "" if there else "it is older")
 
 
-def test_what_can_be_called() -> None:
+def test_a_service_that_can_be_called() -> None:
     found = walk()
     assert found.flows
     assert (found.kind, found.name, found.peer, found.to, found.node) == ("service", "/move", "robot", "base", "/arm")
@@ -93,12 +93,12 @@ def test_every_stage_behind_the_link_can_fail_but_the_calls() -> None:
     assert {stage for _, _, stage, _, _ in FAILURES.values()} == set(ORDER) - {"peer", "link", "calls"}
 
 
-def test_nothing_is_looked_at_behind_a_link_that_is_not_there() -> None:
+def test_without_a_link_nothing_else_is_judged() -> None:
     begin = (BEGIN[0], Check("link", CheckLevel.FAIL, "no link", "plug it in"))
     assert walk(begin=begin).stages == begin
 
 
-def test_failed_calls_and_mismatches_are_warned_of() -> None:
+def test_failed_calls_and_mismatches_are_warnings() -> None:
     for here, text in (
         (replace(HERE, failed=1, problem="took more than 60 s"), "took more than 60 s"),
         (replace(HERE, mismatch="/client wants 456"), "/client wants 456"),
@@ -109,7 +109,7 @@ def test_failed_calls_and_mismatches_are_warned_of() -> None:
         assert text in found.stages[-1].text
 
 
-def test_an_agent_that_does_not_tell_leaves_its_stage_open() -> None:
+def test_the_server_stage_is_unknown_without_an_answer() -> None:
     found = walk(there=None)
     assert found.flows
     assert found.stages[2].level is CheckLevel.UNKNOWN

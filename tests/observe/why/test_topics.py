@@ -135,7 +135,7 @@ def route(**changes: object) -> dict[str, Any]:
     return {"route": changed, "later": changed}
 
 
-def test_what_flows_passes_every_stage_in_order() -> None:
+def test_a_flowing_topic_passes_all_stages() -> None:
     found = one(Case())
     assert found.flows
     assert found.failed is None
@@ -150,7 +150,7 @@ def test_what_flows_passes_every_stage_in_order() -> None:
 PATH = {"path_problem": "large packets do not get through", "path_remedy": "give it its true MTU"}
 
 
-def test_a_path_that_drops_large_packets_is_told_by_whichever_end_knows() -> None:
+def test_a_path_problem_of_either_end_is_shown() -> None:
     here = one(Case(peer=msgspec.structs.replace(PEER, link=msgspec.structs.replace(LINK, **PATH))))
     (stage,) = [stage for stage in here.stages if stage.level is CheckLevel.WARN]
     assert (stage.name, stage.remedy) == ("link", "give it its true MTU")
@@ -454,7 +454,7 @@ WARNINGS: dict[str, tuple[Case, str, str]] = {
 
 
 @pytest.mark.parametrize(("case", "stage", "text"), WARNINGS.values(), ids=WARNINGS)
-def test_what_is_worth_knowing_though_it_flows(case: Case, stage: str, text: str) -> None:
+def test_warnings_of_a_flowing_topic(case: Case, stage: str, text: str) -> None:
     found = one(case)
     assert found.flows
     warned = [s for s in found.stages if s.level is CheckLevel.WARN]
@@ -462,12 +462,12 @@ def test_what_is_worth_knowing_though_it_flows(case: Case, stage: str, text: str
     assert text in warned[0].text
 
 
-def test_bytes_that_wait_at_one_look_alone_are_on_their_way() -> None:
+def test_bytes_that_wait_once_are_no_fault() -> None:
     found = one(Case(readers_later=(connected("/base", waiting=70_000),)))
     assert found.stages[-1].level is CheckLevel.OK
 
 
-def test_an_agent_that_does_not_tell_leaves_stages_open() -> None:
+def test_stages_are_unknown_without_an_answer() -> None:
     found = one(Case(there=None, refusal="it is older"))
     assert found.flows
     unknown = [stage.name for stage in found.stages if stage.level is CheckLevel.UNKNOWN]
@@ -492,7 +492,7 @@ def test_a_topic_that_is_thinned_out_is_not_missing() -> None:
     assert not one(Case(route=quick, later=quick)).flows
 
 
-def test_each_publisher_has_a_way_of_its_own() -> None:
+def test_each_publisher_has_its_diagnosis() -> None:
     second = msgspec.structs.replace(SOURCE, node="/second", crosses=False, rule="no")
     there = TopicAtPublisher(sources=(SOURCE, second))
     first, other = Case(there=there, source=None, source_later=None).walk()
@@ -502,13 +502,13 @@ def test_each_publisher_has_a_way_of_its_own() -> None:
     assert other.failed.name == "policy there"
 
 
-def test_no_more_ways_are_walked_than_a_user_reads() -> None:
+def test_the_number_of_diagnoses_is_bounded() -> None:
     many = tuple(msgspec.structs.replace(SOURCE, node=f"/n{i}") for i in range(10 * bridge_limits.WHY_SOURCES_MAX))
     found = Case(there=TopicAtPublisher(sources=many), source=None, source_later=None).walk()
     assert len(found) == bridge_limits.WHY_SOURCES_MAX
 
 
-def test_a_peer_is_found_by_its_guid_and_a_wrong_name_by_the_nearest() -> None:
+def test_a_peer_is_found_by_guid_and_a_typo_gets_a_hint() -> None:
     assert one(Case(), "10.0.0.2:40002").flows
     assert one(Case(), "10.0.0.2:40002#1").peer == "joystick"
     found = one(Case(), "joystik")
@@ -527,7 +527,7 @@ def test_a_relayed_module_has_no_link_of_its_own() -> None:
     assert nothing.failed.name == "publisher"
 
 
-def test_names_of_both_sides_are_told() -> None:
+def test_names_at_both_ends_are_shown() -> None:
     renamed = Case(**route(wire="/stick"), source=msgspec.structs.replace(SOURCE, topic="/joy/stick"))
     first = renamed.ends(renamed.route, renamed.source, renamed.readers)
     (found,) = diagnose_topic(first, "joystick", None, "/stick")
@@ -536,7 +536,7 @@ def test_names_of_both_sides_are_told() -> None:
     assert texts["policy here"] == "this module takes it as /cmd (its /stick)"
 
 
-def test_one_look_alone_is_judged_too() -> None:
+def test_a_single_look_is_judged() -> None:
     found = one(replace(Case(), readers_later=None))
     assert found.flows
 
@@ -567,7 +567,7 @@ _routes: Callable[[], st.SearchStrategy[RouteInfo]] = lambda: st.builds(  # noqa
 
 
 @given(_answers, _answers, st.none() | _routes(), st.none() | _routes(), st.booleans())
-def test_whatever_another_agent_says_there_is_an_answer(
+def test_any_answer_of_a_peer_is_judged(
     there: TopicAtPublisher | None,
     later: TopicAtPublisher | None,
     before: RouteInfo | None,
