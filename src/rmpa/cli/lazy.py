@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rmpa.config.values import did_you_mean
+from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -22,12 +23,20 @@ class LazyGroup(click.Group):
 
     Args:
         commands_at: By name: the module, and the one line that the group's help shows.
+        moved: Where commands of former releases are now, by name.
         arguments: For ``click.Group``.
     """
 
-    def __init__(self, *, commands_at: Mapping[str, tuple[str, str]], **arguments: object) -> None:
+    def __init__(
+        self,
+        *,
+        commands_at: Mapping[str, tuple[str, str]],
+        moved: Mapping[str, str] | None = None,
+        **arguments: object,
+    ) -> None:
         super().__init__(**arguments)  # type: ignore[arg-type] # handed through as they came
         self.commands_at = commands_at
+        self.moved = moved or {}
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
         """The names, in the order of the table."""
@@ -57,6 +66,8 @@ class LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Find a command; a misspelt one is told the nearest."""
+        if args and args[0] in self.moved:
+            raise ConfigError(args[0], self.moved[args[0]])
         if args and args[0] not in self.commands_at and not args[0].startswith("-"):
             near = did_you_mean(args[0], self.commands_at)
             hint = f"Did you mean {near}?" if near else f"There are {', '.join(self.commands_at)}."

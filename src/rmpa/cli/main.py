@@ -39,10 +39,14 @@ COMMANDS = {
     "why": ("rmpa.cli.why", "Say why a topic of a peer does not arrive, and what to do."),
     "doctor": ("rmpa.cli.doctor", "Check this machine: network, clock, rights, ROS environment."),
     "multicast": ("rmpa.cli.multicast", "Send and receive multicast packets by hand."),
-    "experiment": ("rmpa.cli.experiment", "Measure RMPA and classic ROS side by side: the paper's evaluation."),
     "reload": ("rmpa.cli.reload", "Let the agent read its settings again."),
     "completion": ("rmpa.cli.completion", "Print the script that completes rmpa's commands in a shell."),
 }
+MOVED = {
+    "experiment": "is not part of rmpa any more; in a clone of its repository: make experiment, "
+    "or python -m lab experiment (docs/experiments.md)",
+}
+"""Commands of releases before this one, and where they are now; to be dropped after one release."""
 EPILOG = """\
 \b
 Examples:
@@ -57,6 +61,7 @@ Examples:
 @click.group(
     cls=LazyGroup,
     commands_at=COMMANDS,
+    moved=MOVED,
     epilog=EPILOG,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
