@@ -17,6 +17,7 @@ from rmpa.observe.snapshot import FilesInfo, LinkInfo, PeerInfo, RouteInfo, Samp
 from rmpa.observe.why.diagnosis import (
     BothEnds,
     Diagnosis,
+    ProxyState,
     PublisherReport,
     SubscriberConnection,
     TopicAtPublisher,
@@ -86,7 +87,7 @@ class Case:
     readers: tuple[SubscriberConnection, ...] = (connected("/base", messages=100),)
     readers_later: tuple[SubscriberConnection, ...] | None = (connected("/base", messages=120),)
     mismatches: tuple[str, ...] = ()
-    only: frozenset[str] | None = None
+    known: bool = True
     carrier: str = ""
     files: FilesInfo | None = None
 
@@ -104,18 +105,12 @@ class Case:
         there = self.there
         if there is not None and source is not None:
             there = msgspec.structs.replace(there, sources=(source,))
-        nodes = frozenset({"/joy"})
-        near = TopicAtSubscriber(
-            snapshot,
-            "/cmd",
-            only=self.only,
-            carrier=self.carrier,
-            registered=nodes if self.registered else frozenset(),
-            conflict=nodes if self.conflict else frozenset(),
-            connections={"/joy": readers},
-            mismatches={"/joy": self.mismatches},
+        proxy = ProxyState(
+            registered=self.registered, conflict=self.conflict, connections=readers, mismatches=self.mismatches
         )
-        return BothEnds(near, there, self.refusal)
+        proxies = {"/joy": proxy} if self.known else {}
+        here = TopicAtSubscriber(snapshot, "/cmd", self.carrier, proxies)
+        return BothEnds(here, there, self.refusal)
 
     def walk(self, peer: str = "joystick") -> tuple[Diagnosis, ...]:
         first = self.ends(self.route, self.source, self.readers)
@@ -518,11 +513,11 @@ def test_a_peer_is_found_by_guid_and_a_typo_gets_a_hint() -> None:
 
 def test_a_relayed_module_has_no_link_of_its_own() -> None:
     relayed = msgspec.structs.replace(PEER, name="arm", state="relayed", via="joystick", link=None)
-    found = one(Case(peer=relayed, carrier="joystick", only=frozenset({"/joy"})), "arm")
+    found = one(Case(peer=relayed, carrier="joystick"), "arm")
     assert found.flows
     assert found.stages[1].text == "no link of its own; joystick passes on what it publishes"
     # What the relay brings of other modules is not this one's.
-    nothing = one(Case(peer=relayed, carrier="joystick", only=frozenset(), source=None, source_later=None), "arm")
+    nothing = one(Case(peer=relayed, carrier="joystick", known=False, source=None, source_later=None), "arm")
     assert nothing.failed is not None
     assert nothing.failed.name == "publisher"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
 import msgspec
@@ -139,6 +139,25 @@ class SubscriberConnection(msgspec.Struct, frozen=True, kw_only=True):
 
 
 @dataclass(frozen=True, slots=True)
+class ProxyState:
+    """What the subscribers' agent knows of the proxy for one publisher.
+
+    Args:
+        name: The proxy's name.
+        registered: Whether it is a publisher of the topic in the local graph.
+        conflict: Whether the publisher's type differs from that of the local publishers.
+        connections: Those of local subscribers.
+        mismatches: The subscribers that were refused here or at the peer, ready to read.
+    """
+
+    name: str = ""
+    registered: bool = False
+    conflict: bool = False
+    connections: tuple[SubscriberConnection, ...] = ()
+    mismatches: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class TopicAtSubscriber:
     """What the subscribers' agent knows of a topic of one peer.
 
@@ -146,23 +165,17 @@ class TopicAtSubscriber:
         snapshot: The agent's, of this topic at least.
         topic: The topic's name here.
         carrier: The peer whose link carries it; another one where a relay passes it on.
-        only: The carrier's nodes that belong to the peer; ``None`` for all.
-        proxies: The proxy's name for each node of the peer.
-        registered: Nodes of the peer whose proxies are publishers of it in the local graph.
-        conflict: Nodes of the peer whose type differs from that of the local publishers.
-        connections: The connections to the proxy of each node of the peer.
-        mismatches: The subscribers that were refused there or here, ready to read, by node of the peer.
+        proxies: Those of the peer's publishers, by the publisher's name; ``None`` without a link.
     """
 
     snapshot: Snapshot
     topic: str
     carrier: str = ""
-    only: frozenset[str] | None = None
-    proxies: Mapping[str, str] = field(default_factory=dict)
-    registered: frozenset[str] = frozenset()
-    conflict: frozenset[str] = frozenset()
-    connections: Mapping[str, tuple[SubscriberConnection, ...]] = field(default_factory=dict)
-    mismatches: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    proxies: Mapping[str, ProxyState] | None = None
+
+    def proxy(self, node: str) -> ProxyState:
+        """The proxy for a publisher."""
+        return (self.proxies or {}).get(node, ProxyState())
 
 
 @dataclass(frozen=True, slots=True)

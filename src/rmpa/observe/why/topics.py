@@ -139,7 +139,7 @@ def _nodes(ends: BothEnds, peer: str) -> list[str]:
 def _routes(here: TopicAtSubscriber, peer: str) -> list[RouteInfo]:
     topics = [topic for topic in here.snapshot.topics if topic.name == here.topic]
     routes = [r for t in topics for r in t.routes if r.direction == "in" and r.peer == (here.carrier or peer)]
-    return [route for route in routes if here.only is None or route.node in here.only]
+    return [route for route in routes if here.proxies is None or route.node in here.proxies]
 
 
 def _report(ends: BothEnds | None, node: str) -> PublisherReport | None:
@@ -262,7 +262,7 @@ def _limit(here: TopicAtSubscriber, route: RouteInfo) -> Check:
 
 
 def _policy_here(here: TopicAtSubscriber, route: RouteInfo) -> Check:
-    if route.state == "hidden" and route.node not in here.conflict:
+    if route.state == "hidden" and not here.proxy(route.node).conflict:
         remedy = "change [bridge] in this module's rmpa.toml, and `rmpa reload`"
         return Check("policy here", FAIL, f"this module does not take it: {route.problem}", remedy)
     was = f" (its {route.wire})" if route.wire else ""
@@ -270,15 +270,16 @@ def _policy_here(here: TopicAtSubscriber, route: RouteInfo) -> Check:
 
 
 def _type(here: TopicAtSubscriber, route: RouteInfo) -> Check:
-    if route.node in here.conflict:
+    if here.proxy(route.node).conflict:
         text, _, remedy = route.problem.partition("; ")
         return Check("type", FAIL, text, remedy)
     return Check("type", OK, f"no local publisher has another type than {route.type}")
 
 
 def _in_graph(here: TopicAtSubscriber, route: RouteInfo) -> Check:
-    proxy = here.proxies.get(route.node, f"/rmpa/{route.peer}{route.node}")
-    if route.node not in here.registered:
+    state = here.proxy(route.node)
+    proxy = state.name or f"/rmpa/{route.peer}{route.node}"
+    if not state.registered:
         text = f"its proxy {proxy} is not in the local graph as a publisher of {here.topic}"
         if route.problem:
             problem, _, remedy = route.problem.partition("; ")
@@ -292,10 +293,10 @@ def _in_graph(here: TopicAtSubscriber, route: RouteInfo) -> Check:
 
 def _subscriber(here: TopicAtSubscriber, route: RouteInfo) -> Iterator[Check]:
     """Whether a local subscriber is connected to the proxy, and whether one was refused."""
-    connections = here.connections.get(route.node, ())
+    proxy = here.proxy(route.node)
+    connections, refused = proxy.connections, proxy.mismatches
     topics = [topic for topic in here.snapshot.topics if topic.name == here.topic]
     listed = topics[0].subscribers if topics else ()
-    refused = here.mismatches.get(route.node, ())
     if not connections:
         if refused:
             yield Check("subscriber", OK, f"{', '.join(listed) or 'a node'} wants it")
@@ -424,8 +425,8 @@ def _contract(route: RouteInfo) -> Check:
 
 
 def _reading(ends: BothEnds, later: BothEnds | None, node: str) -> Check:
-    before = {reader.number: reader for reader in ends.here.connections.get(node, ())}
-    after = (later or ends).here.connections.get(node, ())
+    before = {reader.number: reader for reader in ends.here.proxy(node).connections}
+    after = (later or ends).here.proxy(node).connections
     if not after:
         return Check("reader", FAIL, "its subscribers have just left", "start them again")
     stuck = [reader for reader in after if reader.waiting and before.get(reader.number, reader).waiting]

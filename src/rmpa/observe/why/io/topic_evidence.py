@@ -14,7 +14,13 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.contract import Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.names import is_global_name
-from rmpa.observe.why.diagnosis import PublisherReport, SubscriberConnection, TopicAtPublisher, TopicAtSubscriber
+from rmpa.observe.why.diagnosis import (
+    ProxyState,
+    PublisherReport,
+    SubscriberConnection,
+    TopicAtPublisher,
+    TopicAtSubscriber,
+)
 from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.event_loop import yielding_to_data
 
@@ -74,8 +80,7 @@ class TopicEvidence:
         snapshot = self._snapshots.build(frozenset({topic}))
         if session is None or peer is None:
             return TopicAtSubscriber(snapshot, topic)
-        only, registered, conflict = set(), set(), set()
-        connections, mismatches, proxies = {}, {}, {}
+        proxies = {}
         publishers, standing = self._core.publishers(topic), dict(session.inbound)
         for number, source in list(self._bridge.imports.at(topic)):
             entry = self._bridge.imports.get(number, source)
@@ -84,26 +89,15 @@ class TopicEvidence:
             if (entry.origin.instance if entry.origin else session.link.identity.instance.hex()) != peer.instance:
                 continue
             node = source.node
-            only.add(node)
-            if entry.conflict:
-                conflict.add(node)
             name = session.inbound.names.get(node) or proxy_name(session.inbound.prefix, node)
-            proxies[node] = name
-            if node in standing and publishers.get(name) == standing[node].node.uri:
-                registered.add(node)
-            connections[node] = self._connections(session, source)
-            mismatches[node] = self._bridge.mismatches(source)
-        return TopicAtSubscriber(
-            snapshot,
-            topic,
-            session.link.name,
-            frozenset(only),
-            proxies,
-            frozenset(registered),
-            frozenset(conflict),
-            connections,
-            mismatches,
-        )
+            proxies[node] = ProxyState(
+                name=name,
+                registered=node in standing and publishers.get(name) == standing[node].node.uri,
+                conflict=entry.conflict,
+                connections=self._connections(session, source),
+                mismatches=self._bridge.mismatches(source),
+            )
+        return TopicAtSubscriber(snapshot, topic, session.link.name, proxies)
 
     @staticmethod
     def _connections(session: PeerSession, source: Source) -> tuple[SubscriberConnection, ...]:

@@ -131,7 +131,7 @@ class WhyService:
 
     def _offers(self, peer: PeerInfo, topic: str) -> bool:
         session = self._carrier(peer)
-        return session is not None and bool(self._topics.here(session, peer, topic).only)
+        return session is not None and bool(self._topics.here(session, peer, topic).proxies)
 
     async def _nowhere(self, topic: str, linked: list[str]) -> Diagnosis:
         here = self._snapshots.build(frozenset()).agent.name
