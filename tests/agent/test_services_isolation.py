@@ -12,12 +12,18 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from rmpa.config.settings import PeerRule, ServiceSettings
-from rmpa.runtime.event_loop import AgentLoop
-from tests.agent.test_isolation import NODES, STRAYS, Watched, World, call, calls, watched, worlds
+from tests.agent.test_isolation import (
+    NODES,
+    World,
+    assert_yields_to_data,
+    call,
+    calls,
+    watched,
+)
 from tests.agent.test_services import connect, serving
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
 
 __all__ = ["watched"]
@@ -100,30 +106,14 @@ async def the_fleet_leaves(world: World) -> None:
     await world.until(lambda: shown(world) == 0)
 
 
-PHASES: Final[tuple[Callable[[World], Awaitable[None]], ...]] = (
-    a_fleet_registers,
-    plans_are_reconciled,
-    somebody_looks_at_everything,
-    other_rules_hold,
-    large_calls_are_made,
-    the_link_falls_and_comes_back,
-    the_fleet_leaves,
-)
-
-
 def test_work_on_a_thousand_services_yields_to_data(tmp_path: Path) -> None:
-    found: dict[str, list[tuple[float, str]]] = {}
-
-    async def main() -> None:
-        async with worlds(tmp_path) as world:
-            for phase in PHASES:
-                Watched.holds.clear()
-                await phase(world)
-                if len(Watched.holds) > STRAYS:
-                    found[phase.__name__] = sorted(Watched.holds, reverse=True)[:8]
-
-    with asyncio.Runner(loop_factory=AgentLoop) as runner:
-        runner.run(main())
-    told = [f"{name}: {1e3 * hold:.1f} ms: {who}" for name, holds in found.items() for hold, who in holds]
-    assert not found, "\n".join(told)
-    assert Watched.looks > 10_000
+    assert_yields_to_data(
+        tmp_path,
+        a_fleet_registers,
+        plans_are_reconciled,
+        somebody_looks_at_everything,
+        other_rules_hold,
+        large_calls_are_made,
+        the_link_falls_and_comes_back,
+        the_fleet_leaves,
+    )

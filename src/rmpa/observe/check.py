@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import msgspec
 
@@ -52,6 +52,12 @@ class Check(msgspec.Struct, frozen=True, omit_defaults=True):
     remedy: str = ""
     where: str = ""
     evidence: dict[str, str] = {}
+
+    @classmethod
+    def from_message(cls, name: str, level: CheckLevel, message: str, remedy: str = "", where: str = "") -> Self:
+        """The opposite of ``message``: what stands behind the first "; " is the remedy, in place of the one given."""
+        text, _, told = message.partition("; ")
+        return cls(name, level, text, told or remedy, where)
 
     @property
     def message(self) -> str:

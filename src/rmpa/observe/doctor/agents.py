@@ -9,7 +9,7 @@ from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.doctor.machine import judge_peer_clock
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from rmpa.observe.snapshot import AgentInfo, FilesInfo, PeerInfo, Snapshot, UnreachableInfo
 
@@ -24,7 +24,7 @@ def judge_agents(agents: Mapping[str, Snapshot | str], version: str) -> list[Che
     if not agents:
         text = "none runs here, so what only an agent knows was not looked at"
         return [Check("agent", SKIPPED, text, "start it with `rmpa up`, and ask again")]
-    found = []
+    found: list[Check] = []
     for name, shown in agents.items():
         if isinstance(shown, str):
             found.append(Check("agent", FAIL, shown, "is it stopped? its log may tell", where=name))
@@ -33,32 +33,31 @@ def judge_agents(agents: Mapping[str, Snapshot | str], version: str) -> list[Che
     return found
 
 
-def _agent(snapshot: Snapshot, version: str) -> list[Check]:
+def _agent(snapshot: Snapshot, version: str) -> Iterator[Check]:
     agent = snapshot.agent
+    here = agent.name
     text = f"domain {agent.domain}, core {agent.core_uri}, mesh {agent.guid.partition('#')[0] or 'not joined'}"
-    found = [Check("agent", OK, text, where=agent.name)]
+    yield Check("agent", OK, text, where=here)
     if agent.core_memory:
-        found.append(Check("core memory", OK, agent.core_memory, where=agent.name))
+        yield Check("core memory", OK, agent.core_memory, where=here)
     if agent.version != version:
         text = f"it is RMPA {agent.version}, this command is {version}"
-        found.append(Check("agent", WARN, text, "start it again with this version", where=agent.name))
-    problem = agent.files.problem if agent.files is not None else ""
-    found += [Check("agent", WARN, note, where=agent.name) for note in snapshot.notes if note != problem]
-    found += [_unreachable(info) for info in snapshot.unreachable]
+        yield Check("agent", WARN, text, "start it again with this version", where=here)
+    shortage = agent.files.problem if agent.files is not None else ""
+    yield from (Check("agent", WARN, note, where=here) for note in snapshot.notes if note != shortage)
+    yield from map(_unreachable, snapshot.unreachable)
     if agent.files is not None:
-        found.append(_files(agent, agent.files))
+        yield _files(agent, agent.files)
     text = f"{agent.proxies} nodes of peers, {agent.proxy_sockets} listening sockets: {agent.proxy_listening}"
-    found.append(Check("proxies", OK, text, where=agent.name))
+    yield Check("proxies", OK, text, where=here)
     if not snapshot.peers:
-        where = ", ".join(agent.interfaces) or "no interface"
-        text = f"knows no peer (domain {agent.domain}, looking on {where})"
+        text = f"knows no peer (domain {agent.domain}, looking on {', '.join(agent.interfaces) or 'no interface'})"
         advice = (
             f"is `rmpa up` running elsewhere with --domain {agent.domain}? `rmpa multicast` tries the way by hand"
         )
-        found.append(Check("peer", WARN, text, advice, where=agent.name))
+        yield Check("peer", WARN, text, advice, where=here)
     for peer in snapshot.peers:
-        found += _peer(agent.name, peer)
-    return found
+        yield from _peer(here, peer)
 
 
 def _unreachable(info: UnreachableInfo) -> Check:
@@ -80,26 +79,24 @@ def _files(agent: AgentInfo, files: FilesInfo) -> Check:
     return Check("files", OK, text, where=agent.name)
 
 
-def _peer(agent: str, peer: PeerInfo) -> list[Check]:
-    subject = f"{agent}-{peer.name}"
-    found = []
+def _peer(agent: str, peer: PeerInfo) -> Iterator[Check]:
+    both = f"{agent}-{peer.name}"
     for conflict in peer.conflicts:
-        text, _, remedy = conflict.partition("; ")
-        found.append(Check("peer", FAIL, text, remedy or "give each module a --name of its own", where=subject))
+        yield Check.from_message("peer", FAIL, conflict, "give each module a --name of its own", both)
     link = peer.link
     if link is None:
-        text = f"{peer.state}: {peer.last_error or 'no TCP connection yet'}"
         level = FAIL if peer.state == "refused" else WARN
+        text = f"{peer.state}: {peer.last_error or 'no TCP connection yet'}"
         advice = "see that TCP gets through on both machines: firewall, routes; or do what the text says"
-        return [*found, Check("peer", level, text, advice, where=subject)]
+        yield Check("peer", level, text, advice, where=both)
+        return
     way = "found by multicast" if peer.source == "multicast" else f"found by {peer.source or 'its link'}"
-    found.append(Check("peer", OK, f"linked by {link.remote}, {way}", where=subject))
+    yield Check("peer", OK, f"linked by {link.remote}, {way}", where=both)
     if link.path_problem:
-        found.append(Check("mtu", WARN, link.path_problem, link.path_remedy, where=subject))
+        yield Check("mtu", WARN, link.path_problem, link.path_remedy, where=both)
     if link.dropped:
         text = f"{link.dropped} messages were given up, for the link is slower than what it should carry"
         advice = "`rmpa peer info` shows of which topics; contracts.md tells what to do (max_rate, priority)"
-        found.append(Check("peer", WARN, text, advice, where=subject))
+        yield Check("peer", WARN, text, advice, where=both)
     if link.clock_offset is not None:
-        found.append(judge_peer_clock(agent, peer.name, link.clock_offset, link.clock_error))
-    return found
+        yield judge_peer_clock(agent, peer.name, link.clock_offset, link.clock_error)

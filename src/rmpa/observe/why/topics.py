@@ -242,8 +242,7 @@ def _not_offered(ends: BothEnds, report: PublisherReport | None, peer: str) -> C
         return Check("offer", FAIL, text, f"names of at most {config_limits.CROSSING_NAME_MAX} characters cross")
     peers = [p for p in ends.here.snapshot.peers if p.name == peer]
     for bound in (bound for p in peers for bound in p.beyond if bound.here and bound.kind == "topics"):
-        text, _, remedy = bound.text.partition("; ")
-        return Check("limit", FAIL, text, remedy)
+        return Check.from_message("limit", FAIL, bound.text)
     count = peers[0].topics_in if peers else 0
     text = f"the offer of it has not come here ({count} topics of {peer} have)"
     remedy = (
@@ -271,8 +270,7 @@ def _policy_here(here: TopicAtSubscriber, route: RouteInfo) -> Check:
 
 def _type(here: TopicAtSubscriber, route: RouteInfo) -> Check:
     if here.proxy(route.node).conflict:
-        text, _, remedy = route.problem.partition("; ")
-        return Check("type", FAIL, text, remedy)
+        return Check.from_message("type", FAIL, route.problem)
     return Check("type", OK, f"no local publisher has another type than {route.type}")
 
 
@@ -282,8 +280,7 @@ def _in_graph(here: TopicAtSubscriber, route: RouteInfo) -> Check:
     if not state.registered:
         text = f"its proxy {proxy} is not in the local graph as a publisher of {here.topic}"
         if route.problem:
-            problem, _, remedy = route.problem.partition("; ")
-            return Check("graph", FAIL, f"{text}: {problem}", remedy)
+            return Check.from_message("graph", FAIL, f"{text}: {route.problem}")
         remedy = (
             f"it is put there again within {bridge_limits.RECONCILE_INTERVAL:g} s; if not, the agent's log says why"
         )
