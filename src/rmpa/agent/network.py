@@ -123,7 +123,7 @@ class NetworkEndpoint:
 
     def _link_down(self, link: MeshLink, reason: str) -> None:
         self._bridge.link_down(link)
-        if reason != REPLACED:  # the peer is linked all the while: nobody else may take its seat
+        if reason != REPLACED:  # a replaced link leaves its peer linked: its endpoint stays taken
             self.discovery.link_down(link.identity.guid, link.identity.instance)
 
     def _interfaces(self, everything: tuple[Interface, ...]) -> bool:

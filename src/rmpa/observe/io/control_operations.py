@@ -19,7 +19,7 @@ from rmpa.observe.io import node_requests
 from rmpa.observe.reload_reply import ReloadReply
 from rmpa.observe.snapshot import FollowedInfo, PingReply, Snapshot
 from rmpa.observe.why.diagnosis import Diagnosis
-from rmpa.ros.node_info import NodeEnd, NodeFacts, NodeLine, NodePing, PeerNodes
+from rmpa.ros.node_info import NodeLine, PeerNodes
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Collection
@@ -187,6 +187,6 @@ OPERATIONS: Final = (
     Operation("reload", ControlOperations.reload, ReloadReply),
     Operation("param", ControlOperations.param, object),  # the value that the peer replies
     Operation("followed", ControlOperations.followed, tuple[FollowedInfo, ...]),
-    Operation("node", ControlOperations.node, tuple[PeerNodes, ...] | NodeFacts | NodePing | NodeEnd),
+    Operation("node", ControlOperations.node, object),  # tuple[PeerNodes, ...] for lists, else as REPLIES says
 )
 """All operations of the control socket."""

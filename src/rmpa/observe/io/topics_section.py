@@ -134,14 +134,14 @@ class TopicsSection:
 
     def _inbound(self, wanted: Collection[str] | None) -> Iterator[tuple[Source, RouteInfo, list[str]]]:
         """Each source of a peer with its route, and its mismatches."""
-        session = {at.peer: at for at in self._bridge.everyone()}
+        sessions = {at.peer: at for at in self._bridge.everyone()}
         self._clocks.follow(self._clock.now())
-        clocks = {peer: self._clocks[peer] for peer in session}
+        clocks = {peer: self._clocks[peer] for peer in sessions}
         for peer, source, entry in yielding_to_data(list(self._bridge.imports)):
             if wanted is not None and entry.topic not in wanted:
                 continue
             yield_to_data()
-            at = session[peer]
+            at = sessions[peer]
             texts = [f"{at.link.name}: {entry.hidden}"] if entry.conflict else []
             texts += self._bridge.mismatches(source)
             yield Source(entry.topic, source.node), self._import(at, source, entry, clocks[peer]), texts

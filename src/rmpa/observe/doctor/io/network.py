@@ -125,7 +125,7 @@ def _tcp(what: str, host: str, number: int, ours: Mapping[int, str]) -> Port:
 
 
 def _owner(number: int) -> str:
-    """The program that has a port, ready to read; empty where the kernel does not tell us."""
+    """The program that has a port, ready to read; empty where the kernel does not say."""
     with contextlib.suppress(psutil.Error, OSError):
         for connection in psutil.net_connections("inet"):
             listens = connection.status in (psutil.CONN_LISTEN, psutil.CONN_NONE)
