@@ -270,11 +270,11 @@ async def plans_are_reconciled(world: World) -> None:
 async def other_rules_hold(world: World) -> None:
     """Every topic gets another name here, and is kept home over there; and back."""
     for rules in ((PeerRule("far", "/moved"),), ()) * 3:
-        world.near._apply(replace(world.near._settings, peers=rules))
+        world.near.apply_settings(replace(world.near._settings, peers=rules))
         await world.until(lambda rules=rules: world.shown() == (0 if rules else TOPICS))  # type: ignore[misc]
         await world.until(lambda rules=rules: world.shown("/moved/fleet/") == (TOPICS if rules else 0))  # type: ignore[misc]
     for policy in (PolicySettings(deny=("/fleet/**",)), PolicySettings()) * 3:
-        world.far._apply(replace(world.far._settings, policy=policy))
+        world.far.apply_settings(replace(world.far._settings, policy=policy))
         await world.until(lambda policy=policy: world.shown() == (0 if policy.deny else TOPICS))  # type: ignore[misc]
 
 

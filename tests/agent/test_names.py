@@ -113,7 +113,7 @@ async def test_a_reload_keeps_unchanged_routes_and_connections(agents: tuple[Age
         agent, prefix = (robot, "/") if far else (pc, "/robot/")
         near_rule = replace(PREFIX[0], remap_in=(Remap("/named", "/robot/other"),))
         far_rule = PeerRule("pc", "", (), (Remap("/named", "/other"),))
-        agent._apply(
+        agent.apply_settings(
             replace(
                 agent._settings,
                 policy=PolicySettings(deny=(f"{prefix}denied",)),

@@ -140,7 +140,7 @@ async def test_a_node_is_not_ended_without_permission(settings: Callable[..., Se
         with pytest.raises(PeerRefused, match=refusal):
             await ask(a, NodeEnd, "node.kill", "/talker")
         assert not ended.is_set()
-        b._apply(replace(b_settings, nodes=NodeSettings()))
+        b.apply_settings(replace(b_settings, nodes=NodeSettings()))
         assert (await ask(a, NodeEnd, "node.kill", "/talker")).gone
 
 

@@ -91,7 +91,7 @@ class Agent:
         for part in (self.params, self.services, bounds):
             self.bridge.add(part)
         self.network = Network(settings, self.bridge)
-        self.reloader = Reloader(settings, load, self._apply)
+        self.reloader = Reloader(settings, load, self.apply_settings)
         counters = Counters()
         self._collector = GarbageCollector(self._bytes_carried, counters)
         self._clocks = PeerClocks(self.bridge)
@@ -159,7 +159,7 @@ class Agent:
         yield from (f"{key} waits for a restart" for key in self.reloader.waiting)
         yield from self.params.notes()
 
-    def _apply(self, settings: Settings) -> None:
+    def apply_settings(self, settings: Settings) -> None:
         """Take settings that were read again; only those of ``agent.reload.LIVE`` differ."""
         self._settings = settings
         logging.getLogger().setLevel(settings.log_level.upper())

@@ -29,7 +29,7 @@ _DENY: Final = {"services": "services.deny"}
 """The setting that denies things of a kind, where it is not ``bridge.deny``."""
 
 
-class Endpoint(Protocol):
+class EndpointView(Protocol):
     """What the snapshot needs of the agent's place in the network (``agent.network.NetworkEndpoint``)."""
 
     identity: Identity
@@ -50,7 +50,7 @@ class PeersSection:
         self._bounds = bounds
         self._clock = SystemClock()
 
-    def infos(self, endpoint: Endpoint) -> tuple[PeerInfo, ...]:
+    def infos(self, endpoint: EndpointView) -> tuple[PeerInfo, ...]:
         """Every peer that is known, by name."""
         now = self._clock.now()
         links = {session.link.guid: session for session in self._bridge.attached()}

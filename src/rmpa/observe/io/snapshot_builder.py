@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.core.counters import Counters
     from rmpa.observe.io.peer_clocks import PeerClocks
-    from rmpa.observe.io.peers_section import Endpoint
+    from rmpa.observe.io.peers_section import EndpointView
     from rmpa.ros.core.api import Core
     from rmpa.runtime.realtime import SchedulingRequest
 
@@ -58,7 +58,7 @@ class SnapshotSources:
     clocks: PeerClocks
     services: Services
     bounds: Bounds
-    endpoint: Callable[[], Endpoint | None]
+    endpoint: Callable[[], EndpointView | None]
     counters: tuple[Counters, ...]
     notes: Callable[[], Iterable[str]]
     started: float
@@ -75,7 +75,7 @@ class SnapshotBuilder:
 
     def __init__(self, settings: Settings, sources: SnapshotSources) -> None:
         self._settings = settings
-        self._of = sources
+        self._sources = sources
         self._process = psutil.Process()
         self._process.cpu_percent()  # the first call only begins to count
         self._cpu: float | None = None
@@ -85,9 +85,9 @@ class SnapshotBuilder:
         self._services = ServicesSection(sources.services)
 
     @property
-    def endpoint(self) -> Endpoint | None:
+    def endpoint(self) -> EndpointView | None:
         """The agent's place in the network now."""
-        return self._of.endpoint()
+        return self._sources.endpoint()
 
     def reload(self, settings: Settings) -> None:
         """Other settings hold from now on."""
@@ -113,26 +113,31 @@ class SnapshotBuilder:
             services=self._services.infos() if topics is None else (),
             counters=dict(sorted(counters.items())),
             notes=self._notes(endpoint),
-            unreachable=unreachable_infos(self._of.core, time.monotonic()),
+            unreachable=unreachable_infos(self._sources.core, time.monotonic()),
         )
 
-    def _counters(self, endpoint: Endpoint | None) -> Iterator[Counters]:
-        yield from (self._of.bridge.counters, self._of.core.counters, DESCRIPTORS.counters, *self._of.counters)
+    def _counters(self, endpoint: EndpointView | None) -> Iterator[Counters]:
+        yield from (
+            self._sources.bridge.counters,
+            self._sources.core.counters,
+            DESCRIPTORS.counters,
+            *self._sources.counters,
+        )
         if endpoint is not None:
             yield from (endpoint.mesh.counters, endpoint.discovery.counters)
 
-    def _notes(self, endpoint: Endpoint | None) -> tuple[str, ...]:
-        notes = [*(endpoint.discovery.notes() if endpoint is not None else ()), *self._of.core.notes()]
+    def _notes(self, endpoint: EndpointView | None) -> tuple[str, ...]:
+        notes = [*(endpoint.discovery.notes() if endpoint is not None else ()), *self._sources.core.notes()]
         if DESCRIPTORS.shortage is not None:
             notes.append(DESCRIPTORS.shortage.problem)
-        notes += self._of.notes()
-        notes += map(own_text, self._of.bounds.own())
-        missing = refused(self._of.requests)
+        notes += self._sources.notes()
+        notes += map(own_text, self._sources.bounds.own())
+        missing = refused(self._sources.requests)
         return (*notes, missing) if missing else tuple(notes)
 
-    def _agent(self, endpoint: Endpoint | None) -> AgentInfo:
+    def _agent(self, endpoint: EndpointView | None) -> AgentInfo:
         identity = endpoint.identity if endpoint is not None else None
-        bridge, core = self._of.bridge, self._of.core
+        bridge, core = self._sources.bridge, self._sources.core
         proxies = sum(session.inbound.count for session in bridge.everyone())
         return AgentInfo(
             name=self._settings.name,
@@ -142,14 +147,14 @@ class SnapshotBuilder:
             core_uri=core.uri,
             version=rmpa.__version__,
             pid=os.getpid(),
-            started=self._of.started,
-            uptime=time.time() - self._of.started,
+            started=self._sources.started,
+            uptime=time.time() - self._sources.started,
             cpu=self._cpu_share(),
             rss=self._memory(),
             addresses=tuple(str(a) for a in (identity.guid.address, *identity.addresses)) if identity else (),
             interfaces=tuple(i.name for i in endpoint.discovery.interfaces) if endpoint is not None else (),
             config_file=str(self._settings.config_file or ""),
-            realtime=tuple(map(str, self._of.requests)),
+            realtime=tuple(map(str, self._sources.requests)),
             files=_files(),
             proxies=proxies,
             proxy_sockets=bridge.proxy_nodes.sockets(proxies),

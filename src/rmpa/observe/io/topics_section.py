@@ -91,46 +91,34 @@ class TopicsSection:
         names: Iterable[str] = chain(*tables) if wanted is None else wanted
         known = {name for name in yielding_to_data(names) if any(name in table for table in tables)}
         unreachable = {info.node: str(info) for info in unreachable_infos(self._core, self._clock.now())}
-        return tuple(
-            self._topic(
-                name,
-                state.types.get(name, ""),
-                tuple(node for node in state.publishers.get(name, {}) if not is_own(node)),
-                tuple(node for node in state.subscribers.get(name, {}) if not is_own(node)),
-                tuple(routes.get(name, ())),
-                tuple(mismatches.get(name, ())),
-                tuple(text for node in state.publishers.get(name, {}) if (text := unreachable.get(node))),
+        found = []
+        for name in breathing_sorted(known):
+            yield_to_data()
+            nodes, type_name = tuple(state.publishers.get(name, ())), state.types.get(name, "")
+            own, crossing = tuple(node for node in nodes if not is_own(node)), tuple(routes.get(name, ()))
+            decision = self._decision(name, type_name, own[0] if own else "/")
+            topic = TopicInfo(
+                name=name,
+                type=type_name or next((route.type for route in crossing), ""),
+                md5=next((route.md5 for route in crossing if route.md5), ""),
+                publishers=own,
+                subscribers=tuple(node for node in state.subscribers.get(name, ()) if not is_own(node)),
+                routes=crossing,
+                crosses=decision.allowed,
+                policy=decision.rule,
+                mismatches=tuple(mismatches.get(name, ())),
+                unreachable=tuple(unreachable[node] for node in nodes if node in unreachable),
             )
-            for name in breathing_sorted(known)
-        )
+            found.append(topic)
+        return tuple(found)
 
-    def _topic(
-        self,
-        name: str,
-        type_name: str,
-        publishers: tuple[str, ...],
-        subscribers: tuple[str, ...],
-        routes: tuple[RouteInfo, ...],
-        mismatches: tuple[str, ...],
-        unreachable: tuple[str, ...],
-    ) -> TopicInfo:
-        yield_to_data()
-        decision = self._policy.judge(name, type_name, publishers[0] if publishers else "/")
+    def _decision(self, name: str, type_name: str, node: str) -> PolicyDecision:
+        """Whether a topic of this module may cross."""
+        decision = self._policy.judge(name, type_name, node)
         if name == CLOCK and self._follow and not decision.allowed:
             text = f'time.follow = "{self._follow}": that module\'s comes here; one of this module stays home'
-            decision = PolicyDecision(True, text)
-        return TopicInfo(
-            name=name,
-            type=type_name or next((route.type for route in routes), ""),
-            md5=next((route.md5 for route in routes if route.md5), ""),
-            publishers=publishers,
-            subscribers=subscribers,
-            routes=routes,
-            crosses=decision.allowed,
-            policy=decision.rule,
-            mismatches=mismatches,
-            unreachable=unreachable,
-        )
+            return PolicyDecision(True, text)
+        return decision
 
     def _inbound(self, wanted: Collection[str] | None) -> Iterator[tuple[Source, RouteInfo, list[str]]]:
         """Each source of a peer with its route, and its mismatches."""

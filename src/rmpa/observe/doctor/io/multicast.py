@@ -43,7 +43,20 @@ class Packet:
     interface: str
 
 
-class GroupSender:
+class _Socket:
+    """A socket that a ``with`` block closes."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self._sock = sock
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._sock.close()
+
+
+class GroupSender(_Socket):
     """A socket that sends to a group on an interface of choice; a context manager.
 
     Args:
@@ -57,15 +70,9 @@ class GroupSender:
     def __init__(self, group: str, port: int) -> None:
         _check_group(group)
         self._to = (group, port)
-        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+        super().__init__(socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC))
         self._sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, discovery_limits.MULTICAST_TTL)
         self._sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._sock.close()
 
     def send(self, interface: Interface, data: bytes) -> str:
         """Send one packet; return why that failed, or an empty string."""
@@ -78,7 +85,7 @@ class GroupSender:
         return ""
 
 
-class GroupReceiver:
+class GroupReceiver(_Socket):
     """A socket that receives the packets of a group on the interfaces where it joined; a context manager.
 
     Args:
@@ -93,18 +100,12 @@ class GroupReceiver:
     def __init__(self, group: str, port: int) -> None:
         _check_group(group)
         try:
-            self._sock = open_receiver(group, port)
+            super().__init__(open_receiver(group, port))
         except OSError as error:
             problem = f"cannot be opened ({error.strerror})"
             raise StartError(f"UDP port {port}", problem, "`ss -ulnp` shows who has it") from None
         self._members = Membership(self._sock, group)
         self._names: dict[int, str] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._sock.close()
 
     def join(self, interfaces: Iterable[Interface]) -> dict[str, str]:
         """Join the group on these interfaces; return why it failed, by the names of those where it did."""
