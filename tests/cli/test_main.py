@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 from rmpa import __version__
-from rmpa.cli.lazy import LazyGroup
+from rmpa.cli.lazy_group import LazyGroup
 from rmpa.cli.main import cli, main
 
 if TYPE_CHECKING:

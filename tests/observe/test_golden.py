@@ -10,6 +10,7 @@ from ipaddress import IPv4Interface
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+import click
 import msgspec
 import pytest
 
@@ -80,7 +81,8 @@ def holed() -> PeerInfo:
 
 def document(value: Sequence[object], lines: Sequence[str]) -> bytes:
     """As JSON, one object a line, and the lines behind it."""
-    return b"\n".join((msgspec.json.encode(value).replace(b"},{", b"},\n{"), *map(str.encode, lines), b""))
+    plain = (click.unstyle(line).encode() for line in lines)
+    return b"\n".join((msgspec.json.encode(value).replace(b"},{", b"},\n{"), *plain, b""))
 
 
 def findings() -> Iterator[Check]:
@@ -159,9 +161,7 @@ def doctor() -> bytes:
     found = list(findings())
     lines = [line for finding in found for line in doctor_lines(finding)]
     lines += [doctor_summary(found), f"exit code {exit_code(found)}"]
-    return b"\n".join(
-        (msgspec.json.encode([*map(doctor_json, found)]).replace(b"},{", b"},\n{"), *map(str.encode, lines), b"")
-    )
+    return document([*map(doctor_json, found)], lines)
 
 
 def diagnoses() -> Iterator[Diagnosis]:

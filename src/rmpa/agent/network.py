@@ -21,7 +21,7 @@ from rmpa.discovery.io.interfaces import choose, further_addresses, list_interfa
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
-from rmpa.mesh.peering import REPLACED
+from rmpa.mesh.peering import LinkDown, LinkDownCause
 from rmpa.runtime.sockets import open_mesh_port
 from rmpa.runtime.system_clock import SystemClock
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.discovery.events import Event
     from rmpa.discovery.io.interfaces import Interface
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
 
 _log = logging.getLogger(__name__)
 
@@ -78,7 +78,7 @@ class NetworkEndpoint:
             on_link_up=self._link_up,
             on_link_down=self._link_down,
             on_control=bridge.control,
-            takers=LinkHandlers(bridge.data, bridge.part, bridge.mark, bridge.clock, bridge.lane_lost),
+            handlers=LinkHandlers(bridge.data, bridge.part, bridge.mark, bridge.clock, bridge.lane_lost),
             lanes=settings.lanes,
             clock=clock,
         )
@@ -116,14 +116,14 @@ class NetworkEndpoint:
             case PeerConflict():
                 pass  # discovery has logged it, at a bounded rate
 
-    def _link_up(self, link: MeshLink) -> None:
+    def _link_up(self, link: PeerLink) -> None:
         # Its beacons come from its mesh port; an accepted connection may come from any port.
         self.discovery.link_up(link.identity, (link.remote_endpoint[0], link.identity.guid.port))
         self._bridge.link_up(link)
 
-    def _link_down(self, link: MeshLink, reason: str) -> None:
+    def _link_down(self, link: PeerLink, down: LinkDown) -> None:
         self._bridge.link_down(link)
-        if reason != REPLACED:  # a replaced link leaves its peer linked: its endpoint stays taken
+        if down.cause is not LinkDownCause.REPLACED:  # else its peer stays linked, and keeps its endpoint
             self.discovery.link_down(link.identity.guid, link.identity.instance)
 
     def _interfaces(self, everything: tuple[Interface, ...]) -> bool:

@@ -1,4 +1,4 @@
-"""``rmpa doctor``: what on this machine would keep modules apart."""
+"""``rmpa doctor``: checks this machine for what would keep modules apart."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rmpa.cli.options import json_option
-from rmpa.cli.output import LEVEL_COLOURS, coloured, print_json, print_line, printable
+from rmpa.cli.output import LEVEL_COLOURS, print_json, printable
 from rmpa.observe.check import FAIL, WARN, CheckLevel, exit_code
 
 if TYPE_CHECKING:
@@ -36,22 +36,23 @@ Examples:
 def doctor(config: str | None, quiet: bool, as_json: bool) -> int:
     """Check this machine: settings, agents, network, ROS environment, clock and rights.
 
-    It changes nothing. It sends one packet on each interface to the agents' multicast group, which agents pass over,
-    and looks whether it is heard. A firewall on another machine, or a switch between, shows only there: run it on
-    both sides, and `rmpa multicast` between them.
+    It changes nothing. It sends one packet on each interface to the agents' multicast group, which agents ignore, and
+    checks that it comes back. It cannot see a firewall on another machine or a switch in between: run it on both
+    machines, and `rmpa multicast` between them.
     """
     from rmpa.observe.doctor.io.checks import examine, look_at
 
-    found = []
+    found, shown = [], []
     for check in examine(look_at(os.environ, config)):
         found.append(check)
-        if not as_json and (not quiet or check.level in (WARN, FAIL)):
-            for line in _lines(check):
-                print_line(line)
+        if not quiet or check.level in (WARN, FAIL):
+            shown.append(check)
+            if not as_json:
+                click.echo("\n".join(_lines(check)))
     if as_json:
-        print_json([_json(check) for check in found if not quiet or check.level in (WARN, FAIL)])
+        print_json([*map(_json, shown)])
     else:
-        print_line(_summary(found))
+        click.echo(_summary(found))
     return exit_code(found)
 
 
@@ -61,9 +62,7 @@ def _json(check: Check) -> dict[str, str]:
 
 
 def _lines(check: Check) -> list[str]:
-    mark = f"{check.level.value:<7}"
-    if coloured():
-        mark = click.style(mark, fg=LEVEL_COLOURS[check.level])
+    mark = click.style(f"{check.level.value:<7}", fg=LEVEL_COLOURS[check.level])
     what = f"{check.name} {check.where}".strip()
     lines = [f"{mark}  {printable(what)}: {printable(check.text)}"]
     if check.remedy:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rmpa.core.identity import Identity
     from rmpa.discovery.events import PeerView
     from rmpa.discovery.io.discovery import Discovery
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.io.mesh import Mesh
     from rmpa.mesh.io.path_monitor import PathMonitor
     from rmpa.mesh.peering import PeerStatus
@@ -122,7 +122,7 @@ class PeersSection:
         )
 
     @staticmethod
-    def _link(link: MeshLink, paths: PathMonitor, now: float) -> LinkInfo:
+    def _link(link: PeerLink, paths: PathMonitor, now: float) -> LinkInfo:
         host, port = link.remote_endpoint
         problem = paths.problem(link)
         return LinkInfo(

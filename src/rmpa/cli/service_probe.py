@@ -1,4 +1,4 @@
-"""Where a service is, and what it is: asked of the master, and of the service's server by a probe."""
+"""Finds the server of a service at the master, and asks it for the service's type."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import asyncio
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.bridge.proxy_names import proxied_node
-from rmpa.config.values import did_you_mean
 from rmpa.core.errors import RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.http.client import call_api
@@ -16,22 +14,23 @@ from rmpa.ros.types.find import find_service_type
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rmpa.cli.master import Graph, Master, TopicName
+    from rmpa.cli.master import Master
     from rmpa.ros.types.service_types import ServiceType
     from rmpa.ros.wire.services import ServiceDescription
 
 CALLER_ID: Final = "/rmpa_service"
 _AT_ONCE: Final = 16
+"""Servers that are asked at the same time."""
 
 
 @dataclass(frozen=True, slots=True)
 class Probed:
-    """What a service's server says.
+    """The answer of a service's server.
 
     Args:
-        uri: Where it was asked; empty if the master does not know that.
-        description: What it says, or ``None``.
-        problem: Why it does not say anything.
+        uri: Its address; empty if the master does not know it.
+        description: The service's type and MD5 sum; ``None`` if the server does not answer.
+        problem: Why it does not answer.
     """
 
     uri: str = ""
@@ -39,33 +38,8 @@ class Probed:
     problem: str = ""
 
 
-def require_service(graph: Graph, wanted: TopicName) -> str:
-    """See that a service is there; return the node that serves it.
-
-    Raises:
-        RmpaError: It is not, or not that peer's; the nearest one is offered.
-    """
-    name = wanted.topic
-    if name not in graph.services:
-        near = did_you_mean(name, graph.services)
-        raise RmpaError(
-            f"no service {name}; " + (f"did you mean {near}?" if near else "`rmpa service list` shows all")
-        )
-    nodes = graph.services[name]
-    if wanted.peer is not None and not any(map(wanted.takes, nodes)):
-        remedy = f"what {wanted.peer} offers under this name is hidden by it, if there is any"
-        raise RmpaError(f"service {name} is served by {', '.join(nodes)}, not by peer {wanted.peer}; {remedy}")
-    return nodes[0] if nodes else ""
-
-
-def service_peers(graph: Graph, name: str) -> list[str]:
-    """The peers that serve a service; one at the most, but for masters that are wrong."""
-    remote = (proxied_node(node) for node in graph.services.get(name, ()))
-    return sorted({r[0] for r in remote if r is not None})
-
-
 async def lookup(master: Master, name: str) -> str:
-    """Where a service is served, ``rosrpc://host:port``.
+    """The address of a service's server, ``rosrpc://host:port``.
 
     Raises:
         UnreachableError: The master does not answer.
@@ -81,7 +55,7 @@ async def lookup(master: Master, name: str) -> str:
 
 
 async def probe(master: Master, name: str) -> Probed:
-    """Ask a service's server what it is; errors are in the answer.
+    """Ask a service's server for its type; an error of the server is in the answer.
 
     Raises:
         UnreachableError: The master does not answer.
@@ -108,9 +82,9 @@ async def probe_all(master: Master, names: Iterable[str]) -> dict[str, Probed]:
 
 
 def known_type(description: ServiceDescription) -> ServiceType:
-    """The type that a server names, as this machine's packages or we ourselves know it.
+    """The definition of the type that a server names, from this machine's packages or from rmpa's own.
 
     Raises:
-        DefinitionError: It is not known here, or in another version.
+        DefinitionError: It is not known here, or only in another version.
     """
     return find_service_type(description.type, description.md5sum)

@@ -1,4 +1,7 @@
-"""One link's machine: handshake, keepalive, lease, bye. Bytes and ``now`` in; events and bytes out.
+"""The protocol machine of one connection: handshake, frames, keepalive, bye.
+
+Sans-I/O: bytes and ``now`` in, events and bytes out. A link with a peer has one connection for each of its lanes;
+each runs this machine, and ``mesh.io.link`` joins them.
 
 ::
 
@@ -6,8 +9,9 @@
          ├─ refuse or bye sent: CLOSING         └─ bye received, lease over, protocol error: CLOSED
          └─ refused, time out, error: CLOSED
 
-The driver feeds ``receive``, sends what ``take_output`` gives, calls ``handle_timer`` when ``next_timer`` is due
-and closes the socket at ``LinkClosed``. Events and data come in the order of the bytes, from within ``receive``.
+The driver passes what it reads to ``receive``, sends what ``take_output`` returns, calls ``handle_timer`` when
+``next_timer`` is due and closes the socket at ``ConnectionClosed``. Events and data come in the order of the bytes,
+from within ``receive``.
 """
 
 from __future__ import annotations
@@ -20,12 +24,12 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits as core_limits
-from rmpa.core.clock import earliest
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import frames, limits
 from rmpa.mesh.frames import Frame, FrameKind
 from rmpa.mesh.handshake import HandshakeError, Hello, Lane, Refuse, judge_welcome
+from rmpa.mesh.keepalive import Keepalive
 from rmpa.mesh.timing import LinkClock
 from rmpa.runtime import limits as runtime_limits
 
@@ -39,18 +43,18 @@ _HEADER: Final = limits.FRAME_HEADER_BYTES
 _DATA: Final = int(FrameKind.DATA)
 _WHOLE: Final = frames.WHOLE
 _FIRST_PART: Final = 4
-"""Bytes of a message without which its first part says nothing: its length."""
+"""Bytes that the first part of a message must have: the message's length."""
 
 
-class LinkRole(Enum):
-    """Who connected."""
+class ConnectionRole(Enum):
+    """Which side of the TCP connection this is."""
 
     DIALLER = auto()
     ACCEPTOR = auto()
 
 
-class LinkState(Enum):
-    """Where a link is in its life."""
+class ConnectionState(Enum):
+    """Where a connection is in its life."""
 
     HANDSHAKING = auto()
     UP = auto()
@@ -58,26 +62,26 @@ class LinkState(Enum):
     CLOSED = auto()
 
 
-class _Act(Enum):
+class _Step(Enum):
     WELCOMED = auto()
     REFUSING = auto()
     LEAVING = auto()
     ENDED = auto()
 
 
-_NEXT: Final[Mapping[tuple[LinkState, _Act], LinkState]] = MappingProxyType(
+_NEXT: Final[Mapping[tuple[ConnectionState, _Step], ConnectionState]] = MappingProxyType(
     {
-        (LinkState.HANDSHAKING, _Act.WELCOMED): LinkState.UP,
-        (LinkState.HANDSHAKING, _Act.REFUSING): LinkState.CLOSING,
-        (LinkState.HANDSHAKING, _Act.LEAVING): LinkState.CLOSING,
-        (LinkState.HANDSHAKING, _Act.ENDED): LinkState.CLOSED,
-        (LinkState.UP, _Act.LEAVING): LinkState.CLOSING,
-        (LinkState.UP, _Act.ENDED): LinkState.CLOSED,
-        (LinkState.CLOSING, _Act.ENDED): LinkState.CLOSED,
+        (ConnectionState.HANDSHAKING, _Step.WELCOMED): ConnectionState.UP,
+        (ConnectionState.HANDSHAKING, _Step.REFUSING): ConnectionState.CLOSING,
+        (ConnectionState.HANDSHAKING, _Step.LEAVING): ConnectionState.CLOSING,
+        (ConnectionState.HANDSHAKING, _Step.ENDED): ConnectionState.CLOSED,
+        (ConnectionState.UP, _Step.LEAVING): ConnectionState.CLOSING,
+        (ConnectionState.UP, _Step.ENDED): ConnectionState.CLOSED,
+        (ConnectionState.CLOSING, _Step.ENDED): ConnectionState.CLOSED,
     }
 )
 
-_TALK: Final[frozenset[int]] = frozenset(
+_WHEN_UP: Final[frozenset[int]] = frozenset(
     {
         FrameKind.PING,
         FrameKind.PONG,
@@ -89,26 +93,28 @@ _TALK: Final[frozenset[int]] = frozenset(
         FrameKind.FENCED,
     }
 )
-_ALLOWED: Final[Mapping[tuple[LinkRole, LinkState], frozenset[int]]] = MappingProxyType(
+_ALLOWED: Final[Mapping[tuple[ConnectionRole, ConnectionState], frozenset[int]]] = MappingProxyType(
     {
-        (LinkRole.DIALLER, LinkState.HANDSHAKING): frozenset({int(FrameKind.WELCOME), int(FrameKind.REFUSE)}),
-        (LinkRole.ACCEPTOR, LinkState.HANDSHAKING): frozenset({int(FrameKind.HELLO)}),
-        (LinkRole.DIALLER, LinkState.UP): _TALK,
-        (LinkRole.ACCEPTOR, LinkState.UP): _TALK,
+        (ConnectionRole.DIALLER, ConnectionState.HANDSHAKING): frozenset(
+            {int(FrameKind.WELCOME), int(FrameKind.REFUSE)}
+        ),
+        (ConnectionRole.ACCEPTOR, ConnectionState.HANDSHAKING): frozenset({int(FrameKind.HELLO)}),
+        (ConnectionRole.DIALLER, ConnectionState.UP): _WHEN_UP,
+        (ConnectionRole.ACCEPTOR, ConnectionState.UP): _WHEN_UP,
     }
 )
 
 
 @dataclass(frozen=True, slots=True)
 class HelloReceived:
-    """Acceptor: somebody wants a link; answer with ``accept`` or ``refuse``."""
+    """Acceptor: the dialler said hello; the driver answers by ``accept`` or ``refuse``."""
 
     hello: Hello
 
 
 @dataclass(frozen=True, slots=True)
-class Up:
-    """The handshake is over, both want the link."""
+class HandshakeDone:
+    """Both sides accepted the connection; frames may be sent."""
 
     hello: Hello
 
@@ -125,12 +131,12 @@ class ControlReceived:
 
 
 @dataclass(frozen=True, slots=True)
-class Ponged:
+class PongReceived:
     """A ping was answered.
 
     Args:
-        stamp: The ping's.
-        rtt: Seconds on the wire, without the other side's own time.
+        stamp: What identifies the ping: its time stamp.
+        rtt: Seconds on the wire, the time that the remote side took to answer not included.
     """
 
     stamp: int
@@ -139,11 +145,11 @@ class Ponged:
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """No link: one of the two said no. ``LinkClosed`` follows.
+    """One of the two sides refused the connection. ``ConnectionClosed`` follows.
 
     Args:
         refuse: Why.
-        by_us: Whether it was us.
+        by_us: Whether this side refused.
     """
 
     refuse: Refuse
@@ -151,12 +157,12 @@ class Refused:
 
 
 @dataclass(frozen=True, slots=True)
-class LinkClosed:
-    """The link is over: send what is left, close the socket.
+class ConnectionClosed:
+    """The connection is over: the driver sends what is left and closes the socket.
 
     Args:
         reason: Why, for people.
-        orderly: Whether one of the sides said so (bye, refuse), rather than an error or silence.
+        orderly: Whether one of the sides ended it by a frame (bye, refuse), rather than an error or silence.
     """
 
     reason: str
@@ -164,13 +170,13 @@ class LinkClosed:
 
 
 @dataclass(frozen=True, slots=True)
-class Marked:
+class MarkReceived:
     """An acknowledgement, a fence or its answer came.
 
     Args:
         kind: ``ACK``, ``FENCE`` or ``FENCED``.
-        route: Which route.
-        sequence: Up to which message; the fence's number.
+        route: The id of the route.
+        sequence: ``ACK``: the last message that arrived; else the fence's number.
     """
 
     kind: FrameKind
@@ -178,33 +184,37 @@ class Marked:
     sequence: int
 
 
-Event = HelloReceived | Up | ControlReceived | Ponged | Marked | Refused | LinkClosed
-OnEvent = Callable[[Event], None]
+ConnectionEvent = (
+    HelloReceived | HandshakeDone | ControlReceived | PongReceived | MarkReceived | Refused | ConnectionClosed
+)
+OnEvent = Callable[[ConnectionEvent], None]
 OnData = Callable[[int, int, int, memoryview], None]
 OnPart = Callable[[int, int, int, int, memoryview], None]
 
 
-class LinkProtocol:
-    """One side of one link.
+class ConnectionProtocol:
+    """One side of one connection.
 
     Args:
-        role: Whether we connected.
-        ours: Who we are.
-        now: Monotonic seconds at which the connection stood.
-        wall_ns: The wall clock; only asked where a stamp is needed.
+        role: Which side.
+        ours: The identity of this agent.
+        now: Monotonic seconds at which the connection was established.
+        wall_ns: The wall clock; only called where a stamp is needed.
         on_event: Called from within the methods below; it may call any of them but ``receive``.
-        on_data: Called with ``(route, sequence, stamp_ns, payload)`` for each data frame; the payload is a view
-            into the bytes given to ``receive`` and only valid during the call. An attribute that may be changed.
-        on_part: Called with ``(route, sequence, stamp_ns, flags, part)`` for each part of a message that comes in
-            parts; parts of one message come in order, those of other routes in between. Likewise.
-        expected: Dialler: whom we believe we dialled, ``None`` if only the address is known.
-        lease: What we promise: seconds after which our silence means that we are dead.
-        label: For log lines, until the other side's name is known.
+        on_data: Called with ``(route, sequence, stamp_ns, payload)`` for each message in one frame; the payload is a
+            view of the bytes given to ``receive`` and only valid during the call. The attribute may be assigned
+            later: only the handshake tells which peer this is, and what receives its data.
+        on_part: Called with ``(route, sequence, stamp_ns, flags, part)`` for each part of a longer message; parts of
+            one message come in order, those of other routes in between. Otherwise as ``on_data``.
+        expected: Dialler: the GUID that was dialled; ``None`` if only the address is known.
+        lane: Dialler: what the connection is for.
+        lease: Seconds after which the silence of this side means that it is dead.
+        label: For log lines, until the remote side's name is known.
     """
 
     def __init__(
         self,
-        role: LinkRole,
+        role: ConnectionRole,
         ours: Identity,
         now: float,
         *,
@@ -220,38 +230,36 @@ class LinkProtocol:
         self.role = role
         self.clock = LinkClock()
         self.remote: Hello | None = None
-        self._ours = ours
-        self._wall_ns = wall_ns
+        """What the remote side said of itself, as soon as it did."""
         self.on_event = on_event
         self.on_data = on_data
         self.on_part = on_part if on_part is not None else _no_parts
-        self._left = 0
-        self._rest = (0, 0, 0, 0)
+        self._ours = ours
+        self._wall_ns = wall_ns
+        self._missing = 0
+        """Bytes of a data frame that was handed on in part, and whose rest is still to come."""
+        self._begun = (0, 0, 0, 0)
+        """Route, sequence, stamp and LAST flag of that frame."""
         self._expected = expected
         self._label = label
-        self._state = LinkState.HANDSHAKING
-        self._promise(lease)
+        self._state = ConnectionState.HANDSHAKING
+        self._keepalive = Keepalive(lease, now, acceptor=role is ConnectionRole.ACCEPTOR)
         self._deadline = now + limits.HANDSHAKE_TIMEOUT
         self._reason = ""
-        self._heard = now
-        self._excused = self._excused_behind = 0.0
-        self._welcomed = now
-        self._sent = now
-        self._pinged = now
         self._output = bytearray()
-        if role is LinkRole.DIALLER:
+        if role is ConnectionRole.DIALLER:
             hello = Hello.of(ours, lease=lease, expected=expected, lane=lane)
             self._send(Frame(FrameKind.HELLO, hello.serialize()))
 
     @property
-    def state(self) -> LinkState:
-        """Where the link is in its life."""
+    def state(self) -> ConnectionState:
+        """Where the connection is in its life."""
         return self._state
 
     @property
     def heard_at(self) -> float:
         """Monotonic seconds at which bytes last came."""
-        return self._heard
+        return self._keepalive.heard
 
     @property
     def has_output(self) -> bool:
@@ -265,8 +273,8 @@ class LinkProtocol:
         return output
 
     def heard(self, now: float) -> None:
-        """Bytes came at ``now``, though not yet a whole frame: a large message renews the lease as it arrives."""
-        self._heard = max(self._heard, now)
+        """Bytes came at ``now``, though perhaps no whole frame: a large message renews the lease as it arrives."""
+        self._keepalive.heard = max(self._keepalive.heard, now)
 
     def receive(self, view: memoryview, now: float) -> tuple[int, int]:
         """Take whole frames from the start of ``view``.
@@ -276,19 +284,19 @@ class LinkProtocol:
             header, or nothing more).
 
         Raises:
-            RemoteProtocolError: The other side broke the protocol; the link is ``CLOSED``.
+            RemoteProtocolError: The remote side broke the protocol; the connection is ``CLOSED``.
         """
-        self._heard = now
+        self._keepalive.heard = now
         size = len(view)
         offset = 0
         try:
-            if self._left:
+            if self._missing:
                 offset = self._take_rest(view)
             while size - offset >= _HEADER:
                 length, kind, flags, _, route, sequence, stamp_ns = frames.unpack_header(view, offset)
-                if (kind != _DATA or self._state is not LinkState.UP) and not self._admit(kind):
+                if (kind != _DATA or self._state is not ConnectionState.UP) and not self._admit(kind):
                     return size, 0
-                # One comparison each on the data path; what is wrong is said by check_header.
+                # One comparison each on the data path; check_header says what is wrong.
                 if kind != _DATA or length > limits.DATA_PAYLOAD_MAX or flags != _WHOLE:
                     frames.check_header(length, kind, flags)
                 start = offset + _HEADER
@@ -296,9 +304,9 @@ class LinkProtocol:
                 if end > size:
                     if kind != _DATA or length <= core_limits.CUT_THROUGH_BYTES or size - start < _FIRST_PART:
                         return offset, end - offset
-                    # Handed on as it comes: nobody waits for the end of a large frame, and none is moved about.
-                    self._left = end - size
-                    self._rest = (route, sequence, stamp_ns, flags & LAST)
+                    # Handed on as it comes: a large frame is not awaited, and not moved within the buffer.
+                    self._missing = end - size
+                    self._begun = (route, sequence, stamp_ns, flags & LAST)
                     self.on_part(route, sequence, stamp_ns, flags & FIRST, view[start:])
                     return size, 0
                 offset = end
@@ -311,23 +319,23 @@ class LinkProtocol:
         except RemoteProtocolError as error:
             self._end(f"{self._name} broke the protocol: {error}")
             raise
-        return (size if self._state is LinkState.CLOSED else offset), 0
+        return (size if self._state is ConnectionState.CLOSED else offset), 0
 
     def accept(self, now: float) -> None:
-        """Acceptor, after ``HelloReceived``: welcome the other side; the link is up.
+        """Acceptor, after ``HelloReceived``: welcome the remote side; the connection is up.
 
         Raises:
             LocalProtocolError: There was no hello, or it was answered.
         """
         hello = self._unanswered()
         if hello.lane == Lane.BULK:
-            self._promise(limits.BULK_LEASE)
-        welcome = Hello.of(self._ours, lease=self._lease, expected=hello.guid, lane=hello.lane)
+            self._keepalive.promise(limits.BULK_LEASE)
+        welcome = Hello.of(self._ours, lease=self._keepalive.lease, expected=hello.guid, lane=hello.lane)
         self._send(Frame(FrameKind.WELCOME, welcome.serialize()))
-        self._raise_up(hello, now)
+        self._open(hello, now)
 
     def refuse(self, refuse: Refuse, now: float) -> None:
-        """Acceptor, after ``HelloReceived``: say no, and leave.
+        """Acceptor, after ``HelloReceived``: refuse the connection, and close it.
 
         Raises:
             LocalProtocolError: There was no hello, or it was answered.
@@ -344,57 +352,55 @@ class LinkProtocol:
         return Frame(FrameKind.CONTROL, payload, stamp_ns=self._wall_ns()).serialize()
 
     def close(self, reason: str, now: float) -> None:
-        """Say bye and leave; ``LinkClosed`` comes from ``drained`` or the timer. Without effect once leaving."""
-        if self._state in (LinkState.CLOSING, LinkState.CLOSED):
+        """Say bye; ``ConnectionClosed`` comes from ``drained`` or the timer. Without effect once closing."""
+        if self._state in (ConnectionState.CLOSING, ConnectionState.CLOSED):
             return
-        if self._state is LinkState.UP:
+        if self._state is ConnectionState.UP:
             self._send(Frame(FrameKind.BYE, frames.text_payload(reason), stamp_ns=self._wall_ns()))
-        self._leave(_Act.LEAVING, reason, now)
+        self._close(_Step.LEAVING, reason, now)
 
     def drained(self) -> None:
         """The driver has sent all that was to be sent; the end of ``CLOSING``."""
-        if self._state is LinkState.CLOSING:
+        if self._state is ConnectionState.CLOSING:
             self._end(self._reason, orderly=True)
 
     def lost(self, reason: str) -> None:
-        """The connection is gone; without effect once closed."""
-        if self._state is not LinkState.CLOSED:
-            self._end(self._reason or reason, orderly=self._state is LinkState.CLOSING)
+        """The TCP connection is gone; without effect once closed."""
+        if self._state is not ConnectionState.CLOSED:
+            self._end(self._reason or reason, orderly=self._state is ConnectionState.CLOSING)
 
     def ping(self, now: float) -> int:
-        """Measure a round trip on demand; ``Ponged`` with the stamp that this returns is the answer.
+        """Measure a round trip on demand; the answer is a ``PongReceived`` with the stamp that this returns.
 
         Raises:
-            LocalProtocolError: The link is not up.
+            LocalProtocolError: The connection is not up.
         """
-        if self._state is not LinkState.UP:
+        if self._state is not ConnectionState.UP:
             raise LocalProtocolError(f"no ping on a link that is {self._state.name}")
         return self._ping(now)
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due, in monotonic seconds."""
-        if self._state is LinkState.CLOSED:
+        if self._state is ConnectionState.CLOSED:
             return None
-        if self._state is LinkState.UP:
-            ping = min(self._sent + self._keepalive, self._pinged + limits.CLOCK_INTERVAL)
-            return earliest(self._lease_over, ping)
-        return self._deadline
+        return self._keepalive.due if self._state is ConnectionState.UP else self._deadline
 
     def handle_timer(self, now: float) -> None:
-        """Do what is due: keepalive, end of the lease, end of the handshake's or the drain's time."""
+        """Do what is due: keepalive, end of the lease, end of the time for the handshake or for closing."""
         due = self.next_timer()
         if due is None or now < due:
             return
+        keepalive = self._keepalive
         if now - due > limits.PAUSE_NOTICED:
-            self._excuse(min(now - due, now - self._heard))
-        if self._state is LinkState.CLOSING:
+            keepalive.excuse(now - due, now)
+        if self._state is ConnectionState.CLOSING:
             self._end(self._reason, orderly=True)
-        elif self._state is LinkState.HANDSHAKING:
+        elif self._state is ConnectionState.HANDSHAKING:
             self._end(f"{self._name} did not finish the handshake within {limits.HANDSHAKE_TIMEOUT:g} s")
-        elif now >= self._lease_over:
-            excused = self._excused_now
+        elif now >= keepalive.lease_end:
+            excused = keepalive.excused
             ours = f", our own pauses of {excused:.2g} s not counted" if excused else ""
-            self._end(f"{self._name} was silent for its lease of {self._awaited_lease:g} s{ours}")
+            self._end(f"{self._name} was silent for its lease of {keepalive.awaited_lease:g} s{ours}")
         else:
             self._ping(now)
 
@@ -404,62 +410,28 @@ class LinkProtocol:
     def _name(self) -> str:
         return self.remote.name if self.remote is not None else self._label
 
-    @property
-    def _remote_lease(self) -> float:
-        return self.remote.lease if self.remote is not None else limits.LINK_LEASE
-
-    @property
-    def _lease_over(self) -> float:
-        """When the other side's silence ends the link.
-
-        Behind our welcome a whole round trip goes by before the dialler's first word, which is still a part of the
-        handshake's time: with the lease alone, no link with a round trip above it would ever come up for good.
-        """
-        return self._heard + self._awaited_lease + self._excused_now
-
-    @property
-    def _awaited_lease(self) -> float:
-        """How long the other side may be silent now, in seconds that we looked."""
-        awaited = self.role is LinkRole.ACCEPTOR and self._heard <= self._welcomed
-        return max(self._remote_lease, limits.HANDSHAKE_TIMEOUT) if awaited else self._remote_lease
-
-    @property
-    def _excused_now(self) -> float:
-        """Seconds of this silence in which we did not look."""
-        return self._excused if self._excused_behind == self._heard else 0.0
-
-    def _excuse(self, late: float) -> None:
-        """Let the other side's silence last longer by the time for which we did not look.
-
-        Whose timers come late was away itself: stopped, or without a processor. That is no peer's death.
-        """
-        self._excused, self._excused_behind = self._excused_now + late, self._heard
-
     def _admit(self, kind: int) -> bool:
-        """Whether a frame of this kind is read now; ``False`` when we are leaving and read nothing more."""
-        if self._state in (LinkState.CLOSING, LinkState.CLOSED):
+        """Whether a frame of this kind is read now; false while closing, when nothing more is read.
+
+        Raises:
+            RemoteProtocolError: Such a frame may not come in this state.
+        """
+        if self._state in (ConnectionState.CLOSING, ConnectionState.CLOSED):
             return False
         if kind not in _ALLOWED[self.role, self._state] or (
-            self.remote is not None and self._state is not LinkState.UP
+            self.remote is not None and self._state is not ConnectionState.UP
         ):
             what = FrameKind(kind).name.lower() if kind in frames.PAYLOAD_MAX else f"kind {kind}"
             raise RemoteProtocolError(f"{what} frame while {self._state.name.lower()}")
         return True
 
-    def _promise(self, lease: float) -> None:
-        self._lease = lease
-        self._keepalive = lease * limits.KEEPALIVE_INTERVAL / limits.LINK_LEASE
-        if self.role is LinkRole.ACCEPTOR:
-            # A little later than the dialler's, so that its pongs are all that an idle link needs of it.
-            self._keepalive *= limits.KEEPALIVE_ANSWERED
-
     def _take_rest(self, view: memoryview) -> int:
         """Hand on what has come of a data frame that was begun; return how many bytes that were."""
-        count = min(self._left, len(view))
-        self._left -= count
-        if self._state is LinkState.UP:
-            route, sequence, stamp_ns, last = self._rest
-            self.on_part(route, sequence, stamp_ns, 0 if self._left else last, view[:count])
+        count = min(self._missing, len(view))
+        self._missing -= count
+        if self._state is ConnectionState.UP:
+            route, sequence, stamp_ns, last = self._begun
+            self.on_part(route, sequence, stamp_ns, 0 if self._missing else last, view[:count])
         return count
 
     def _handle(
@@ -470,16 +442,16 @@ class LinkProtocol:
         if kind is FrameKind.PING:
             came = self._wall_ns()
             self._send(frames.pong(stamp_ns, came, self._wall_ns()))
-            self._sent = now
+            self._keepalive.sent = now
         elif kind is FrameKind.PONG:
             t1, t2 = frames.parse_pong(payload)
             sample = self.clock.ponged(t1, t2, stamp_ns, self._wall_ns(), now)
             if sample is not None:
-                self.on_event(Ponged(t1, sample.rtt))
+                self.on_event(PongReceived(t1, sample.rtt))
         elif kind is FrameKind.CONTROL:
             self.on_event(ControlReceived(bytes(payload)))
         elif kind in {FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED}:
-            self.on_event(Marked(kind, route, sequence))
+            self.on_event(MarkReceived(kind, route, sequence))
         elif kind is FrameKind.BYE:
             self._end(f"{self._name} left: {frames.parse_text(payload)}", orderly=True)
         elif kind is FrameKind.REFUSE:
@@ -495,53 +467,59 @@ class LinkProtocol:
         except HandshakeError as error:
             self._refuse(error.refuse, now)
             return
-        if self.role is LinkRole.ACCEPTOR:
+        if self.role is ConnectionRole.ACCEPTOR:
             self.remote = hello
             self.on_event(HelloReceived(hello))
         elif refuse := judge_welcome(hello, self._ours, self._expected):
             self._refuse(refuse, now)
         else:
-            self._raise_up(hello, now)
+            self._open(hello, now)
 
     def _unanswered(self) -> Hello:
-        if self.role is not LinkRole.ACCEPTOR or self.remote is None or self._state is not LinkState.HANDSHAKING:
+        if (
+            self.role is not ConnectionRole.ACCEPTOR
+            or self.remote is None
+            or self._state is not ConnectionState.HANDSHAKING
+        ):
             raise LocalProtocolError(f"no hello waits for an answer (state {self._state.name})")
         return self.remote
 
-    def _raise_up(self, hello: Hello, now: float) -> None:
-        self._state = _NEXT[self._state, _Act.WELCOMED]
+    def _open(self, hello: Hello, now: float) -> None:
+        self._state = _NEXT[self._state, _Step.WELCOMED]
         self.remote = hello
-        self._heard = self._welcomed = now
+        self._keepalive.begin(hello.lease, now)
         _log.debug("= %s: up", self._name)
         self._ping(now)
-        self.on_event(Up(hello))
+        self.on_event(HandshakeDone(hello))
 
     def _refuse(self, refuse: Refuse, now: float) -> None:
         self._send(
-            Frame(FrameKind.REFUSE, refuse.serialize()) if self.role is LinkRole.ACCEPTOR else _bye(refuse.text)
+            Frame(FrameKind.REFUSE, refuse.serialize())
+            if self.role is ConnectionRole.ACCEPTOR
+            else Frame(FrameKind.BYE, frames.text_payload(refuse.text))
         )
-        self._leave(_Act.REFUSING, f"refused: {refuse}", now)
+        self._close(_Step.REFUSING, f"refused: {refuse}", now)
         self.on_event(Refused(refuse, by_us=True))
 
-    def _leave(self, act: _Act, reason: str, now: float) -> None:
-        self._state = _NEXT[self._state, act]
+    def _close(self, step: _Step, reason: str, now: float) -> None:
+        self._state = _NEXT[self._state, step]
         self._reason = reason
         self._deadline = now + runtime_limits.DRAIN_TIMEOUT
         _log.debug("= %s: closing: %s", self._name, reason)
 
     def _end(self, reason: str, *, orderly: bool = False) -> None:
-        if self._state is LinkState.CLOSED:
+        if self._state is ConnectionState.CLOSED:
             return
-        self._state = _NEXT[self._state, _Act.ENDED]
+        self._state = _NEXT[self._state, _Step.ENDED]
         self._reason = reason
         _log.debug("= %s: closed: %s", self._name, reason)
-        self.on_event(LinkClosed(reason, orderly))
+        self.on_event(ConnectionClosed(reason, orderly))
 
     def _ping(self, now: float) -> int:
         stamp = self._wall_ns()
         self.clock.pinged(stamp, now)
         self._send(Frame(FrameKind.PING, stamp_ns=stamp))
-        self._sent = self._pinged = now
+        self._keepalive.pinged(now)
         return stamp
 
     def _send(self, frame: Frame) -> None:
@@ -551,8 +529,4 @@ class LinkProtocol:
 
 
 def _no_parts(_route: int, _sequence: int, _stamp_ns: int, _flags: int, _part: memoryview) -> None:
-    """Parts of messages on a link whose owner takes none."""
-
-
-def _bye(text: str) -> Frame:
-    return Frame(FrameKind.BYE, frames.text_payload(text))
+    """Ignores parts of messages, where the owner of the machine takes none."""

@@ -1,4 +1,4 @@
-"""A group of commands each of which is imported when it is called: ``rmpa --help`` stays quick."""
+"""A group of commands, each imported when it is called: ``rmpa --help`` stays quick."""
 
 from __future__ import annotations
 
@@ -14,16 +14,20 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 
-class PipeClosed(Exception):  # noqa: N818 - not an error: whoever reads our output has enough
+class PipeClosed(Exception):  # noqa: N818 - not an error: the program that reads our output has closed the pipe
     """Standard output was closed; click would turn the BrokenPipeError into an exit of its own."""
 
 
 class LazyGroup(click.Group):
-    """A click group whose commands live in modules of their own, under their own names.
+    """A click group whose commands are imported on use.
+
+    Click shows a command's help line by importing it, and suggests the nearest command only since 8.4; this class
+    does both from the table alone.
 
     Args:
-        commands_at: By name: the module, and the one line that the group's help shows.
-        moved: Where commands of former releases are now, by name.
+        commands_at: By name: the module, which has the command under that name (or with ``_`` behind it, where the
+            name is a builtin's), and the line that the group's help shows.
+        moved: By name: where a command of an earlier release is now, for the error.
         arguments: For ``click.Group``.
     """
 
@@ -47,7 +51,9 @@ class LazyGroup(click.Group):
         if cmd_name not in self.commands_at:
             return None
         module = importlib.import_module(self.commands_at[cmd_name][0])
-        command = getattr(module, cmd_name.replace("-", "_"), None) or getattr(module, f"{cmd_name}_")
+        command = getattr(module, cmd_name.replace("-", "_"), None)
+        if not isinstance(command, click.Command):
+            command = getattr(module, f"{cmd_name}_")
         assert isinstance(command, click.Command)  # noqa: S101 - a mistake in our own table
         return command
 
@@ -55,7 +61,7 @@ class LazyGroup(click.Group):
         """Run the command.
 
         Raises:
-            PipeClosed: Whoever reads its output has closed it.
+            PipeClosed: Standard output was closed by its reader.
         """
         try:
             return super().invoke(ctx)
@@ -65,7 +71,7 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find a command; a misspelt one is told the nearest."""
+        """Find a command; for a misspelt one the error names the nearest."""
         if args and args[0] in self.moved:
             raise ConfigError(args[0], self.moved[args[0]])
         if args and args[0] not in self.commands_at and not args[0].startswith("-"):

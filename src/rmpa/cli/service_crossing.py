@@ -1,40 +1,35 @@
-"""What an agent knows of the services that cross, as ``rmpa service`` shows it."""
+"""What the agent knows of the services that cross the mesh, as ``rmpa service`` shows it."""
 
 from __future__ import annotations
 
-import contextlib
 from typing import TYPE_CHECKING
 
-import click
-
-from rmpa.cli.output import duration, printable, warn
-from rmpa.core.errors import RmpaError
+from rmpa.cli.output import duration, print_line, warn
 
 if TYPE_CHECKING:
-    from rmpa.cli.master import Master, TopicName
+    from rmpa.cli.graph import GraphName
+    from rmpa.cli.master import Master
     from rmpa.observe.snapshot import ServiceInfo
 
 
-def crossing(master: Master, wanted: TopicName | None = None) -> tuple[ServiceInfo, ...]:
-    """What the master's agent knows of its services and its peers', or of one; empty without an agent."""
-    with contextlib.suppress(RmpaError):
-        snapshot = master.snapshot()
-        return tuple(
-            info
-            for info in (snapshot.services if snapshot is not None else ())
-            if wanted is None or (info.name == wanted.topic and wanted.peer in (None, info.peer))
-        )
-    return ()
+def crossing(master: Master, wanted: GraphName) -> tuple[ServiceInfo, ...]:
+    """What the master's agent knows of a service, at all peers or the named one; empty without an agent."""
+    snapshot = master.snapshot()
+    return tuple(
+        info
+        for info in (snapshot.services if snapshot is not None else ())
+        if info.name == wanted.name and wanted.peer in (None, info.peer)
+    )
 
 
 def print_crossing(infos: tuple[ServiceInfo, ...]) -> None:
-    """Lines about one service: whether it may cross, each peer that offers it, and how its calls went."""
+    """Print whether a service may cross, each peer that offers it, and how its calls went."""
     for info in infos:
-        click.echo(printable(f" * {_headline(info)}"))
+        print_line(f" * {_headline(info)}")
         for label, text in _facts(info):
-            click.echo(printable(f"     {label:<10} {text}"))
+            print_line(f"     {label:<10} {text}")
         if info.problem:
-            warn(printable(f"{info.peer or info.node}: {info.problem}"))
+            warn(f"{info.peer or info.node}: {info.problem}")
 
 
 def _headline(info: ServiceInfo) -> str:

@@ -8,9 +8,17 @@ from rmpa.core import limits as core_limits
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
 from rmpa.mesh import limits
+from rmpa.mesh.connection import (
+    ConnectionClosed,
+    ConnectionRole,
+    ConnectionState,
+    ControlReceived,
+    HandshakeDone,
+    HelloReceived,
+    MarkReceived,
+)
 from rmpa.mesh.frames import WHOLE, Frame, FrameKind, pack_data_header
 from rmpa.mesh.handshake import Lane
-from rmpa.mesh.link import ControlReceived, HelloReceived, LinkClosed, LinkRole, LinkState, Marked, Up
 from tests.mesh.worlds import HIGH, LOW, Time, deliver, exchange, pair, pass_time, side
 
 
@@ -102,7 +110,7 @@ def test_an_abort_that_is_none_ends_the_link(flags: int) -> None:
     _, acceptor = pair(time)
     with pytest.raises(RemoteProtocolError, match="aborts"):
         acceptor.link.receive(memoryview(Frame(FrameKind.DATA, b"", 7, 1, 99, flags).serialize()), time.now)
-    assert acceptor.link.state is LinkState.CLOSED
+    assert acceptor.link.state is ConnectionState.CLOSED
     assert acceptor.parts == []
 
 
@@ -118,7 +126,7 @@ def test_a_frame_that_is_too_long_is_refused_before_its_bytes_come(size: int, fl
 
 def test_no_fragment_before_the_handshake_is_over() -> None:
     time = Time()
-    acceptor = side(LinkRole.ACCEPTOR, HIGH, time)
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
     with pytest.raises(RemoteProtocolError, match="data frame while handshaking"):
         acceptor.link.receive(memoryview(Frame(FrameKind.DATA, b"x", flags=FIRST).serialize()), time.now)
 
@@ -158,9 +166,9 @@ def test_a_half_read_frame_keeps_the_link_no_longer_than_its_bytes_come() -> Non
         time.now += 0.9
         acceptor.link.receive(memoryview(bytes(1000)), time.now)
         acceptor.link.handle_timer(time.now)
-    assert not any(isinstance(event, LinkClosed) for event in acceptor.events)
+    assert not any(isinstance(event, ConnectionClosed) for event in acceptor.events)
     pass_time(acceptor.link, time, 1.0)
-    assert isinstance(acceptor.last(), LinkClosed)
+    assert isinstance(acceptor.last(), ConnectionClosed)
 
 
 @pytest.mark.parametrize("kind", [FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED])
@@ -177,7 +185,7 @@ def test_marks_come_in_the_order_of_the_messages(kind: FrameKind, chunk: int) ->
     for link in (dialler.link, acceptor.link):
         said.clear()
         deliver(wire, link, time.now, chunk)
-        assert said == [1, Marked(kind, 7, 0xFFFFFFFF), 2]
+        assert said == [1, MarkReceived(kind, 7, 0xFFFFFFFF), 2]
         assert not link.has_output, "who answers a fence is the driver's business"
 
 
@@ -193,15 +201,15 @@ def test_a_bulk_lane_says_what_it_is_and_promises_its_own_lease() -> None:
     time = Time()
     dialler, acceptor = pair(time, lane=Lane.BULK, lease=limits.BULK_LEASE)
     hello = next(e.hello for e in acceptor.events if isinstance(e, HelloReceived))
-    welcome = next(e.hello for e in dialler.events if isinstance(e, Up))
+    welcome = next(e.hello for e in dialler.events if isinstance(e, HandshakeDone))
     assert hello.lane == welcome.lane == Lane.BULK
     assert hello.lease == welcome.lease == limits.BULK_LEASE
 
 
 def test_an_acceptor_promises_for_a_bulk_lane_what_bulk_lanes_have() -> None:
     time = Time()
-    dialler = side(LinkRole.DIALLER, LOW, time, expected=HIGH.guid, lease=limits.BULK_LEASE, lane=Lane.BULK)
-    acceptor = side(LinkRole.ACCEPTOR, HIGH, time, lease=limits.LINK_LEASE)
+    dialler = side(ConnectionRole.DIALLER, LOW, time, expected=HIGH.guid, lease=limits.BULK_LEASE, lane=Lane.BULK)
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time, lease=limits.LINK_LEASE)
     deliver(dialler.link.take_output(), acceptor.link, time.now)
     acceptor.link.accept(time.now)
     exchange(dialler, acceptor, time)
@@ -215,5 +223,5 @@ def test_an_acceptor_promises_for_a_bulk_lane_what_bulk_lanes_have() -> None:
             mine.link.handle_timer(time.now)
             pings += mine.link.has_output
         exchange(dialler, acceptor, time)
-    assert dialler.link.state is acceptor.link.state is LinkState.UP
+    assert dialler.link.state is acceptor.link.state is ConnectionState.UP
     assert pings <= 100 * 2.1, "a bulk lane's keepalives are seldom"

@@ -1,19 +1,17 @@
-"""Which Smart Resources the graph holds, of this module and of others, and what they say of themselves."""
+"""Finds the Smart Resources of the graph, of this module and of others, and reads what they publish."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
-import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from rmpa.bridge.proxy_names import proxied_node
-from rmpa.cli.master import TopicName, choose_master, read_graph, read_topic
+from rmpa.cli.graph import GraphName, peer_of, read_graph, read_name
 from rmpa.cli.output import printable
-from rmpa.cli.service_ends import require_service
 from rmpa.cli.stream import with_node
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
@@ -23,25 +21,27 @@ from rmpa.ros.types.messages import MessageType
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 
-    from rmpa.cli.master import Graph, Master
+    from rmpa.cli.graph import Graph
+    from rmpa.cli.master import Master
+    from rmpa.cli.options import GraphOptions
     from rmpa.ros.node.node import Node
     from rmpa.ros.node.topics import Received
 
 TEXT: Final = "std_msgs/String"
 _ANSWER: Final = 3.0
-"""Seconds for what is latched: for a resource of another module its route has to open first."""
+"""Seconds for a latched message: the route of another module's topic has to open first."""
 _NODE: Final = "rmpa_resource"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenResource:
-    """One resource.
+    """A resource of the graph.
 
     Args:
-        path: Its node's name as this module's graph has its topics: ``/sonar``.
-        peer: Whose it is; ``None``: this module's own.
-        caller: The node that publishes for it here: itself, or its proxy.
-        descriptor: What it says of itself.
+        path: The name of its node, below which this module's graph has its topics: ``/sonar``.
+        peer: The peer that it runs at; ``None``: this module.
+        caller: The node that publishes its topics in this graph: its own, or a proxy.
+        descriptor: Its published description.
     """
 
     path: str
@@ -51,17 +51,17 @@ class SeenResource:
 
     def __str__(self) -> str:
         """As a user writes it."""
-        return str(TopicName(self.path, self.peer))
+        return str(GraphName(self.path, self.peer))
 
 
 @dataclass(frozen=True, slots=True)
-class Room:
-    """Where a command looks around.
+class ResourceGraph:
+    """The resources of a graph, and a node to ask them by.
 
     Args:
-        node: A node of our own.
-        graph: What the master knows.
-        seen: All resources.
+        node: This command's own node.
+        graph: The master's graph.
+        seen: All resources in it.
     """
 
     node: Node
@@ -69,17 +69,17 @@ class Room:
     seen: tuple[SeenResource, ...]
 
     def pick(self, text: str | None) -> SeenResource:
-        """The resource that a user means: ``sonar``, ``/sonar``, ``base:/sonar``; ``None``: the only one.
+        """The resource that a user names: ``sonar``, ``/sonar``, ``base:/sonar``; ``None``: the only one.
 
         Raises:
             ConfigError: It is no name.
-            RmpaError: There is none, or several and nothing tells which is meant.
+            RmpaError: There is none, or there are several.
         """
         if text is None:
             own = [each for each in self.seen if each.peer is None] or list(self.seen)
             return _only(own, "say which resource is meant")
-        wanted = read_topic(text, "resource")
-        found = [s for s in self.seen if s.path == wanted.topic and (wanted.peer is None or s.peer == wanted.peer)]
+        wanted = read_name(text, "resource")
+        found = [s for s in self.seen if s.path == wanted.name and (wanted.peer is None or s.peer == wanted.peer)]
         if not found:
             near = did_you_mean(str(wanted), map(str, self.seen))
             remedy = f"did you mean {printable(near)}?" if near else "`rmpa resource list` shows all"
@@ -93,7 +93,7 @@ class Room:
         kind: str = TEXT,
         timeout: float = _ANSWER,  # noqa: ASYNC109
     ) -> dict[SeenResource, Any]:
-        """The first message of each resource's topic, as far as they come in time.
+        """The first message of a topic of each resource; without those that send none in time.
 
         Args:
             each: Which resources.
@@ -111,7 +111,7 @@ class Room:
         return found
 
     async def texts(self, each: Sequence[SeenResource], *names: str) -> list[dict[SeenResource, str]]:
-        """What several topics ``std_msgs/String`` of resources say."""
+        """The texts of ``std_msgs/String`` topics: by topic, then by resource."""
         heard = await asyncio.gather(*(self.hear(each, name) for name in names))
         return [{one: str(message.data) for one, message in found.items()} for found in heard]
 
@@ -123,22 +123,22 @@ class Room:
         return read_config(message) if message is not None else {}
 
     async def configure(self, one: SeenResource, values: Mapping[str, str]) -> None:
-        """Set texts among a resource's parameters.
+        """Set text parameters of a resource.
 
         Raises:
-            RmpaError: It cannot be reached, or refuses; nothing has changed then.
+            RmpaError: It cannot be reached, or refuses; then nothing has changed.
         """
         from rmpa.resource.run.dynamic_reconfigure import SERVICE_TYPE
         from rmpa.ros.types.service_types import ServiceType
 
-        service = TopicName(f"{one.path}/set_parameters", one.peer)
-        server = require_service(self.graph, service)
-        if one.peer is None and proxied_node(server) is not None:
+        service = GraphName(f"{one.path}/set_parameters", one.peer)
+        server = self.graph.require_service(service)
+        if one.peer is None and peer_of(server) is not None:
             raise RmpaError(f"service {service} is another module's; {one} does not offer it")
         pairs: Any = [{"name": name, "value": value} for name, value in values.items()]
         kind = ServiceType(SERVICE_TYPE)
         try:
-            await self.node.call_service(service.topic, kind, {"config": {"strs": pairs}})
+            await self.node.call_service(service.name, kind, {"config": {"strs": pairs}})
         except PeerRefused as error:
             raise RmpaError(printable(f"{one}: {error.reason}")) from None
 
@@ -151,23 +151,23 @@ def _only(found: Sequence[SeenResource], remedy: str) -> SeenResource:
     raise RmpaError(f"there are {', '.join(printable(str(each)) for each in found)}; {remedy}")
 
 
-def run_around(master: str | None, agent: str | None, body: Callable[[Room], Awaitable[None]]) -> None:
-    """Find all resources of the graph that is meant, as ``choose_master`` has it, and let ``body`` deal with them."""
-    asyncio.run(look_around(choose_master(master, agent, os.environ), body))
+def run_with_resources(options: GraphOptions, body: Callable[[ResourceGraph], Awaitable[None]]) -> None:
+    """Find all resources of the graph that the options name, and run ``body`` with them."""
+    asyncio.run(with_resources(options.master(), body))
 
 
-async def look_around(master: Master, body: Callable[[Room], Awaitable[None]]) -> None:
-    """Find all resources, and let ``body`` deal with them."""
+async def with_resources(master: Master, body: Callable[[ResourceGraph], Awaitable[None]]) -> None:
+    """Find all resources of a master's graph, and run ``body`` with them."""
     graph = await read_graph(master)
 
     async def within(node: Node) -> None:
-        await body(Room(node, graph, await find_resources(node, graph)))
+        await body(ResourceGraph(node, graph, await find_resources(node, graph)))
 
     await with_node(master, _NODE, within)
 
 
 async def find_resources(node: Node, graph: Graph) -> tuple[SeenResource, ...]:
-    """All resources that say what they are, this module's first."""
+    """All resources that publish a descriptor, this module's first."""
     ending = f"/{TOPIC}"
     topics = {
         topic: set(nodes)
@@ -179,11 +179,8 @@ async def find_resources(node: Node, graph: Graph) -> tuple[SeenResource, ...]:
         try:
             descriptor = Descriptor.parse(str(received.message.data))
         except RmpaError:
-            continue  # somebody else's topic of that name
-        proxy = proxied_node(caller)
-        found.append(
-            SeenResource(topic.removesuffix(ending), proxy[0] if proxy is not None else None, caller, descriptor)
-        )
+            continue  # another program's topic of that name
+        found.append(SeenResource(topic.removesuffix(ending), peer_of(caller), caller, descriptor))
     return tuple(sorted(found, key=lambda each: (each.peer or "", each.path)))
 
 
@@ -191,9 +188,9 @@ async def first_messages(
     node: Node,
     callers: Mapping[str, set[str]],
     kind: str,
-    timeout: float,  # noqa: ASYNC109 - what has come by then is the result
+    timeout: float,  # noqa: ASYNC109 - a time-out is no error here
 ) -> dict[tuple[str, str], Received]:
-    """The first message of each publisher of topics, by topic and publisher; those that do not come are not in it."""
+    """The first message of each publisher, by topic and publisher; without those that send none in time."""
     found: dict[tuple[str, str], Received] = {}
     missing = {(topic, caller) for topic, names in callers.items() for caller in names}
     change = asyncio.Event()
@@ -209,11 +206,10 @@ async def first_messages(
     type_ = MessageType(kind)
     subscribers = [await node.subscribe(topic, type_, functools.partial(take, topic)) for topic in callers]
     try:
-        async with asyncio.timeout(timeout):
-            while missing:
-                await change.wait()
-    except TimeoutError:
-        pass
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout):
+                while missing:
+                    await change.wait()
     finally:
         for subscriber in subscribers:
             await subscriber.close()
@@ -221,10 +217,10 @@ async def first_messages(
 
 
 def decision_of(text: str) -> dict[str, Any]:
-    """What a resource says about its last decision.
+    """Parse a resource's account of its last decision, a JSON object.
 
     Raises:
-        RmpaError: It is no such thing.
+        RmpaError: It is none.
     """
     try:
         found = msgspec.json.decode(text)
@@ -236,10 +232,10 @@ def decision_of(text: str) -> dict[str, Any]:
 
 
 def known_name(what: str, text: str, known: Iterable[str]) -> str:
-    """A profile or context that a resource has.
+    """Check that a resource has a profile or context of that name; return the name.
 
     Raises:
-        ConfigError: It has none of that name.
+        ConfigError: It has none.
     """
     names = list(known)
     if text not in names:

@@ -1,35 +1,29 @@
-"""What an agent measures of the topics that reach it over the mesh, as the topic commands show it."""
+"""What the agent knows of the topics that cross the mesh, as the topic commands show it."""
 
 from __future__ import annotations
 
-import contextlib
 from typing import TYPE_CHECKING
 
 from rmpa.cli.output import duration, printable, size
-from rmpa.core.errors import RmpaError
-from rmpa.observe.io.control_client import ControlClient
-from rmpa.observe.snapshot import Snapshot
 from rmpa.ros import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.cli.master import Master, TopicName
+    from rmpa.cli.graph import GraphName
+    from rmpa.cli.master import Master
     from rmpa.observe.snapshot import LatencyInfo, RouteInfo, TopicInfo
 
 
 def ask_agent(master: Master, topic: str) -> TopicInfo | None:
-    """What the master's agent knows of one topic, if it is an agent's master and the agent answers."""
-    if master.agent is not None:
-        with contextlib.suppress(RmpaError), ControlClient(master.agent) as client:
-            topics = client.call("snapshot", Snapshot, topics=(topic,)).topics
-            return next((info for info in topics if info.name == topic), None)
-    return None
+    """What the master's agent knows of a topic; ``None`` without an agent, or if it does not answer."""
+    snapshot = master.snapshot(topics=(topic,))
+    return next((info for info in snapshot.topics if info.name == topic), None) if snapshot is not None else None
 
 
-def arriving(master: Master, wanted: TopicName) -> tuple[RouteInfo, ...]:
-    """The remote sources of a topic from which something has come, as the agent sees them."""
-    info = ask_agent(master, wanted.topic)
+def arriving(master: Master, wanted: GraphName) -> tuple[RouteInfo, ...]:
+    """The routes of a topic's remote sources from which a message has come."""
+    info = ask_agent(master, wanted.name)
     return tuple(
         route
         for route in (info.routes if info else ())
@@ -38,12 +32,12 @@ def arriving(master: Master, wanted: TopicName) -> tuple[RouteInfo, ...]:
 
 
 def origin(route: RouteInfo) -> str:
-    """Whose figures they are: ``joystick /joy_node``."""
+    """The source that figures are about: ``joystick /joy_node``."""
     return printable(f"{route.peer} {route.node}")
 
 
 def rate_text(route: RouteInfo) -> str:
-    """How often messages come."""
+    """Rate, period and jitter."""
     if route.rate is None or route.period is None:
         return "one message, no rate yet" if route.messages == 1 else "nothing in the last minute"
     p = route.period
@@ -54,7 +48,7 @@ def rate_text(route: RouteInfo) -> str:
 
 
 def latency_text(latency: LatencyInfo | None) -> str:
-    """How long they were on the way."""
+    """One-way latency, with the bound of its error."""
     if latency is None:
         return "unknown yet"
     return (
@@ -64,13 +58,13 @@ def latency_text(latency: LatencyInfo | None) -> str:
 
 
 def bandwidth_text(route: RouteInfo) -> str:
-    """How many bytes they need."""
+    """Bytes a second, and bytes a message."""
     mean = route.bytes / route.messages if route.messages else None
     return f"{size(route.bandwidth)}/s, {size(mean)} a message" if route.bandwidth is not None else "unknown yet"
 
 
 def losses_text(route: RouteInfo) -> str:
-    """What did not arrive, by its reason."""
+    """Messages that did not arrive, by reason."""
     ours = f"{route.dropped} dropped here"
     if route.direction == "in":
         return f"{route.lost} lost, {route.late} late, {route.expired} expired, {ours}"
@@ -78,14 +72,14 @@ def losses_text(route: RouteInfo) -> str:
 
 
 def oversized_text(route: RouteInfo) -> str:
-    """What cannot cross because it is too long."""
+    """Messages that were left out because they are too long."""
     where = f"by the agent of {route.peer}" if route.direction == "in" else "here"
     last, most = size(route.oversized_bytes), size(limits.TCPROS_MESSAGE_MAX)
     return f"{route.oversized} left out {where}, the last of {last}; at most {most} cross: send parts"
 
 
 def facts(route: RouteInfo) -> Iterator[tuple[str, str]]:
-    """All that is known of a route, a label and a text each."""
+    """All that the agent knows of a route: label and text of each line."""
     if route.wire:
         yield "there", route.wire
     if route.lane:
@@ -109,7 +103,7 @@ def facts(route: RouteInfo) -> Iterator[tuple[str, str]]:
 
 
 def _value(key: str, value: object) -> str:
-    """A contract's value with its unit; JSON does not tell whole numbers from durations, the key does."""
+    """A contract's value with its unit: only the key says whether a number is a count, a rate or seconds."""
     if not isinstance(value, int | float):
         return str(value)
     if key == "depth":

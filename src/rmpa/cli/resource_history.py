@@ -1,4 +1,4 @@
-"""Which resources a module of this machine has seen before, as its ``rmpa run`` wrote them down."""
+"""The resources that modules of this machine have seen before, from the files that ``rmpa run`` keeps."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rmpa.bridge.proxy_names import proxied_node
-from rmpa.cli.output import duration, printable, warn
-from rmpa.cli.resources_seen import SeenResource
+from rmpa.cli.graph import peer_of
+from rmpa.cli.output import duration, warn
+from rmpa.cli.resource_graph import SeenResource
 from rmpa.resource.run.registry_writer import FILE
 from rmpa.resource.run.resource_registry import ResourceRegistry
 from rmpa.resource.run.store import module_dir, read_state, state_dir
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class KnownResource:
-    """One resource.
+    """A resource that was seen before.
 
     Args:
-        module: Who has seen it; the names are those of its graph.
-        seen: As it was then.
+        module: The module that saw it; the names are those of its graph.
+        seen: The resource as it was then.
         first: When it was seen first, Unix seconds.
-        last: And last.
+        last: When it was seen last, Unix seconds.
     """
 
     module: str
@@ -41,7 +41,7 @@ class KnownResource:
         return max(0.0, time.time() - self.last)
 
     def __str__(self) -> str:
-        """Where it is now, for a column of states."""
+        """For a column of states."""
         return f"last seen {duration(self.ago)} ago, not here now"
 
 
@@ -49,9 +49,9 @@ def remembered(module: str | None, state: str | None, here: Iterable[SeenResourc
     """The resources that were seen before and are not here now, the latest first.
 
     Args:
-        module: Which has seen them; ``None``: any of this machine.
-        state: Where they are written down; ``None``: where ``rmpa run`` does so by default.
-        here: Those that are here.
+        module: The module that saw them; ``None``: any of this machine.
+        state: The state directory; ``None``: the default of ``rmpa run``.
+        here: The resources that are here.
     """
     directory = state_dir(os.environ, state)
     if directory is None:
@@ -70,12 +70,11 @@ def _read(path: Path) -> list[KnownResource]:
     try:
         rows = read_state(path)
     except OSError as error:
-        warn(printable(str(error)))
+        warn(str(error))
         return []
     latest: dict[tuple[str, str | None], KnownResource] = {}
     for each in ResourceRegistry(rows).all:  # the latest first
-        proxy = proxied_node(each.caller)
-        peer = proxy[0] if proxy is not None else None
+        peer = peer_of(each.caller)
         one = KnownResource(
             path.parent.name,
             SeenResource(each.path, peer, each.caller, each.descriptor),

@@ -1,4 +1,4 @@
-"""``rmpa resource info``."""
+"""``rmpa resource info``: all that a resource publishes about itself."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from rmpa.cli.options import agent_option, json_option, master_option
-from rmpa.cli.output import Column, print_json, print_table, printable, warn
-from rmpa.cli.profile_commands import offers, shown
-from rmpa.cli.resources_seen import run_around
+from rmpa.cli.options import GraphOptions, graph_options
+from rmpa.cli.output import Column, print_json, print_line, print_table, warn
+from rmpa.cli.profile import offers, shown
+from rmpa.cli.resource_graph import run_with_resources
 from rmpa.resource.declare.attributes import MEASURED
 from rmpa.ros.types.diagnostic_array import ARRAY_TYPE, DiagnosticLevel
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from rmpa.cli.resources_seen import Room, SeenResource
+    from rmpa.cli.resource_graph import ResourceGraph, SeenResource
     from rmpa.resource.run.descriptor import Descriptor, ParameterDescriptor, TaskDescriptor, TopicDescriptor
 
 _TIMES: Final = frozenset({"deadline", "lifespan", "liveliness_lease"})
@@ -25,19 +25,17 @@ _TIMES: Final = frozenset({"deadline", "lifespan", "liveliness_lease"})
 
 @click.command(epilog="\b\nExamples:\n  rmpa resource info /sonar\n  rmpa resource info base:/arm --json\n")
 @click.argument("resource", required=False)
-@json_option
-@agent_option
-@master_option
-def info(resource: str | None, as_json: bool, agent: str | None, master: str | None) -> None:
+@graph_options
+def info(resource: str | None, options: GraphOptions) -> None:
     """Show all of a RESOURCE: topics, parameters, qualities, profiles, contexts, tasks, what it asks, and clients."""
 
-    async def body(room: Room) -> None:
-        one = room.pick(resource)
+    async def body(graph: ResourceGraph) -> None:
+        one = graph.pick(resource)
         texts, values, quality, responses = await asyncio.gather(
-            room.texts([one], "state", "profile", "context"),
-            room.configuration(one),
-            room.hear([one], "quality", ARRAY_TYPE),
-            room.hear([one], "responses", ARRAY_TYPE),
+            graph.texts([one], "state", "profile", "context"),
+            graph.configuration(one),
+            graph.hear([one], "quality", ARRAY_TYPE),
+            graph.hear([one], "responses", ARRAY_TYPE),
         )
         state, profile, context = (said.get(one, "") for said in texts)
         health, *_ = [*_statuses(quality.get(one)), None]
@@ -52,12 +50,12 @@ def info(resource: str | None, as_json: bool, agent: str | None, master: str | N
             "parameters": values,
             "clients": _statuses(responses.get(one)),
         }
-        if as_json:
+        if options.as_json:
             print_json(about | {"descriptor": one.descriptor})
         else:
             _print_info(one, about)
 
-    run_around(master, agent, body)
+    run_with_resources(options, body)
 
 
 def _statuses(message: Any) -> list[dict[str, Any]]:
@@ -88,7 +86,7 @@ def _print_info(one: SeenResource, about: dict[str, Any]) -> None:
     if said.contexts:
         _line("Context", about["context"] or "none")
     if health is None:
-        warn(f"{printable(str(one))} has sent no quality while we listened")
+        warn(f"{one} has sent no quality while we listened")
     else:
         _line("Health", f"{health['level']}: {health['message']}")
     _topics("OUTPUT", said.outputs)
@@ -120,7 +118,7 @@ def _print_info(one: SeenResource, about: dict[str, Any]) -> None:
 
 
 def _runs(task: TaskDescriptor, values: dict[str, Any]) -> str:
-    """When a task runs."""
+    """The rate at which a task runs, or the topic that starts it."""
     if task.follows in values:
         return f"{values[task.follows]:g} Hz (parameter {task.follows})"
     return f"{task.rate:g} Hz" if task.rate else f"on {task.on}"
@@ -135,7 +133,7 @@ def _parameter(one: ParameterDescriptor, values: dict[str, Any]) -> Sequence[str
 
 
 def _qualities(said: Descriptor, values: dict[str, str]) -> list[Sequence[str]]:
-    """What is declared, and what is measured."""
+    """The declared attributes, and the general ones that are measured."""
     return [
         (each.name, values.get(each.name, "not measured"), each.better, each.category)
         for each in said.attributes
@@ -151,16 +149,15 @@ def _topics(title: str, topics: Sequence[TopicDescriptor]) -> None:
 
 
 def _term(key: str, value: object) -> str:
-    """A term of a contract; its times are seconds."""
+    """A term of a contract; times are in seconds."""
     return f"{key} {value:g} s" if isinstance(value, float) and key in _TIMES else f"{key} {value}"
 
 
 def _line(title: str, text: str) -> None:
-    click.echo(printable(f"{title}: {text}"))
+    print_line(f"{title}: {text}")
 
 
 def _table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    made = [tuple(map(printable, row)) for row in rows]
-    if made:
-        click.echo()
+    if made := list(rows):
+        print_line()
         print_table(tuple(map(Column, titles)), made)

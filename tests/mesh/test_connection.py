@@ -8,9 +8,17 @@ from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolEr
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.mesh import limits
+from rmpa.mesh.connection import (
+    ConnectionClosed,
+    ConnectionRole,
+    ConnectionState,
+    ControlReceived,
+    HandshakeDone,
+    HelloReceived,
+    Refused,
+)
 from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pong
 from rmpa.mesh.handshake import Hello, Refusal, Refuse
-from rmpa.mesh.link import ControlReceived, HelloReceived, LinkClosed, LinkRole, LinkState, Refused, Up
 from rmpa.runtime import limits as runtime_limits
 from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, exchange, pair, pass_time, side
 
@@ -18,14 +26,14 @@ from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, exchange, pair, pa
 @pytest.mark.parametrize("chunk", [1, 7, 24, 1 << 20])
 def test_handshake_control_data_and_bye_in_pieces(chunk: int) -> None:
     time = Time()
-    dialler = side(LinkRole.DIALLER, LOW, time, expected=HIGH.guid)
-    acceptor = side(LinkRole.ACCEPTOR, HIGH, time)
+    dialler = side(ConnectionRole.DIALLER, LOW, time, expected=HIGH.guid)
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
     deliver(dialler.link.take_output(), acceptor.link, time.now, chunk)
     assert isinstance(acceptor.events[0], HelloReceived)
     assert acceptor.events[0].hello.identity == LOW
     acceptor.link.accept(time.now)
     exchange(dialler, acceptor, time, chunk)
-    assert isinstance(dialler.events[0], Up)
+    assert isinstance(dialler.events[0], HandshakeDone)
     assert dialler.events[0].hello.identity == HIGH
     control = dialler.link.control(b'{"op":"x"}')
     data = [pack_data_header(n, 7, i, 99) + bytes(n) for i, n in enumerate([3, 1, 300])]
@@ -33,18 +41,18 @@ def test_handshake_control_data_and_bye_in_pieces(chunk: int) -> None:
     assert acceptor.last() == ControlReceived(b'{"op":"x"}')
     assert acceptor.data == [(7, 0, 99, bytes(3)), (7, 1, 99, bytes(1)), (7, 2, 99, bytes(300))]
     dialler.link.close("shutting down", time.now)
-    assert dialler.link.state is LinkState.CLOSING
+    assert dialler.link.state is ConnectionState.CLOSING
     deliver(dialler.link.take_output(), acceptor.link, time.now, chunk)
-    assert acceptor.last() == LinkClosed("low left: shutting down", orderly=True)
+    assert acceptor.last() == ConnectionClosed("low left: shutting down", orderly=True)
     dialler.link.drained()
-    assert dialler.last() == LinkClosed("shutting down", orderly=True)
+    assert dialler.last() == ConnectionClosed("shutting down", orderly=True)
 
 
 def test_every_split_of_the_handshake_in_two_is_the_same() -> None:
     time = Time()
-    whole = side(LinkRole.DIALLER, LOW, time).link.take_output()
+    whole = side(ConnectionRole.DIALLER, LOW, time).link.take_output()
     for cut in range(1, len(whole)):
-        acceptor = side(LinkRole.ACCEPTOR, HIGH, time)
+        acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
         consumed, wanted = acceptor.link.receive(memoryview(whole[:cut]), time.now)
         assert consumed == 0
         assert wanted == (len(whole) if cut >= 24 else 0)
@@ -65,17 +73,20 @@ def test_data_arrives_as_a_view_without_a_copy() -> None:
 
 def test_a_refusal_reaches_the_dialler_and_both_end() -> None:
     time = Time()
-    dialler = side(LinkRole.DIALLER, LOW, time)
-    acceptor = side(LinkRole.ACCEPTOR, HIGH, time)
+    dialler = side(ConnectionRole.DIALLER, LOW, time)
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
     deliver(dialler.link.take_output(), acceptor.link, time.now)
     refuse = Refuse(Refusal.BUSY, "come later")
     acceptor.link.refuse(refuse, time.now)
     assert acceptor.last() == Refused(refuse, by_us=True)
-    assert acceptor.link.state is LinkState.CLOSING
+    assert acceptor.link.state is ConnectionState.CLOSING
     deliver(acceptor.link.take_output(), dialler.link, time.now)
-    assert dialler.events == [Refused(refuse, by_us=False), LinkClosed("? refused: busy: come later", orderly=True)]
+    assert dialler.events == [
+        Refused(refuse, by_us=False),
+        ConnectionClosed("? refused: busy: come later", orderly=True),
+    ]
     acceptor.link.drained()
-    assert acceptor.last() == LinkClosed("refused: busy: come later", orderly=True)
+    assert acceptor.last() == ConnectionClosed("refused: busy: come later", orderly=True)
 
 
 def with_byte(data: bytes, offset: int, value: int) -> bytes:
@@ -93,20 +104,20 @@ def with_byte(data: bytes, offset: int, value: int) -> bytes:
 )
 def test_an_unreadable_hello_is_refused_with_its_code(offset: int, value: int, code: Refusal) -> None:
     time = Time()
-    acceptor = side(LinkRole.ACCEPTOR, HIGH, time)
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
     payload = Hello.of(LOW, lease=1.0, expected=None).serialize()
     deliver(Frame(FrameKind.HELLO, with_byte(payload, offset, value)).serialize(), acceptor.link, time.now)
     frame = Frame.parse(acceptor.link.take_output())
     assert frame is not None
     assert frame[0].kind is FrameKind.REFUSE
     assert Refuse.parse(frame[0].payload).code == code
-    assert acceptor.link.state is LinkState.CLOSING
+    assert acceptor.link.state is ConnectionState.CLOSING
     assert isinstance(acceptor.events[0], Refused)
 
 
 def test_a_wrong_welcome_ends_the_link_with_a_bye() -> None:
     time = Time()
-    dialler = side(LinkRole.DIALLER, LOW, time, expected=Guid.of("10.0.0.9", 1))
+    dialler = side(ConnectionRole.DIALLER, LOW, time, expected=Guid.of("10.0.0.9", 1))
     dialler.link.take_output()
     welcome = Hello.of(HIGH, lease=1.0, expected=LOW.guid)
     deliver(Frame(FrameKind.WELCOME, welcome.serialize()).serialize(), dialler.link, time.now)
@@ -120,17 +131,17 @@ def test_a_wrong_welcome_ends_the_link_with_a_bye() -> None:
 @pytest.mark.parametrize("kind", [k for k in FrameKind if k is not FrameKind.HELLO])
 def test_only_hello_opens(kind: FrameKind) -> None:
     time = Time()
-    acceptor = side(LinkRole.ACCEPTOR, HIGH, time)
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
     with pytest.raises(RemoteProtocolError, match="while handshaking"):
         acceptor.link.receive(memoryview(Frame(kind).serialize()), time.now)
-    assert acceptor.link.state is LinkState.CLOSED
-    assert isinstance(acceptor.events[-1], LinkClosed)
+    assert acceptor.link.state is ConnectionState.CLOSED
+    assert isinstance(acceptor.events[-1], ConnectionClosed)
 
 
 @pytest.mark.parametrize("kind", [k for k in FrameKind if k not in (FrameKind.WELCOME, FrameKind.REFUSE)])
 def test_only_welcome_or_refuse_answer(kind: FrameKind) -> None:
     time = Time()
-    dialler = side(LinkRole.DIALLER, LOW, time)
+    dialler = side(ConnectionRole.DIALLER, LOW, time)
     with pytest.raises(RemoteProtocolError, match="while handshaking"):
         dialler.link.receive(memoryview(Frame(kind).serialize()), time.now)
 
@@ -145,8 +156,8 @@ def test_no_handshake_while_up(kind: FrameKind) -> None:
 
 def test_a_second_frame_before_the_answer_is_an_error() -> None:
     time = Time()
-    acceptor = side(LinkRole.ACCEPTOR, HIGH, time)
-    hello = side(LinkRole.DIALLER, LOW, time).link.take_output()
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
+    hello = side(ConnectionRole.DIALLER, LOW, time).link.take_output()
     with pytest.raises(RemoteProtocolError, match="hello frame while handshaking"):
         acceptor.link.receive(memoryview(hello + hello), time.now)
 
@@ -161,7 +172,7 @@ def test_a_second_frame_before_the_answer_is_an_error() -> None:
 )
 def test_garbage_on_the_port(header: bytes) -> None:
     time = Time()
-    acceptor = side(LinkRole.ACCEPTOR, HIGH, time)
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
     with pytest.raises(RemoteProtocolError):
         acceptor.link.receive(memoryview(header), time.now)
 
@@ -188,8 +199,8 @@ def test_keepalive_holds_an_idle_link_for_ever_and_its_clock_is_known() -> None:
             mine.link.handle_timer(time.now)
             pings += mine.link.has_output
         exchange(dialler, acceptor, time)
-    assert dialler.link.state is LinkState.UP
-    assert acceptor.link.state is LinkState.UP
+    assert dialler.link.state is ConnectionState.UP
+    assert acceptor.link.state is ConnectionState.UP
     assert pings < 100 * 5.5  # one side pings at 4 Hz, the other's pongs keep it, and it pings once a second
     estimate = dialler.link.clock.estimate(time.now)
     assert estimate is not None
@@ -200,14 +211,14 @@ def test_silence_for_the_others_lease_ends_the_link() -> None:
     time = Time()
     dialler, _ = pair(time, lease=2.0)
     pass_time(dialler.link, time, 1.999)
-    assert dialler.link.state is LinkState.UP
+    assert dialler.link.state is ConnectionState.UP
     pass_time(dialler.link, time, 0.001)
-    assert dialler.last() == LinkClosed("high was silent for its lease of 2 s", orderly=False)
+    assert dialler.last() == ConnectionClosed("high was silent for its lease of 2 s", orderly=False)
     assert dialler.link.next_timer() is None
 
 
 def is_up(one: Side) -> bool:
-    return one.link.state is LinkState.UP
+    return one.link.state is ConnectionState.UP
 
 
 def test_a_pause_of_our_own_is_no_silence_of_the_others() -> None:
@@ -234,7 +245,7 @@ def test_the_reason_names_the_lease_and_our_own_pause_apart() -> None:
     dialler.link.handle_timer(time.now)
     pass_time(dialler.link, time, 2.0)
     closed = dialler.last()
-    assert isinstance(closed, LinkClosed)
+    assert isinstance(closed, ConnectionClosed)
     assert "silent for its lease of 2 s, our own pauses of 1." in closed.reason
 
 
@@ -255,17 +266,17 @@ def test_bytes_within_a_half_read_frame_renew_the_lease() -> None:
         time.now += 0.9
         dialler.link.heard(time.now)
         dialler.link.handle_timer(time.now)
-    assert dialler.link.state is LinkState.UP
+    assert dialler.link.state is ConnectionState.UP
 
 
-@pytest.mark.parametrize("role", list(LinkRole))
-def test_a_handshake_that_takes_too_long(role: LinkRole) -> None:
+@pytest.mark.parametrize("role", list(ConnectionRole))
+def test_a_handshake_that_takes_too_long(role: ConnectionRole) -> None:
     time = Time()
     mine = side(role, LOW, time)
     assert mine.link.next_timer() == time.now + limits.HANDSHAKE_TIMEOUT
     time.now += limits.HANDSHAKE_TIMEOUT
     mine.link.handle_timer(time.now)
-    assert isinstance(mine.events[-1], LinkClosed)
+    assert isinstance(mine.events[-1], ConnectionClosed)
     assert "handshake" in mine.events[-1].reason
 
 
@@ -286,7 +297,7 @@ def test_what_comes_while_leaving_is_ignored_and_the_drain_ends_in_time() -> Non
     assert not any(isinstance(e, ControlReceived) for e in dialler.events)
     time.now += runtime_limits.DRAIN_TIMEOUT
     dialler.link.handle_timer(time.now)
-    assert dialler.last() == LinkClosed("done", orderly=True)
+    assert dialler.last() == ConnectionClosed("done", orderly=True)
 
 
 def test_the_driver_loses_the_connection() -> None:
@@ -294,8 +305,8 @@ def test_the_driver_loses_the_connection() -> None:
     dialler, _ = pair(time)
     dialler.link.lost("reset by peer")
     dialler.link.lost("twice")
-    assert dialler.last() == LinkClosed("reset by peer", orderly=False)
-    assert sum(isinstance(e, LinkClosed) for e in dialler.events) == 1
+    assert dialler.last() == ConnectionClosed("reset by peer", orderly=False)
+    assert sum(isinstance(e, ConnectionClosed) for e in dialler.events) == 1
 
 
 def test_closing_from_within_the_data_callback_stops_the_reading() -> None:
@@ -315,7 +326,7 @@ def test_closing_from_within_the_data_callback_stops_the_reading() -> None:
 
 def test_answers_out_of_turn_are_our_own_fault() -> None:
     time = Time()
-    acceptor = side(LinkRole.ACCEPTOR, HIGH, time)
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
     with pytest.raises(LocalProtocolError):
         acceptor.link.accept(time.now)
     dialler, _ = pair(time)
@@ -327,8 +338,8 @@ def test_answers_out_of_turn_are_our_own_fault() -> None:
 def test_the_clock_offset_is_within_its_bound(offset_ns: int) -> None:
     mine, theirs = Time(), Time()
     theirs.offset_ns = offset_ns
-    dialler = side(LinkRole.DIALLER, LOW, mine)
-    acceptor = side(LinkRole.ACCEPTOR, HIGH, theirs)
+    dialler = side(ConnectionRole.DIALLER, LOW, mine)
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, theirs)
 
     def carry(source: Side, target: Side, delay: float) -> None:
         mine.now += delay
@@ -352,12 +363,12 @@ def test_the_clock_offset_is_within_its_bound(offset_ns: int) -> None:
 
 def test_a_lease_of_a_month_is_cut() -> None:
     time = Time()
-    acceptor = side(LinkRole.ACCEPTOR, HIGH, time)
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
     hello = Hello(LOW.guid, LOW.instance, LOW.name, 0, 0xFFFFFFFF)
     deliver(Frame(FrameKind.HELLO, hello.serialize()).serialize(), acceptor.link, time.now)
     acceptor.link.accept(time.now)
     pass_time(acceptor.link, time, limits.LINK_LEASE_MAX)
-    assert acceptor.link.state is LinkState.CLOSED
+    assert acceptor.link.state is ConnectionState.CLOSED
 
 
 def test_identity_of_the_other_side_comes_with_the_hello() -> None:
@@ -371,8 +382,8 @@ def test_identity_of_the_other_side_comes_with_the_hello() -> None:
 def test_a_link_with_a_long_round_trip_comes_up_and_stays(one_way: float) -> None:
     """Where a foreign flow fills a slow radio's queue: each side hears the other steadily, only late."""
     time = Time()
-    dialler = side(LinkRole.DIALLER, LOW, time, expected=HIGH.guid)
-    acceptor = side(LinkRole.ACCEPTOR, HIGH, time)
+    dialler = side(ConnectionRole.DIALLER, LOW, time, expected=HIGH.guid)
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
     on_the_way: list[tuple[float, Side, bytes]] = []
     ends: list[float] = []
     begin = time.now
@@ -390,6 +401,6 @@ def test_a_link_with_a_long_round_trip_comes_up_and_stays(one_way: float) -> Non
                 to.link.accept(time.now)
         for s in (dialler, acceptor):
             s.link.handle_timer(time.now)
-            ends += [time.now - begin for event in s.events if isinstance(event, LinkClosed)]
+            ends += [time.now - begin for event in s.events if isinstance(event, ConnectionClosed)]
     assert ends == []
-    assert dialler.link.state is acceptor.link.state is LinkState.UP
+    assert dialler.link.state is acceptor.link.state is ConnectionState.UP
