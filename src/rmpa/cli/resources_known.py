@@ -12,7 +12,8 @@ from rmpa.cli.output import duration, printable, warn
 from rmpa.cli.resources_seen import SeenResource
 from rmpa.resource.run.registry_writer import FILE
 from rmpa.resource.run.resource_registry import ResourceRegistry
-from rmpa.resource.run.store import module_dir, read_state, state_dir
+from rmpa.resource.run.store import read_state
+from rmpa.runtime.state_dir import module_dir, state_dir
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

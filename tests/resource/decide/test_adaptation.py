@@ -6,19 +6,11 @@ from dataclasses import replace
 import pytest
 
 from rmpa.core.errors import ConfigError, PeerRefused
-from rmpa.resource.decide.adaptation import (
-    Action,
-    Adaptation,
-    AdaptationSettings,
-    AlarmKind,
-    Apply,
-    Clear,
-    CoolDown,
-    ProfileState,
-    Raise,
-    Reacted,
-)
+from rmpa.resource.decide.actions import Action, AlarmKind, Apply, Clear, Raise, Reacted
+from rmpa.resource.decide.adaptation import Adaptation, ProfileState
+from rmpa.resource.decide.cool_downs import CoolDown
 from rmpa.resource.decide.decision import Decider
+from rmpa.resource.declare.adaptation_settings import AdaptationSettings
 from rmpa.resource.declare.attributes import LATENCY, RATE
 from rmpa.resource.declare.profiles import Profile
 from rmpa.resource.declare.requirements import Bound, Requirement, bound
@@ -103,7 +95,7 @@ def test_a_disturbance_takes_k_of_n_windows() -> None:
     assert alarms(actions) == [(AlarmKind.ADAPTATION, "middle", "fast")]
     assert applies(actions) == ["fast"]
     raised = next(a.alarm for a in actions if isinstance(a, Raise))
-    assert [(s.attribute, s.given) for s in raised.shortfalls] == [("rate", 8.0)]
+    assert [(s.attribute, s.offered) for s in raised.shortfalls] == [("rate", 8.0)]
     # From the first window that was violated to the profile that runs.
     assert one.applied("fast", 4.5)[0] == Reacted("fast", 2.5)
 
@@ -160,7 +152,7 @@ def test_what_no_profile_is_declared_to_meet_is_a_non_adaptable_event_at_once() 
     actions = one.require(at_least(100, hard=True), 1.0)
     assert alarms(actions) == [(AlarmKind.NON_ADAPTABLE, "slow", "fast")]
     raised = next(a.alarm for a in actions if isinstance(a, Raise))
-    assert [(s.attribute, s.given) for s in raised.shortfalls] == [("rate", 40.0)]
+    assert [(s.attribute, s.offered) for s in raised.shortfalls] == [("rate", 40.0)]
     finish(one, 1.0)
     assert [type(a) for a in one.require(at_least(10, hard=True), 2.0)] == [Clear, Apply]
 
@@ -238,17 +230,17 @@ def test_two_that_are_nearly_alike_do_not_alternate() -> None:
 
 def test_what_a_better_profile_waits_for_is_the_dwell_time() -> None:
     one = running(30, FAST, SLOW, hard=False)
-    one.bar({"fast": "battery low"}, 2.0)
+    one.block({"fast": "battery low"}, 2.0)
     finish(one, 2.0)
     assert one.profile == "slow"
-    assert one.bar({}, 3.0) == []
+    assert one.block({}, 3.0) == []
     assert applies(one.window({"latency": 0.1}, 3.5)) == []
     assert applies(one.window({"latency": 0.1}, 4.5)) == ["fast"]
 
 
 def test_a_barred_profile_is_left_at_once() -> None:
     one = running(30)
-    assert applies(one.bar({"fast": "battery low"}, 1.5)) == ["middle"]
+    assert applies(one.block({"fast": "battery low"}, 1.5)) == ["middle"]
 
 
 def test_a_choice_by_hand_holds_whatever_is_asked() -> None:
@@ -319,7 +311,7 @@ def test_whatever_happens_one_profile_is_applied_at_a_time_and_none_that_is_left
     for _ in range(300):
         now += chance.choice((0.0, 0.1, 1.0, 4.0))
         while (due := one.next_timer()) is not None and due <= now:
-            was, outstanding = outstanding, "" if outstanding and due == one._deadline else outstanding
+            was, outstanding = outstanding, "" if outstanding and due == one._apply_deadline else outstanding
             take(one.handle_timer(due))
         match chance.randrange(6):
             case 0:
@@ -336,7 +328,7 @@ def test_whatever_happens_one_profile_is_applied_at_a_time_and_none_that_is_left
                 take(one.failed(was, "by chance", now))
             case 5:
                 barred = {name: "by chance" for name in ("fast", "middle") if chance.random() < 0.3}
-                take(one.bar(barred, now))
+                take(one.block(barred, now))
 
 
 def _any_requirement(chance: random.Random, now: float) -> Requirement:
@@ -368,7 +360,7 @@ def test_a_soft_bound_that_the_profile_is_known_to_fall_short_of_is_no_disturban
 
 def test_a_restart_begins_with_what_was_asked_and_the_profile_that_ran() -> None:
     one = loop()
-    one.remember([at_least(15)], "fast")  # fast serves as well as middle does
+    one.restore([at_least(15)], "fast", {}, 0.0)  # fast serves as well as middle does
     assert applies(one.start(0.0)) == ["fast"]
     one.applied("fast", 0.1)
     assert one.requirements.keys() == {"/client"}
@@ -376,14 +368,14 @@ def test_a_restart_begins_with_what_was_asked_and_the_profile_that_ran() -> None
     assert applies(one.release("/client", 6.0)) == ["slow"]
 
     worse = loop()
-    worse.remember([at_least(15, hard=True)], "slow")
+    worse.restore([at_least(15, hard=True)], "slow", {}, 0.0)
     assert applies(worse.start(0.0)) == ["middle"]
     pinned = loop()
-    pinned.remember([], "fast")
+    pinned.restore([], "fast", {}, 0.0)
     assert applies(pinned.pin("middle", 0.0)) == ["middle"]
     barred = loop()
-    barred.remember([], "fast")
-    assert applies(barred.bar({"fast": "no power"}, 0.0)) == ["slow"]
+    barred.restore([], "fast", {}, 0.0)
+    assert applies(barred.block({"fast": "no power"}, 0.0)) == ["slow"]
 
 
 def test_who_says_the_same_again_and_again_hides_no_disturbance() -> None:
@@ -398,10 +390,10 @@ def test_who_says_the_same_again_and_again_hides_no_disturbance() -> None:
 
 def test_who_says_the_same_again_does_not_skip_the_dwell() -> None:
     one = running(20.0)
-    one.bar({"middle": "no current"}, 1.5)
+    one.block({"middle": "no current"}, 1.5)
     finish(one, 1.5)
     assert one.profile == "fast"
-    one.bar({}, 1.6)
+    one.block({}, 1.6)
     assert one.require(at_least(20.0, hard=True), 1.7) == []
     assert one.profile == "fast"
 
@@ -486,7 +478,7 @@ def test_what_was_left_out_before_a_restart_is_left_out_for_the_rest_of_it() -> 
     cooling = one.cooling(4.0)
     assert {name: (cool.until, cool.cool_down) for name, cool in cooling.items()} == {"fast": (13.0, 10.0)}
     again = loop()
-    again.remember([at_least(30)], "middle", cooling, 4.0)
+    again.restore([at_least(30)], "middle", cooling, 4.0)
     assert applies(again.start(4.0)) == ["middle"]
     finish(again, 4.0)
     assert again.explain(5.0)[0].excluded == "no bus"
@@ -499,14 +491,14 @@ def test_what_was_left_out_before_a_restart_is_left_out_for_the_rest_of_it() -> 
 
 def test_a_cool_down_of_a_file_is_no_longer_than_any_may_be() -> None:
     one = loop()
-    one.remember([at_least(30)], "", {"fast": CoolDown(1e9, 1e9, "odd")}, 1.0)
+    one.restore([at_least(30)], "", {"fast": CoolDown(1e9, 1e9, "odd")}, 1.0)
     assert one.cooling(1.0)["fast"].until == 161.0
 
 
 def test_a_profile_chosen_before_a_restart_waits_for_its_cool_down_and_one_chosen_now_does_not() -> None:
     cooling = {"fast": CoolDown(13.0, 10.0, "no bus")}
     before, now = loop(), loop()
-    before.remember([], "", cooling, 4.0)
-    assert applies(before.pin("fast", 4.0, anew=False)) == ["slow"]
-    now.remember([], "", cooling, 4.0)
+    before.restore([], "", cooling, 4.0)
+    assert applies(before.pin("fast", 4.0, restored=True)) == ["slow"]
+    now.restore([], "", cooling, 4.0)
     assert applies(now.pin("fast", 4.0)) == ["fast"]

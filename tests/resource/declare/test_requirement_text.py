@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource.declare.attributes import LATENCY, RATE, Attribute, Direction, Scale
-from rmpa.resource.declare.requirement_text import parse_bound, parse_requirement, parse_wish
+from rmpa.resource.declare.qos_request import QoSRequest, at_least, at_most, between, exactly
+from rmpa.resource.declare.requirement_text import parse_bound, parse_request, parse_requirement
 from rmpa.resource.declare.requirements import Bound, Requirement
-from rmpa.resource.declare.resource import QoSRequest, at_least, at_most, between, exactly
 
 ATTRIBUTES = {
     "rate": RATE,
@@ -35,7 +35,7 @@ ATTRIBUTES = {
     ],
 )
 def test_what_people_write_is_read(text: str, wish: QoSRequest) -> None:
-    assert parse_wish(text, "x") == wish
+    assert parse_request(text, "x") == wish
 
 
 def test_an_interval_has_one_unit() -> None:
@@ -88,7 +88,7 @@ _wishes = st.one_of(
 
 @given(_wishes)
 def test_what_a_wish_shows_is_read_as_the_same(wish: QoSRequest) -> None:
-    assert parse_wish(str(wish), "x") == wish
+    assert parse_request(str(wish), "x") == wish
 
 
 @given(st.text(max_size=80))

@@ -8,8 +8,9 @@ import msgspec
 import pytest
 
 from rmpa.core.errors import PeerRefused, UnreachableError
-from rmpa.resource.decide.adaptation import AdaptationSettings
-from rmpa.resource.declare.resource import Resource, at_least, at_most
+from rmpa.resource.declare.adaptation_settings import AdaptationSettings
+from rmpa.resource.declare.qos_request import at_least, at_most
+from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.adapter import Adapter
 from rmpa.resource.run.client import ResourceClient
 from rmpa.resource.run.runtime import Runtime
@@ -60,7 +61,6 @@ class Sonar:
         self.problems: list[object] = []
         self.tasks = Tasks(self.runtime, on_problem=self.problems.append, on_deactivate=self.problems.append)
         self.adapter = Adapter(self.runtime, self.tasks, window=0.2, settings=QUICK)
-        self.runtime.parts += [self.tasks, self.adapter]
 
     def _applier(self, name: str) -> Callable[[], None]:
         def apply() -> None:
@@ -78,7 +78,7 @@ class Sonar:
 @pytest.fixture
 async def sonar(core: RosCore) -> AsyncIterator[Sonar]:
     one = Sonar(core)
-    await one.runtime.start()
+    await one.runtime.start([one.tasks, one.adapter])
     one.tasks.activate()
     yield one
     for problem in one.broken.values():
@@ -241,9 +241,9 @@ async def test_a_profile_chosen_by_hand_and_a_context(sonar: Sonar) -> None:
     await until("fine")
     sonar.adapter.pin("")
     await until("coarse")
-    sonar.adapter.shift("lab", {}, {"coarse": "not in the lab"})
+    sonar.adapter.enter_context("lab", {}, {"coarse": "not in the lab"})
     await until("fine")
-    sonar.adapter.shift("", {}, {})
+    sonar.adapter.enter_context("", {}, {})
     await until("coarse")
 
 

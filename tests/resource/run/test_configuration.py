@@ -11,9 +11,10 @@ import pytest
 
 from rmpa.core.errors import ConfigError, PeerRefused
 from rmpa.resource import limits
-from rmpa.resource.declare.resource import Resource, at_least
+from rmpa.resource.declare.qos_request import at_least
+from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.dynamic_reconfigure import CONFIG_TYPE, DESCRIPTION_TYPE, SERVICE_TYPE, read_config
-from rmpa.resource.run.member import Member
+from rmpa.resource.run.resource_node import ResourceNode
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
@@ -77,7 +78,7 @@ class Lamp:
             said.publish(data=" ".join(w or "-" for w in words))
             other.publish(data="here")
 
-        self.member = Member(one, core.uri, window=0.2)
+        self.member = ResourceNode(one, core.uri, window=0.2)
 
     def _apply(self, name: str) -> Callable[[], None]:
         def apply() -> None:
@@ -290,8 +291,8 @@ async def test_a_rule_over_its_own_topics(core: RosCore, node: Node) -> None:
     one.profile(offers={}, name="plain")(lambda: None)
     one.task(on=orders, name="repeat")(lambda message: said.publish(data=message.data))
     one.context("told", when="/orders == 'go' and /gauge/said.data == 'go'")
-    member = Member(one, core.uri)
-    member.contexts.chosen = "gone"  # of an earlier version of the file
+    member = ResourceNode(one, core.uri)
+    member.contexts.preset("gone")  # of an earlier version of the file
     await member.start()
     assert member.contexts.chosen == member.contexts.current == ""
     sender = await node.advertise("/orders", TEXT)

@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.resource import limits
-from rmpa.resource.declare.resource import Resource, at_least, at_most
+from rmpa.resource.declare.qos_request import at_least, at_most
+from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.client import ResourceClient
-from rmpa.resource.run.member import Member
+from rmpa.resource.run.resource_node import ResourceNode
+from rmpa.resource.run.runtime import RuntimePart
 from rmpa.resource.run.store import ResourceStore
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
@@ -39,8 +41,8 @@ def sonar(**more: Any) -> Resource:
     return one
 
 
-async def started(core: RosCore, path: Path, resource: Resource | None = None) -> Member:
-    member = Member(resource or sonar(), core.uri, store=ResourceStore(path))
+async def started(core: RosCore, path: Path, resource: Resource | None = None) -> ResourceNode:
+    member = ResourceNode(resource or sonar(), core.uri, store=ResourceStore(path))
     await member.start()
     return member
 
@@ -108,12 +110,14 @@ async def test_a_latched_request_that_has_expired_does_not_come_again(core: RosC
         assert "/client" in member.adapter.loop.requirements
         await until(lambda: not member.adapter.loop.requirements)
         seen: list[object] = []
-        member.adapter.on_asked.append(lambda: seen.append(dict(member.adapter.loop.requirements)))
-        assert client._asking is not None
+        watcher = RuntimePart()
+        watcher.requirements_changed = lambda: seen.append(dict(member.adapter.loop.requirements))  # type: ignore[method-assign]
+        member.runtime.parts.append(watcher)
+        assert client._requirements is not None
         again: Any = {"header": {"stamp": float(next(iter(member.adapter.clients.expiries))[1])}}
         pairs: Any = [{"key": "noise", "value": "<= 5 cm"}, {"key": "expires", "value": "300 ms"}]
-        message = client._asking.make({**again, "status": [{"name": "x", "values": pairs}]})
-        client._asking.publish(message)
+        message = client._requirements.make({**again, "status": [{"name": "x", "values": pairs}]})
+        client._requirements.publish(message)
         await asyncio.sleep(0.5)
         assert not any(seen)
     await member.close()
@@ -136,11 +140,11 @@ async def test_a_profile_that_failed_is_not_tried_at_once_because_of_a_restart(c
     path = tmp_path / "sonar.sqlite"
     first = await started(core, path, broken())
     await until(lambda: first.adapter.loop.profile == "coarse")
-    (before,) = first.adapter.cooling(time.time_ns()).values()
+    (before,) = first.adapter.saved_cool_downs(time.time_ns()).values()
     await first.close()
     again = await started(core, path, broken())
     await until(lambda: again.adapter.loop.profile == "coarse")
-    (after,) = again.adapter.cooling(time.time_ns()).values()
+    (after,) = again.adapter.saved_cool_downs(time.time_ns()).values()
     assert after.until_ns == pytest.approx(before.until_ns, abs=2e9)
     assert (after.cool_down, after.why) == (60.0, "OSError: no bus")
     assert tried == ["fine"]

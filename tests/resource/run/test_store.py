@@ -8,7 +8,8 @@ import pytest
 
 from rmpa.resource import limits
 from rmpa.resource.run import store as store_module
-from rmpa.resource.run.store import ResourceStore, module_dir, state_dir
+from rmpa.resource.run.store import ResourceStore
+from rmpa.runtime.state_dir import module_dir, state_dir
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,10 +10,13 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.resource.declare.resource import Resource
-from rmpa.resource.run.tasks import TaskProblem, Tasks
+from rmpa.resource.run.tasks import Tasks
+from rmpa.ros.types.diagnostic_array import DiagnosticLevel
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
+
+    from rmpa.resource.run.task_runners import TaskProblem
 
 
 class Bench:
@@ -174,12 +177,12 @@ async def test_a_task_that_is_stuck_is_reported_and_replaced(bench: Bench, kind:
     bench.tasks.activate()
     assert "a run has not ended for" in (await bench.problem("stuck")).text
     assert list(bench.tasks.running.values()) == ["stuck"], "until a run has come back"
-    (trouble,) = bench.tasks.troubles
+    (trouble,) = bench.tasks.problems
     assert "stuck: a run has not ended for" in trouble
     await count.wait()
     free.set()
     async with asyncio.timeout(30):
-        while bench.tasks.troubles:
+        while bench.tasks.problems:
             await asyncio.sleep(0.01)
 
 
@@ -218,21 +221,21 @@ async def test_a_task_that_overruns_its_period_is_reported_once_and_goes_on(benc
     bench.resource.task(rate=100, name="t")(plain if kind == "thread" else coroutine)
     bench.tasks.activate()
     await count.wait()
-    bench.tasks.judge()
+    bench.tasks.window_ended(DiagnosticLevel.OK, "", {})
     assert bench.problems == [], "one window may be the machine's business"
     for _ in range(2):
         count = Counter(4)
         await count.wait()
-        bench.tasks.judge()
+        bench.tasks.window_ended(DiagnosticLevel.OK, "", {})
     assert [problem.kind for problem in bench.problems] == ["too slow"]
-    (trouble,) = bench.tasks.troubles
+    (trouble,) = bench.tasks.problems
     assert "task t too slow:" in trouble
     assert "runs took longer than its period of 0.01 s" in trouble
     slow.clear()
     async with asyncio.timeout(60):
-        while bench.tasks.troubles:
+        while bench.tasks.problems:
             await asyncio.sleep(0.1)
-            bench.tasks.judge()
+            bench.tasks.window_ended(DiagnosticLevel.OK, "", {})
 
 
 async def test_the_same_failure_has_one_traceback(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
