@@ -15,6 +15,10 @@ _HERE: Final = "rmpa.cli.resource_commands"
     cls=LazyGroup,
     commands_at={
         "list": ("rmpa.cli.resource_list", "List resources; those of peers with the peers' names."),
+        "history": (
+            "rmpa.cli.resource_history",
+            "Show which profile ran when and why, violations, and the measured quality.",
+        ),
         "info": (_HERE, "Show all of a resource: topics, parameters, qualities, profiles, contexts, clients."),
     },
     epilog="""\
