@@ -123,7 +123,7 @@ def test_an_alarm_is_over_when_the_windows_are_good_again() -> None:
     assert one.alarm is None
 
 
-def test_without_another_that_can_serve_the_alarm_is_non_adaptable_and_best_effort_runs() -> None:
+def test_best_effort_runs_if_no_profile_can_serve() -> None:
     one = running(30, FAST, SLOW, LIMP)
     one.window({"rate": 20.0}, 2.0)
     actions = one.window({"rate": 20.0}, 3.0)
@@ -145,7 +145,7 @@ def test_without_a_declared_best_effort_the_profile_stays() -> None:
     assert [type(a) for a in one.window({"rate": 39.0}, 6.0)] == [Clear]
 
 
-def test_what_no_profile_is_declared_to_meet_is_a_non_adaptable_event_at_once() -> None:
+def test_infeasible_request_is_non_adaptable_at_once() -> None:
     one = loop()
     one.start(0.0)
     finish(one, 0.0)
@@ -157,7 +157,7 @@ def test_what_no_profile_is_declared_to_meet_is_a_non_adaptable_event_at_once() 
     assert [type(a) for a in one.require(at_least(10, hard=True), 2.0)] == [Clear, Apply]
 
 
-def test_a_profile_that_fails_is_left_out_for_its_cool_down_and_the_next_best_taken() -> None:
+def test_failed_profile_is_excluded_for_its_cool_down() -> None:
     one = loop()
     one.start(0.0)
     finish(one, 0.0)
@@ -179,14 +179,14 @@ def test_a_profile_that_hangs_is_failed() -> None:
     assert one.applying == "middle"
 
 
-def test_a_failure_applies_the_profile_that_ran_before_again() -> None:
+def test_failure_reapplies_the_previous_profile() -> None:
     one = running(1)
     assert applies(one.pin("fast", 2.0)) == ["fast"]
     one.pin("", 2.5)
     assert applies(one.failed("fast", "broken", 3.0)) == ["slow"]
 
 
-def test_when_every_profile_fails_the_first_cool_down_that_ends_tries_again() -> None:
+def test_first_ended_cool_down_retries() -> None:
     one = loop(FAST, SLOW)
     one.start(0.0)
     assert applies(one.failed("slow", "broken", 1.0)) == ["fast"]
@@ -195,7 +195,7 @@ def test_when_every_profile_fails_the_first_cool_down_that_ends_tries_again() ->
     assert applies(one.handle_timer(one.next_timer() or 0.0)) == ["slow"]
 
 
-def test_a_profile_that_disappoints_again_and_again_is_left_out_for_longer() -> None:
+def test_cool_down_grows_with_each_violation() -> None:
     one = loop(FAST, SLOW)
     outs = []
     one.start(0.0)
@@ -255,7 +255,7 @@ def test_a_choice_by_hand_holds_whatever_is_asked() -> None:
         one.pin("slwo", 8.0)
 
 
-def test_a_choice_by_hand_that_fails_is_tried_again_behind_its_cool_down() -> None:
+def test_failed_choice_is_retried_after_its_cool_down() -> None:
     one = running(1)
     assert applies(one.pin("fast", 2.0)) == ["fast"]
     assert applies(one.failed("fast", "broken", 2.0)) == ["slow"]  # not the broken one over and over
@@ -286,7 +286,7 @@ def test_what_is_asked_while_a_profile_is_applied_counts_when_it_runs() -> None:
 
 
 @pytest.mark.parametrize("seed", range(200))
-def test_whatever_happens_one_profile_is_applied_at_a_time_and_none_that_is_left_out(seed: int) -> None:  # noqa: C901
+def test_one_allowed_profile_is_applied_at_a_time(seed: int) -> None:  # noqa: C901
     chance = random.Random(seed)
     one = loop(FAST, MIDDLE, SLOW, LIMP)
     now, outstanding = 0.0, ""
@@ -349,7 +349,7 @@ def test_a_reaction_counts_from_the_beginning_of_the_first_bad_window() -> None:
     assert one.applied("fast", 4.5)[0] == Reacted("fast", 2.5)
 
 
-def test_a_soft_bound_that_the_profile_is_known_to_fall_short_of_is_no_disturbance() -> None:
+def test_declared_soft_shortfall_is_no_disturbance() -> None:
     only = Profile("only", {"rate": 10.0, "latency": 0.1}, cost=1)
     one = running(20, only, hard=False)
     for second in range(2, 8):
@@ -358,7 +358,7 @@ def test_a_soft_bound_that_the_profile_is_known_to_fall_short_of_is_no_disturban
     assert [kind for kind, _, _ in alarms(one.window({"rate": 2.0}, 9.0))] == [AlarmKind.NON_ADAPTABLE]
 
 
-def test_a_restart_begins_with_what_was_asked_and_the_profile_that_ran() -> None:
+def test_restart_continues_with_profile_and_requirements() -> None:
     one = loop()
     one.restore([at_least(15)], "fast", {}, 0.0)  # fast serves as well as middle does
     assert applies(one.start(0.0)) == ["fast"]
@@ -398,7 +398,7 @@ def test_who_says_the_same_again_does_not_skip_the_dwell() -> None:
     assert one.profile == "fast"
 
 
-def test_what_the_profile_before_left_in_queues_is_not_held_against_the_next_one() -> None:
+def test_windows_within_the_settling_time_do_not_count() -> None:
     one = Adaptation(ATTRIBUTES, Decider("camera", ATTRIBUTES, (FAST, MIDDLE, LIMP)), replace(SETTINGS, settle=1.5))
     one.start(0.0)
     one.require(at_least(15, hard=True), 0.0)
@@ -439,7 +439,7 @@ def test_a_profile_whose_function_still_hangs_is_not_taken_again() -> None:
     assert applies(one.ended_late("fast", 101.0, touched=False)) == ["fast"]
 
 
-def test_what_runs_is_applied_once_more_when_a_hung_function_has_ended() -> None:
+def test_late_end_reapplies_the_running_profile() -> None:
     one = hung(5.0)
     finish(one, 5.1)
     assert applies(one.ended_late("fast", 7.0, touched=True)) == ["middle"]
@@ -447,7 +447,7 @@ def test_what_runs_is_applied_once_more_when_a_hung_function_has_ended() -> None
     assert not one.applying
 
 
-def test_a_hung_function_that_ends_amid_the_next_one_has_that_applied_twice() -> None:
+def test_late_end_during_the_next_applies_it_twice() -> None:
     one = hung(5.0)
     assert one.ended_late("fast", 5.5, touched=True) == []
     assert applies(one.applied("middle", 6.0)) == ["middle"]
@@ -455,7 +455,7 @@ def test_a_hung_function_that_ends_amid_the_next_one_has_that_applied_twice() ->
     assert not one.applying
 
 
-def test_a_hung_function_that_ends_amid_another_question_has_nothing_applied_for_nothing() -> None:
+def test_late_end_during_a_new_request_applies_only_that() -> None:
     one = hung(5.0)
     one.ended_late("fast", 5.5, touched=True)
     one.require(at_least(1), 5.6)
@@ -463,13 +463,13 @@ def test_a_hung_function_that_ends_amid_another_question_has_nothing_applied_for
     assert not applies(one.applied("slow", 6.5))
 
 
-def test_a_hung_function_that_ended_before_the_next_one_began_changes_nothing() -> None:
+def test_late_end_before_the_next_begins_changes_nothing() -> None:
     one = hung(5.0)
     assert one.ended_late("fast", 5.1, touched=False) == []
     assert finish(one, 5.2) == [Reacted("middle", 5.2)]
 
 
-def test_what_was_left_out_before_a_restart_is_left_out_for_the_rest_of_it() -> None:
+def test_restored_cool_down_runs_to_its_end() -> None:
     one = loop()
     one.start(0.0)
     finish(one, 0.0)
@@ -495,7 +495,7 @@ def test_a_cool_down_of_a_file_is_no_longer_than_any_may_be() -> None:
     assert one.cooling(1.0)["fast"].until == 161.0
 
 
-def test_a_profile_chosen_before_a_restart_waits_for_its_cool_down_and_one_chosen_now_does_not() -> None:
+def test_only_a_new_choice_ends_a_cool_down() -> None:
     cooling = {"fast": CoolDown(13.0, 10.0, "no bus")}
     before, now = loop(), loop()
     before.restore([], "", cooling, 4.0)

@@ -15,7 +15,7 @@ def clients() -> Clients:
     return Clients("camera", {"rate": RATE, "latency": LATENCY})
 
 
-def test_what_cannot_be_is_remembered_until_something_better_is_said() -> None:
+def test_refusal_lasts_until_a_valid_request() -> None:
     one = clients()
     one.received("/a", "m" * 9999, "")
     assert len(one.mark("/a")) == limits.REQUIREMENT_TEXT_MAX
@@ -30,7 +30,7 @@ def test_what_cannot_be_is_remembered_until_something_better_is_said() -> None:
     assert (one.refusal("/b"), one.mark("/b")) == ("", "")
 
 
-def test_a_latched_request_that_comes_again_does_not_begin_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_repeated_latched_request_keeps_its_expiry(monkeypatch: pytest.MonkeyPatch) -> None:
     one = clients()
     for now, expires in ((1.0, 31.0), (20.0, 31.0), (31.0, None)):
         one.received("/a", "m", "5.000000000")
@@ -51,7 +51,7 @@ def test_a_latched_request_that_comes_again_does_not_begin_anew(monkeypatch: pyt
     assert list(one.expiries) == [("/a", "3.5"), ("/a", "4.5")]
 
 
-def test_one_that_is_away_for_two_looks_is_gone_and_nothing_of_it_stays() -> None:
+def test_absent_client_is_removed() -> None:
     one = clients()
     one.received("/a", "m", "")
     one.received("/b", "n", "")

@@ -69,7 +69,7 @@ def test_without_a_range_a_shortfall_is_all_or_nothing() -> None:
     assert one.distance("slow", {"rate": bound(RATE, at_least=9)}) == 0.0
 
 
-def test_where_no_profile_meets_the_hard_requirements_the_best_effort_one_serves() -> None:
+def test_best_effort_serves_if_none_is_feasible() -> None:
     bounds = {"rate": bound(RATE, at_least=100, hard=True)}
     declared = Profile("limp", {"rate": 1.0}, best_effort=True)
     decision = decider(FAST, SHARP, declared).decide(bounds)
@@ -138,7 +138,7 @@ def test_every_term_is_explained() -> None:
         ),
     ],
 )
-def test_a_declaration_that_cannot_be_is_refused(profiles: list[Profile], said: str) -> None:
+def test_invalid_profiles_are_refused(profiles: list[Profile], said: str) -> None:
     with pytest.raises(ConfigError) as caught:
         Decider("camera", ATTRIBUTES, profiles)
     assert said in str(caught.value)
@@ -168,13 +168,13 @@ def plane(profiles: list[Profile]) -> Decider:
 
 
 @given(_profiles, _asked)
-def test_better_than_asked_is_never_penalised(profiles: list[Profile], asked: dict[str, Bound]) -> None:
+def test_better_values_have_no_shortfall(profiles: list[Profile], asked: dict[str, Bound]) -> None:
     enough = {name: Bound(0.0, weight=b.weight, hard=b.hard) for name, b in asked.items()}
     assert all(score.distance == 0.0 and score.feasible for score in plane(profiles).explain(enough))
 
 
 @given(_profiles, _asked)
-def test_the_one_taken_is_feasible_whenever_one_is(profiles: list[Profile], asked: dict[str, Bound]) -> None:
+def test_decision_is_feasible_if_any_profile_is(profiles: list[Profile], asked: dict[str, Bound]) -> None:
     decider = plane(profiles)
     scores = decider.explain(asked)
     decision = decider.decide(asked)

@@ -28,7 +28,7 @@ def asked(rate: float = 20.0, client: str = "/a", priority: int = 0) -> Requirem
     return Requirement(client, bounds, priority=priority)
 
 
-def test_an_alarm_in_words_and_figures() -> None:
+def test_alarm_text_and_values() -> None:
     alarm = Alarm(AlarmKind.ADAPTATION, (Shortfall("rate", WANTED, 3.5),), "fast", "slow", 0.0)
     assert describe_alarm(alarm) == "adaptation: rate fell short under fast; slow takes over"
     assert alarm_values(alarm, ATTRIBUTES, cleared=False, reaction=2.0) == {
@@ -40,7 +40,7 @@ def test_an_alarm_in_words_and_figures() -> None:
     assert alarm_values(none, ATTRIBUTES, cleared=False, reaction=None)["rate"].endswith("given nothing")
 
 
-def test_how_a_resource_is_the_worst_first() -> None:
+def test_health_reports_the_worst() -> None:
     assert health(loop(), [], []) == (DiagnosticLevel.OK, "profile fast")
     assert health(loop(), [], ["task a stuck"]) == (DiagnosticLevel.WARN, "task a stuck")
     assert health(loop(), ["nobody publishes /b"], ["c"]) == (DiagnosticLevel.STALE, "nobody publishes /b; c")
@@ -51,7 +51,7 @@ def test_how_a_resource_is_the_worst_first() -> None:
     )  # fmt: skip
 
 
-def test_what_a_client_is_told() -> None:
+def test_answer_to_a_client() -> None:
     level, message, values = answer_to(asked(), loop(), ATTRIBUTES, {"rate": 30.0})
     assert (level, message) == (DiagnosticLevel.OK, "profile fast")
     assert values == {
@@ -70,7 +70,7 @@ def test_what_a_client_is_told() -> None:
     assert "/b" in message
 
 
-def test_a_decision_tells_each_term() -> None:
+def test_decision_report_has_each_term() -> None:
     one = loop()
     found = decision_report(one, one.explain(0.0), 0.25)
     assert (found["profile"], found["applying"], found["reaction"], found["clients"]) == ("fast", "", 0.25, ["/a"])

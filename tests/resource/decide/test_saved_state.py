@@ -58,7 +58,7 @@ def test_what_was_kept_comes_back() -> None:
     assert requirement.bounds["noise"].hard
 
 
-def test_what_has_expired_meanwhile_is_forgotten() -> None:
+def test_expired_requirement_is_not_restored() -> None:
     found = read_saved_state({("requirement", "/driver"): asked(expires_ns=NOW - 1).serialize()}, sonar(), NOW)
     assert (found.requirements, found.lost) == ((), ())
 
@@ -80,7 +80,7 @@ def test_what_has_expired_meanwhile_is_forgotten() -> None:
         (("requirement", "/a"), "[" * 100_000, "requirement /a"),
     ],
 )
-def test_what_no_longer_fits_is_left_out_and_said(key: tuple[str, str], text: str, said: str) -> None:
+def test_invalid_rows_are_left_out_and_reported(key: tuple[str, str], text: str, said: str) -> None:
     found = read_saved_state({key: text, ("parameter", "count"): "7"}, sonar(), NOW)
     assert found.parameters == {"count": 7}
     (lost,) = found.lost
@@ -108,7 +108,7 @@ def test_an_expiry_is_the_wall_clocks() -> None:
     [(12, 12), (20, 20), (500, 20), (10**9, 20), (0, None), (-1, None), (-(10**9), None)],
     ids=["running", "just begun", "set back", "set back by decades", "over", "long over", "set forward by decades"],
 )
-def test_a_cool_down_is_the_wall_clocks_and_never_longer_than_it_was(ahead: int, left: int | None) -> None:
+def test_restored_cool_down_is_never_longer(ahead: int, left: int | None) -> None:
     row = SavedCoolDown(until_ns=NOW + ahead * SECOND, cool_down=20.0, why="no bus").serialize()
     found = read_saved_state({(COOL_DOWN, "fine"): row}, sonar(), NOW)
     one = found.cool_downs["fine"].left(100.0, NOW)

@@ -99,7 +99,7 @@ _requirements = st.lists(
 
 
 @given(_requirements)
-def test_what_is_merged_satisfies_all_but_those_that_were_told(requirements: list[Requirement]) -> None:
+def test_merge_satisfies_all_but_reported_conflicts(requirements: list[Requirement]) -> None:
     merged = merge(requirements)
     told = {(conflict.client, conflict.attribute) for conflict in merged.conflicts}
     for requirement in requirements:
@@ -111,7 +111,7 @@ def test_what_is_merged_satisfies_all_but_those_that_were_told(requirements: lis
 
 
 @given(_requirements)
-def test_the_most_important_client_never_gives_way(requirements: list[Requirement]) -> None:
+def test_highest_priority_never_conflicts(requirements: list[Requirement]) -> None:
     merged = merge(requirements)
     if requirements:
         highest = max(requirements, key=lambda requirement: requirement.priority)

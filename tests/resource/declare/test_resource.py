@@ -160,7 +160,7 @@ MISTAKES: list[tuple[Callable[[Resource], object], str]] = [
 
 
 @pytest.mark.parametrize(("mistake", "said"), MISTAKES, ids=[said[:40] for _, said in MISTAKES])
-def test_a_mistake_is_said_where_it_is_made(mistake: Callable[[Resource], object], said: str) -> None:
+def test_invalid_declaration_is_refused(mistake: Callable[[Resource], object], said: str) -> None:
     one = sonar()
     before = describe(one, "/sonar")
     with pytest.raises(ConfigError) as caught:

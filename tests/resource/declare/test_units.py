@@ -21,7 +21,7 @@ from rmpa.resource.declare.units import convert, quantity
         ("7 widgets", "widgets", 7.0),
     ],
 )
-def test_a_quantity_is_read_in_the_unit_of_its_attribute(text: str | float, to: str, value: float) -> None:
+def test_quantity_is_converted_to_the_unit(text: str | float, to: str, value: float) -> None:
     assert quantity(text, to, "rate") == pytest.approx(value)
 
 
@@ -39,7 +39,7 @@ def test_a_quantity_is_read_in_the_unit_of_its_attribute(text: str | float, to: 
         ("", "Hz", "'' is not a number"),
     ],
 )
-def test_what_is_no_quantity_is_refused_with_its_reason(text: str | float, to: str, said: str) -> None:
+def test_invalid_quantity_is_refused(text: str | float, to: str, said: str) -> None:
     with pytest.raises(ConfigError) as caught:
         quantity(text, to, "latency")
     assert said in str(caught.value)

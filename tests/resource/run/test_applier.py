@@ -107,7 +107,7 @@ async def client(core: RosCore) -> AsyncIterator[Node]:
         yield node
 
 
-async def test_what_a_hung_profile_does_late_has_no_effect_and_is_said(
+async def test_late_actions_of_a_hung_profile_have_no_effect(
     sonar: Sonar, client: Node, caplog: pytest.LogCaptureFixture
 ) -> None:
     adapter = sonar.member.adapter
@@ -151,7 +151,7 @@ async def test_what_a_hung_profile_does_late_has_no_effect_and_is_said(
     assert "hangs" not in adapter.health()[1]
 
 
-async def test_a_coroutine_that_is_given_up_is_cancelled_and_nothing_is_applied_twice(sonar: Sonar) -> None:
+async def test_hung_coroutine_is_cancelled(sonar: Sonar) -> None:
     adapter = sonar.member.adapter
     adapter.pin("asynchronous")
     await sonar.until(lambda: sonar.refused)
@@ -161,7 +161,7 @@ async def test_a_coroutine_that_is_given_up_is_cancelled_and_nothing_is_applied_
     assert not adapter._applier.hanging
 
 
-async def test_a_message_that_was_on_its_way_is_dropped(sonar: Sonar) -> None:
+async def test_queued_message_of_a_hung_profile_is_dropped(sonar: Sonar) -> None:
     """It was handed to the loop before the function was given up, and arrives behind that."""
     said: list[str] = []
     sent = Sent()
@@ -174,7 +174,7 @@ async def test_a_message_that_was_on_its_way_is_dropped(sonar: Sonar) -> None:
     assert (sent.count, said) == (1, ["publish on mode"])
 
 
-async def test_a_context_that_is_given_up_has_no_effect_either(
+async def test_late_actions_of_a_hung_context_have_no_effect(
     core: RosCore, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(limits, "CONTEXT_ENTER_TIMEOUT", 0.1)

@@ -44,7 +44,7 @@ def eye() -> Resource:
     return one
 
 
-async def test_a_controller_asks_as_much_as_its_profile_needs(core: RosCore) -> None:
+async def test_profiles_change_the_requests_to_others(core: RosCore) -> None:
     hand = Resource("hand", role="controlling", physical=False)
     hand.attribute("slip", better="min", unit="m")
     needs = hand.asks("eye", blur=at_most("4 px", hard=True), priority=2)
@@ -82,7 +82,7 @@ async def test_a_controller_asks_as_much_as_its_profile_needs(core: RosCore) -> 
     await other.close()
 
 
-def test_what_cannot_be_asked_is_said_where_it_is_written() -> None:
+def test_invalid_demand_is_refused() -> None:
     one = eye()
     one.asks("hand", rate=at_least("5 Hz"))
     for name, said in (

@@ -46,7 +46,7 @@ async def until(fits: Any) -> None:
             await asyncio.sleep(0.02)
 
 
-async def test_a_resource_tells_what_arrives_of_what_it_asks_for(core: RosCore, camera: ResourceNode) -> None:
+async def test_observed_quality_of_inputs_is_reported(core: RosCore, camera: ResourceNode) -> None:
     one = Resource("viewer", role="controlling")
     one.input("/camera/frames", "std_msgs/String")
     one.input("/elsewhere", "std_msgs/String", required=False)
@@ -62,7 +62,7 @@ async def test_a_resource_tells_what_arrives_of_what_it_asks_for(core: RosCore, 
     await viewer.close()
 
 
-async def test_what_a_client_observes_is_what_is_adapted_to(core: RosCore, camera: ResourceNode) -> None:
+async def test_adaptation_follows_the_clients_observation(core: RosCore, camera: ResourceNode) -> None:
     assert camera.adapter.loop.profile in ("", "small")
     async with Node("pilot", master_uri=core.uri) as node, ResourceClient(node, "camera") as client:
         await client.require(rate=at_least("20 Hz", hard=True))

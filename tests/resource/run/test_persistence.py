@@ -53,7 +53,7 @@ async def until(fits: Any) -> None:
             await asyncio.sleep(0.01)
 
 
-async def test_the_configuration_and_what_was_chosen_are_back(core: RosCore, tmp_path: Path) -> None:
+async def test_configuration_survives_a_restart(core: RosCore, tmp_path: Path) -> None:
     path = tmp_path / "sonar.sqlite"
     first = await started(core, path)
     await first.configuration.set({"gain": 2.5, "profile": "fine", "context": "docked"})
@@ -79,9 +79,7 @@ async def test_the_configuration_and_what_was_chosen_are_back(core: RosCore, tmp
     await fourth.close()
 
 
-async def test_what_clients_asked_is_back_for_those_that_come_back(
-    core: RosCore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_requirements_survive_a_restart(core: RosCore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "sonar.sqlite"
     first = await started(core, path)
     async with Node("stays", master_uri=core.uri) as stays, ResourceClient(stays, "sonar") as one:
@@ -103,7 +101,7 @@ async def test_what_clients_asked_is_back_for_those_that_come_back(
         await again.close()
 
 
-async def test_a_latched_request_that_has_expired_does_not_come_again(core: RosCore, tmp_path: Path) -> None:
+async def test_expired_latched_request_stays_expired(core: RosCore, tmp_path: Path) -> None:
     member = await started(core, tmp_path / "sonar.sqlite")
     async with Node("client", master_uri=core.uri) as node, ResourceClient(node, "sonar") as client:
         await client.require(noise=at_most("5 cm"), expires="300 ms")
@@ -123,7 +121,7 @@ async def test_a_latched_request_that_has_expired_does_not_come_again(core: RosC
     await member.close()
 
 
-async def test_a_profile_that_failed_is_not_tried_at_once_because_of_a_restart(core: RosCore, tmp_path: Path) -> None:
+async def test_cool_down_survives_a_restart(core: RosCore, tmp_path: Path) -> None:
     def broken() -> Resource:
         one = Resource("sonar", role="sensing")
         one.attribute("noise", better="min", unit="m")
@@ -155,7 +153,7 @@ async def test_a_profile_that_failed_is_not_tried_at_once_because_of_a_restart(c
     await again.close()
 
 
-async def test_a_store_that_cannot_be_is_said_and_the_resource_runs(core: RosCore, tmp_path: Path) -> None:
+async def test_resource_runs_without_a_usable_store(core: RosCore, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     member = await started(core, tmp_path / "file" / "sonar.sqlite")
     async with Node("watcher", master_uri=core.uri) as node:

@@ -73,7 +73,7 @@ async def test_one_that_blocks_holds_up_neither_the_start_nor_the_loop(
     await member.close()
 
 
-async def test_the_first_decision_knows_the_answers(core: RosCore) -> None:
+async def test_first_decision_waits_for_preconditions(core: RosCore) -> None:
     applied: list[str] = []
     watcher = RuntimePart()
     watcher.acted = lambda action: applied.append(getattr(action, "profile", ""))  # type: ignore[method-assign]
@@ -89,14 +89,14 @@ async def test_the_first_decision_knows_the_answers(core: RosCore) -> None:
     ("answer", "why"),
     [(True, None), (None, None), (False, "its precondition does not hold"), ("no lens", "no lens"), ("", None)],
 )
-async def test_what_an_answer_means(answer: str | bool | None, why: str | None) -> None:
+async def test_precondition_results(answer: str | bool | None, why: str | None) -> None:
     one = Preconditions(declared(lambda: answer).profiles, lambda: None)
     await one.start()
     assert one.blocked().get("fine") == why
     await one.close()
 
 
-async def test_one_that_raises_does_not_hold_and_another_answer_is_told() -> None:
+async def test_raising_precondition_does_not_hold() -> None:
     answers: list[Exception | bool] = [OSError("no bus"), True, True, False]
     changes: list[dict[str, str]] = []
 

@@ -48,7 +48,7 @@ async def until_seen(path: Path, wanted: dict[tuple[str, str], str]) -> None:
             await asyncio.sleep(0.02)
 
 
-async def test_resources_of_others_are_kept_when_all_are_gone(core: RosCore, tmp_path: Path) -> None:
+async def test_registry_keeps_resources_that_are_gone(core: RosCore, tmp_path: Path) -> None:
     stop, ready = asyncio.Event(), asyncio.Event()
     running = asyncio.create_task(run_all([declared("ear"), declared("eye")], core.uri, stop, ready.set, tmp_path))
     await asyncio.wait_for(ready.wait(), 30)
@@ -79,7 +79,7 @@ async def test_resources_of_others_are_kept_when_all_are_gone(core: RosCore, tmp
     await again.close()
 
 
-async def test_one_that_is_asked_for_something_is_kept_too(core: RosCore, tmp_path: Path) -> None:
+async def test_registry_shares_the_subscription_of_demands(core: RosCore, tmp_path: Path) -> None:
     """What it asks listens to that descriptor already, and a node listens to a topic once."""
     eye, keeper = ResourceNode(declared("eye"), core.uri), declared("keeper")
     await eye.start()
@@ -92,7 +92,7 @@ async def test_one_that_is_asked_for_something_is_kept_too(core: RosCore, tmp_pa
     await eye.close()
 
 
-async def test_a_disk_that_takes_nothing_is_said(core: RosCore, tmp_path: Path) -> None:
+async def test_unusable_registry_is_reported(core: RosCore, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     member = ResourceNode(declared("ear"), core.uri, registry=ResourceStore(tmp_path / "file" / FILE))
     await member.start()

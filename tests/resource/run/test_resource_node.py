@@ -93,7 +93,7 @@ async def test_a_resource_lives_and_says_what_it_lacks(core: RosCore) -> None:
     assert core.state().nodes.keys() <= {"/rosout"}
 
 
-async def test_a_second_one_of_its_name_is_refused_and_the_first_lives_on(core: RosCore) -> None:
+async def test_second_node_of_a_name_is_refused(core: RosCore) -> None:
     member = ResourceNode(echo(), core.uri)
     await member.start()
     with pytest.raises(PeerRefused, match="a node /echo runs there already"):
@@ -102,7 +102,7 @@ async def test_a_second_one_of_its_name_is_refused_and_the_first_lives_on(core: 
     await member.close()
 
 
-async def test_it_is_configured_with_its_parameters_before_a_profile_is_applied(core: RosCore) -> None:
+async def test_configure_runs_between_parameters_and_profile(core: RosCore) -> None:
     events: list[str] = []
     one = Resource("arm", role="acting")
     speed = one.parameter("speed", 1.0)
@@ -130,7 +130,7 @@ async def test_it_is_configured_with_its_parameters_before_a_profile_is_applied(
 
 
 @pytest.mark.parametrize("event", ["configure", "activate"])
-async def test_a_hook_that_raises_is_why_it_does_not_start(core: RosCore, event: str) -> None:
+async def test_failing_hook_prevents_the_start(core: RosCore, event: str) -> None:
     events: list[str] = []
     one = echo()
     one.on("finalize")(lambda: events.append("finalize"))
@@ -184,7 +184,7 @@ class Loud:
         await asyncio.sleep(0)
 
 
-async def test_nothing_leaves_unless_the_resource_is_active(core: RosCore, caplog: pytest.LogCaptureFixture) -> None:
+async def test_outputs_send_only_while_active(core: RosCore, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO", "rmpa")
     loud = Loud()
     words: list[str] = []

@@ -47,7 +47,7 @@ def test_two_of_one_name_of_two_modules_are_two() -> None:
     assert [each.descriptor.description for each in one.all] == ["theirs", "ours"]
 
 
-def test_the_time_is_written_seldom_and_at_once_when_one_goes_or_the_clock_is_set() -> None:
+def test_times_are_written_seldom() -> None:
     store: dict[tuple[str, str], str] = {}
     one, here = ResourceRegistry(), {("/sonar", PROXY)}
     one.record("/sonar", PROXY, text(), NOW)

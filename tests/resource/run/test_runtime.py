@@ -93,7 +93,7 @@ async def test_a_resource_is_an_ordinary_node_of_its_core(core: RosCore, one: Re
         one.outputs["words"].publish(data="too late")
 
 
-async def test_a_message_that_does_not_fit_is_refused_where_it_is_published(core: RosCore, one: Resource) -> None:
+async def test_publish_refuses_a_message_of_another_type(core: RosCore, one: Resource) -> None:
     runtime = Runtime(one, Node("speaker", master_uri=core.uri))
     await runtime.start()
     words = one.outputs["words"]
@@ -108,7 +108,7 @@ async def test_a_message_that_does_not_fit_is_refused_where_it_is_published(core
         await runtime.close()
 
 
-async def test_what_is_published_while_a_profile_is_applied_waits(core: RosCore, one: Resource) -> None:
+async def test_messages_are_held_while_a_profile_is_applied(core: RosCore, one: Resource) -> None:
     runtime = Runtime(one, Node("speaker", master_uri=core.uri))
     ear = Ear()
     await runtime.start([ear])
@@ -127,7 +127,7 @@ async def test_what_is_published_while_a_profile_is_applied_waits(core: RosCore,
         await runtime.close()
 
 
-async def test_what_waits_is_bounded_and_the_oldest_gives_way(
+async def test_held_messages_are_bounded_drop_oldest(
     core: RosCore, one: Resource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("rmpa.resource.limits.RESOURCE_HELD_MAX", 40)
