@@ -54,13 +54,13 @@ def rows(state: Path, *arguments: str) -> list[list[str]]:
 
 def test_events_tell_what_happened(state: Path) -> None:
     titles, *found = rows(state, "sonar")
-    assert titles == ["TIME", "EVENT", "LEVEL", "PROFILE", "MESSAGE"]
+    assert titles == ["TIME", "LEVEL", "EVENT", "PROFILE", "MESSAGE"]
     assert [row[2:5] for row in found] == [
-        ["apply", "OK", "quick"],
-        ["reacted", "OK", "quick"],
-        ["alarm", "WARN", "-"],
-        ["apply", "OK", "fine"],
-        ["over", "OK", "-"],
+        ["OK", "apply", "quick"],
+        ["OK", "reacted", "quick"],
+        ["WARN", "alarm", "-"],
+        ["OK", "apply", "fine"],
+        ["OK", "over", "-"],
     ]
 
 
@@ -78,20 +78,20 @@ def test_profiles_tell_when_and_why(state: Path) -> None:
 
 
 def test_violations_are_alarms_and_their_ends(state: Path) -> None:
-    assert [row[2] for row in rows(state, "sonar", "--violations")[1:]] == ["alarm", "over"]
+    assert [row[3] for row in rows(state, "sonar", "--violations")[1:]] == ["alarm", "over"]
 
 
 def test_windows_have_a_column_for_each_attribute(state: Path) -> None:
     titles, first, second = rows(state, "sonar", "--windows")
-    assert titles == ["TIME", "PROFILE", "LEVEL", "accuracy", "[m]", "rate", "[Hz]"]
-    assert (first[2:], second[2:]) == (["quick", "WARN", "0.2", "20"], ["fine", "OK", "0.05", "-"])
+    assert titles == ["TIME", "LEVEL", "PROFILE", "accuracy", "[m]", "rate", "[Hz]"]
+    assert (first[2:], second[2:]) == (["WARN", "quick", "0.2", "20"], ["OK", "fine", "0.05", "-"])
     (last,) = json.loads(history(state, "sonar", "--windows", "--since", "35s", "--json").output)
     assert last["quality"] == {"accuracy": 0.05}
 
 
 def test_the_last_rows_are_shown(state: Path) -> None:
-    assert [row[2] for row in rows(state, "sonar", "-n", "1")[1:]] == ["over"]
-    assert [row[2] for row in rows(state, "sonar", "--since", "1 h", "-n", "2")[1:]] == ["apply", "over"]
+    assert [row[3] for row in rows(state, "sonar", "-n", "1")[1:]] == ["over"]
+    assert [row[3] for row in rows(state, "sonar", "--since", "1 h", "-n", "2")[1:]] == ["apply", "over"]
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import click
 from click.core import ParameterSource
 
 from rmpa.cli.options import json_option
-from rmpa.cli.output import Column, duration, print_json, print_table, printable
+from rmpa.cli.output import Column, duration, print_json, print_table
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.resource.declare.units import quantity
 from rmpa.resource.run.history import profile_runs, read_events, read_units, read_windows
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _COLOURS: Final = {"OK": "", "WARN": "yellow", "ERROR": "red", "STALE": "magenta"}
 _VIOLATIONS: Final = ("alarm", "over")
-_EVENT_TITLES: Final = ("TIME", "EVENT", "LEVEL", "PROFILE", "MESSAGE")
+_EVENT_TITLES: Final = ("TIME", "LEVEL", "EVENT", "PROFILE", "MESSAGE")
 _PROFILE_TITLES: Final = ("SINCE", "FOR", "PROFILE", "REACTION", "WHY")
 _EXAMPLES: Final = """\
 \b
@@ -69,12 +69,12 @@ def history(
     try:
         if shown == "windows":
             windows = [window for window in read_windows(path) if window.at >= after][last]
-            units = {} if as_json else read_units(path)
-            _print(windows, as_json, *([] if as_json else _window_table(windows, units)))
+            titles, rows, colours = _window_table(windows, read_units(path))
+            _print(windows, as_json, titles, rows, colours)
             return
         events = read_events(path)
     except OSError as error:
-        raise RmpaError(printable(str(error))) from None
+        raise RmpaError(str(error)) from None
     if shown == "profiles":
         runs = [run for run in profile_runs(events) if run.until is None or run.until >= after][last]
         _print(runs, as_json, _PROFILE_TITLES, list(map(_profile_row, runs)))
@@ -87,19 +87,18 @@ def history(
 def _print(
     found: Sequence[object],
     as_json: bool,
-    titles: Sequence[str] = (),
-    rows: Sequence[Sequence[str]] = (),
+    titles: Sequence[str],
+    rows: Sequence[Sequence[str]],
     colours: Sequence[str] = (),
 ) -> None:
     if as_json:
         print_json(found)
     else:
-        cells = [tuple(map(printable, row)) for row in rows]
-        print_table(tuple(map(Column, titles)), cells, colours=colours)
+        print_table(tuple(map(Column, titles)), rows, colours=colours)
 
 
 def _event_row(event: HistoryEvent) -> Sequence[str]:
-    return _time(event.at), event.event, event.level, str(event.details.get("profile", "-")), event.message
+    return _time(event.at), event.level, event.event, str(event.details.get("profile", "-")), event.message
 
 
 def _profile_row(run: ProfileRun) -> Sequence[str]:
@@ -118,9 +117,9 @@ def _window_table(
 ) -> tuple[Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
     """Titles, rows and colours; only the attributes that need no name of an output or input."""
     names = sorted({name for window in windows for name in window.quality if "." not in name})
-    titles = ["TIME", "PROFILE", "LEVEL", *(f"{name} [{units[name]}]" if units.get(name) else name for name in names)]
+    titles = ["TIME", "LEVEL", "PROFILE", *(f"{name} [{units[name]}]" if units.get(name) else name for name in names)]
     rows = [
-        (_time(window.at), window.profile or "-", window.level, *(_cell(window.quality.get(name)) for name in names))
+        (_time(window.at), window.level, window.profile or "-", *(_cell(window.quality.get(name)) for name in names))
         for window in windows
     ]
     return titles, rows, [_COLOURS[window.level] for window in windows]
@@ -144,7 +143,7 @@ def _find(resource: str | None, module: str | None, state: str | None) -> Path:
     name = (resource or "*").removeprefix("/")
     if ":" in name:
         remedy = "ask there: its file is where it runs"
-        raise ConfigError("resource", f"{printable(name)} is of another module", remedy)
+        raise ConfigError("resource", f"{name} is of another module", remedy)
     directory = state_dir(os.environ, state)
     folders = [] if directory is None else [module_dir(directory, module)] if module else sorted(directory.glob("*"))
     found = [
@@ -155,9 +154,9 @@ def _find(resource: str | None, module: str | None, state: str | None) -> Path:
     ]
     if len(found) == 1:
         return found[0]
-    where = printable(str(directory))
+    where = str(directory)
     if not found:
-        what = f"resource {printable(name)}" if resource is not None else "resource"
+        what = f"resource {name}" if resource is not None else "resource"
         raise RmpaError(f"no history of a {what} in {where}; `rmpa run` keeps one, --state says where it is")
-    modules = ", ".join(printable(f"{path.parent.name}/{path.stem}") for path in found)
+    modules = ", ".join(f"{path.parent.name}/{path.stem}" for path in found)
     raise RmpaError(f"several have a history in {where}: {modules}; name the resource, or its module by --agent")

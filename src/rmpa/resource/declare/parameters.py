@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError
+from rmpa.core.sizes import INT32_MAX, INT32_MIN
 from rmpa.resource.declare.fence import fenced_action
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 ParameterValue = bool | int | float | str
-INT_MIN: Final = -(2**31)
-INT_MAX: Final = 2**31 - 1
+INT_MIN: Final = INT32_MIN
+INT_MAX: Final = INT32_MAX
 """Whole numbers have 32 bits in dynamic_reconfigure."""
 _ROS_TYPES: Final = {bool: "bool", int: "int", float: "double", str: "str"}
 

@@ -13,6 +13,7 @@ from collections import Counter, deque
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import LocalProtocolError, RmpaError
+from rmpa.core.serial_number import SERIAL_MASK
 from rmpa.resource import limits
 from rmpa.resource.declare.fence import current_fence
 from rmpa.resource.run.descriptor import TOPIC, describe, topic_of
@@ -322,7 +323,7 @@ class Runtime:
         if kind.fields and kind.fields[0].name == "header":
             header: Any = getattr(message, "header", None)
             if hasattr(header, "seq"):
-                header.seq = next(numbers) & 0xFFFF_FFFF  # as rospy does, so that receivers can count losses
+                header.seq = next(numbers) & SERIAL_MASK  # as rospy does, so that receivers can count losses
         raw, fence = kind.serialize(message), current_fence()
         if fence is None:
             self.call_in_loop(self.send, output, raw)
