@@ -195,8 +195,8 @@ class Decider:
             excluded: Reasons by the names of profiles that may not be taken.
         """
         columns = [self._column(name, bound) for name, bound in bounds.items()]
-        left_out = excluded or {}
-        allowed = [index for index, name in enumerate(self._profiles) if name not in left_out]
+        reasons = excluded or {}
+        allowed = [index for index, name in enumerate(self._profiles) if name not in reasons]
         names = self.profiles
         hard_deltas = [column.deltas for column in columns if column.bound.hard]
         fails = [*map(any, zip(*hard_deltas, strict=True))]  # a shortfall is above 0
@@ -209,7 +209,7 @@ class Decider:
             distances = self._distances(columns)
             best = min(feasible, key=distances.__getitem__)
             return ProfileDecision(names[best], distances[best], feasible=True)
-        if self._best_effort and self._best_effort not in left_out:
+        if self._best_effort and self._best_effort not in reasons:
             best = names.index(self._best_effort)
             return ProfileDecision(names[best], self._distance(best, columns), feasible=False, best_effort=True)
         if not allowed:
@@ -223,11 +223,15 @@ class Decider:
     ) -> tuple[ProfileScore, ...]:
         """Every profile's score with all its terms, in order of declaration."""
         distances, hard = self._judge(bounds)
-        left_out = excluded or {}
-        said = {name: describe_bound(self._attributes[name], bound) for name, bound in bounds.items()}
+        reasons = excluded or {}
+        texts = {name: describe_bound(self._attributes[name], bound) for name, bound in bounds.items()}
         return tuple(
             ProfileScore(
-                name, distances[index], hard[index], left_out.get(name, ""), self._terms(index, profile, said, bounds)
+                name,
+                distances[index],
+                hard[index],
+                reasons.get(name, ""),
+                self._terms(index, profile, texts, bounds),
             )
             for index, (name, profile) in enumerate(self._profiles.items())
         )
@@ -298,12 +302,12 @@ class Decider:
         return [_MISSING if place is None or not low <= place <= high else 0.0 for place in places]
 
     def _terms(
-        self, index: int, profile: Profile, said: Mapping[str, str], bounds: Mapping[str, Bound]
+        self, index: int, profile: Profile, texts: Mapping[str, str], bounds: Mapping[str, Bound]
     ) -> tuple[Term, ...]:
         return tuple(
             Term(
                 name,
-                said[name],
+                texts[name],
                 profile.offers.get(name),
                 self._column(name, bound).deltas[index],
                 bound.weight,

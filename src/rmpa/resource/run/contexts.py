@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource import limits
-from rmpa.resource.declare.context_rules import Chooser, parse_rule
+from rmpa.resource.declare.context_rules import ContextSelector, parse_rule
 from rmpa.resource.run.descriptor import topic_of
 from rmpa.resource.run.fenced_call import FencedCall
 from rmpa.resource.run.runtime import RuntimePart
@@ -62,7 +62,7 @@ class Contexts(RuntimePart):
             for name, context in self._known.items()
             if context.when
         }
-        self._chooser = Chooser(rules)
+        self._selector = ContextSelector(rules)
         self._topic_fields = {
             reference.text: _TopicField(reference)
             for rule in rules.values()
@@ -92,11 +92,11 @@ class Contexts(RuntimePart):
     @property
     def chosen(self) -> str:
         """The one chosen by hand; empty: the rules decide."""
-        return self._chooser.chosen
+        return self._selector.chosen
 
     def preset(self, name: str) -> None:
         """Choose a context by hand, or none, before ``start``."""
-        self._chooser.chosen = name
+        self._selector.chosen = name
 
     @property
     def problems(self) -> list[str]:
@@ -122,7 +122,7 @@ class Contexts(RuntimePart):
                 self.preset("")
         if self._topic_fields:
             self._spawn(self._find_topics(), "find topics of rules")
-        if self._chooser.rules:
+        if self._selector.rules:
             self._evaluate(self._loop.time())
             self._timer.arm()
 
@@ -145,16 +145,16 @@ class Contexts(RuntimePart):
             near = did_you_mean(name, self._known)
             remedy = f"did you mean {near}?" if near else f"it is one of {', '.join(self._known) or 'none'}"
             raise ConfigError(f"resource {self._runtime.resource.name}", f"no context {name[:80]!r}", remedy)
-        before, self._chooser.chosen = self._chooser.chosen, name
+        before, self._selector.chosen = self._selector.chosen, name
         try:
             if name:
                 await self._switch(name)
         except RmpaError:
-            self._chooser.chosen = before
+            self._selector.chosen = before
             raise
         if not name:
-            self._chooser.since = self._retry = 0.0
-            wanted = self._chooser.choose(self._current, self._values(), self._loop.time())
+            self._selector.since = self._retry = 0.0
+            wanted = self._selector.select(self._current, self._values(), self._loop.time())
             await self._switch(wanted)
         self._publish()
 
@@ -232,7 +232,7 @@ class Contexts(RuntimePart):
         self._next_evaluation = now + _INTERVAL
         if self._switch_lock.locked() or now < self._retry or (self._switching and not self._switching.done()):
             return
-        wanted = self._chooser.choose(self._current, self._values(), now)
+        wanted = self._selector.select(self._current, self._values(), now)
         if wanted != self._current:
             self._switching = self._spawn(self._switch_by_rule(wanted), "switch context")
 
@@ -273,7 +273,7 @@ class Contexts(RuntimePart):
                 runtime.context_outputs = frozenset(outputs) if outputs is not None else None
                 self._apply(name, context)
                 self._current = name
-                self._chooser.since = self._loop.time()
+                self._selector.since = self._loop.time()
                 await self._adapter.settled()
             finally:
                 runtime.release(_HOLDER)

@@ -195,8 +195,8 @@ def restart_delay(in_a_row: int) -> float:
     return min(RESTART_FIRST * 2.0 ** min(max(0, in_a_row - 1), 16), RESTART_MAX)
 
 
-def stuck_after(period: float | None, said: float | None) -> float:
-    """Seconds after which a run counts as stuck; ``said``: as declared, or ``None``."""
-    if said is not None:
-        return said
+def stuck_after(period: float | None, declared: float | None) -> float:
+    """Seconds after which a run counts as stuck; ``declared``: by the task, or ``None``."""
+    if declared is not None:
+        return declared
     return max(STUCK_LEAST, STUCK_PERIODS * period) if period is not None else STUCK_LEAST
