@@ -316,7 +316,7 @@ def test_alarms(rmpa: Rmpa, core: RosCore, running: ResourceNode, background: Ba
     background.do(others[0].close())
 
 
-def test_nobody_is_there(rmpa: Rmpa, core: RosCore) -> None:
+def test_no_resource(rmpa: Rmpa, core: RosCore) -> None:
     assert as_json(rmpa, "resource", "list") == []
     text = "rmpa: there is no resource; `rmpa run` runs one, `rmpa resource list` shows all\n"
     assert rmpa("profile", "list") == (1, "", text)

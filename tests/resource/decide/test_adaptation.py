@@ -267,7 +267,7 @@ def test_failed_choice_is_retried_after_its_cool_down() -> None:
     assert applies(one.pin("fast", 12.5)) == ["fast"]
 
 
-def test_what_none_can_serve_is_one_alarm_however_little_is_measured() -> None:
+def test_infeasible_request_raises_one_alarm() -> None:
     one = running(5)
     raised = one.require(Requirement("/c", {"latency": bound(LATENCY, at_most=0.001, hard=True)}), 2.0)
     assert [kind for kind, _, _ in alarms(raised)] == [AlarmKind.NON_ADAPTABLE]
@@ -278,7 +278,7 @@ def test_what_none_can_serve_is_one_alarm_however_little_is_measured() -> None:
     assert any(isinstance(action, Clear) for action in one.release("/c", 6.0))
 
 
-def test_what_is_asked_while_a_profile_is_applied_counts_when_it_runs() -> None:
+def test_request_while_applying_counts_afterwards() -> None:
     one = loop()
     one.start(0.0)
     assert one.require(at_least(30), 0.1) == []
@@ -340,7 +340,7 @@ def _any_requirement(chance: random.Random, now: float) -> Requirement:
     )
 
 
-def test_a_reaction_counts_from_the_beginning_of_the_first_bad_window() -> None:
+def test_reaction_begins_with_the_first_violated_window() -> None:
     one = running(20.0, FAST, MIDDLE)
     assert one.profile == "middle"
     one.window({"rate": 20.0}, 2.0)
@@ -378,7 +378,7 @@ def test_restart_continues_with_profile_and_requirements() -> None:
     assert applies(barred.block({"fast": "no power"}, 0.0)) == ["slow"]
 
 
-def test_who_says_the_same_again_and_again_hides_no_disturbance() -> None:
+def test_repeated_request_hides_no_disturbance() -> None:
     one = running(20.0, FAST, MIDDLE)
     actions: list[Action] = []
     for turn in range(3):  # rostopic pub -r 10
@@ -427,7 +427,7 @@ def hung(now: float) -> Adaptation:
     return one
 
 
-def test_a_profile_whose_function_still_hangs_is_not_taken_again() -> None:
+def test_hanging_profile_is_not_taken_again() -> None:
     one = hung(5.0)
     finish(one, 5.1)
     assert not applies(one.handle_timer(100.0))  # its cool-down is over

@@ -64,7 +64,7 @@ def test_absent_client_is_removed() -> None:
     assert one.remove_absent(set(), 6.0) == ["/a"]  # also one that asked for nothing any more
 
 
-def test_what_was_asked_survives_a_restart_for_those_that_come_back() -> None:
+def test_requirements_wait_for_their_clients_after_a_restart() -> None:
     before = clients()
     before.received("/a", "m", "5.0")
     before.received("/b", "n", "")

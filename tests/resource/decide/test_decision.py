@@ -144,7 +144,7 @@ def test_invalid_profiles_are_refused(profiles: list[Profile], said: str) -> Non
     assert said in str(caught.value)
 
 
-def test_an_unknown_profile_is_named_with_the_one_that_was_meant() -> None:
+def test_unknown_profile_has_a_suggestion() -> None:
     with pytest.raises(ConfigError, match="camera has no such profile; did you mean sharp"):
         decider().profile("shrap")
 
@@ -205,7 +205,7 @@ def test_a_greater_weight_never_favours_who_falls_shorter(
 
 
 @given(_profiles, _asked, st.integers(0, 5), st.floats(0, 1), st.floats(0, 1))
-def test_a_profile_that_serves_worse_within_the_known_range_changes_nothing(
+def test_worse_profile_within_the_range_changes_nothing(
     profiles: list[Profile], asked: dict[str, Bound], which: int, dx: float, dy: float
 ) -> None:
     before = plane(profiles).decide(asked)

@@ -15,7 +15,7 @@ def sonar() -> Resource:
     return one
 
 
-def test_each_output_and_input_is_measured_and_the_first_one_twice() -> None:
+def test_each_topic_is_measured_the_first_output_twice() -> None:
     one = QualityMeasurement(sonar(), 0.0)
     raw = struct.pack("<IIII", 1, 0, 0, 0)
     for number in range(1, 11):

@@ -82,7 +82,7 @@ def test_a_text_is_no_number() -> None:
         ("~on or " * 200 + "~on", "1403 characters"),
     ],
 )
-def test_a_rule_that_cannot_be_is_said(text: str, said: str) -> None:
+def test_invalid_rule_is_refused(text: str, said: str) -> None:
     with pytest.raises(ConfigError) as error:
         rule(text)
     assert said in str(error.value)

@@ -62,7 +62,7 @@ def test_an_interval_has_one_unit() -> None:
         ("rate", "x" * 2000, "2000 characters"),
     ],
 )
-def test_what_cannot_be_read_is_said(key: str, text: str, said: str) -> None:
+def test_unreadable_requirement_is_refused(key: str, text: str, said: str) -> None:
     with pytest.raises(ConfigError) as caught:
         parse_requirement("/c", [(key, text)], ATTRIBUTES, "camera", 0.0)
     assert said in str(caught.value)

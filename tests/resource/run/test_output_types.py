@@ -155,7 +155,7 @@ def ear() -> Resource:
     return one
 
 
-async def test_a_definition_that_cannot_be_used_is_said_once(
+async def test_unusable_definition_is_reported_once(
     core: RosCore, ear: Resource, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with Node("liar", master_uri=core.uri) as node, asyncio.timeout(30):

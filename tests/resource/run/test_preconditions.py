@@ -42,9 +42,7 @@ def declared(needs: Callable[[], str | bool | None]) -> Resource:
     return one
 
 
-async def test_one_that_blocks_holds_up_neither_the_start_nor_the_loop(
-    core: RosCore, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_blocking_precondition_delays_nothing(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "PRECONDITION_TIMEOUT", 0.3)
     goes_on, threads = threading.Event(), set()
     calls: list[float] = []

@@ -153,7 +153,7 @@ def test_a_resource_without_a_profile_is_refused() -> None:
         asyncio.run(make())
 
 
-async def test_several_run_until_they_are_told_to_stop(core: RosCore) -> None:
+async def test_resources_run_until_stopped(core: RosCore) -> None:
     stop, ready = asyncio.Event(), asyncio.Event()
     other = Resource("other", role="sensing")
     other.profile(offers={}, name="plain")(lambda: None)
