@@ -8,6 +8,7 @@ may have changed the device itself. Until then its own profile is excluded: call
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 from typing import TYPE_CHECKING, Final
 
@@ -51,7 +52,7 @@ class Applier:
         self._tasks = tasks
         self._on_applied = on_applied
         self._on_ended_late = on_ended_late
-        self._on_late_action = on_late_action
+        self._on_late_action = functools.partial(runtime.call_in_loop, on_late_action)
         self._call: FencedCall | None = None
         self._task: asyncio.Task[None] | None = None
         self._running: set[asyncio.Task[None]] = set()
@@ -65,7 +66,7 @@ class Applier:
 
     def begin(self, profile: str) -> None:
         """Apply a profile; the previous one is complete or was given up."""
-        self._call = call = FencedCall("profile", profile, self._action_blocked)
+        self._call = call = FencedCall("profile", profile, self._on_late_action)
         self._task = task = asyncio.get_running_loop().create_task(self._apply(call), name=f"apply {profile}")
         self._running.add(task)
         task.add_done_callback(self._running.discard)
@@ -142,14 +143,3 @@ class Applier:
         took = asyncio.get_running_loop().time() - call.began if call.began else 0.0
         text = f"the function of profile {call.name}, which was given up, has ended after {took:.3g} s"
         self._on_ended_late(call.name, touched, text)
-
-    def _action_blocked(self, call: FencedCall, what: str) -> None:
-        """Called in any thread."""
-        self._runtime.call_in_loop(self._report_blocked, call, what)
-
-    def _report_blocked(self, call: FencedCall, what: str) -> None:
-        if what not in call.reported:
-            call.reported.add(what)
-            self._on_late_action(
-                call.name, f"the function of profile {call.name} was given up; it has no effect: {what}"
-            )

@@ -7,6 +7,7 @@ requirements are in force, and the resulting profile has been applied.
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 from typing import TYPE_CHECKING, Any, Final
 
@@ -285,7 +286,9 @@ class Contexts(RuntimePart):
         """Call a context's function."""
         if context.enter is None:
             return
-        timeout, call = limits.CONTEXT_ENTER_TIMEOUT, FencedCall("context", context.name, self._action_blocked)
+        timeout = limits.CONTEXT_ENTER_TIMEOUT
+        report = functools.partial(self._runtime.call_in_loop, self._adapter.report_late_action)
+        call = FencedCall("context", context.name, report)
         limit = asyncio.timeout(timeout)
         try:
             async with limit:
@@ -296,13 +299,6 @@ class Contexts(RuntimePart):
             if isinstance(error, TimeoutError) and limit.expired():
                 why = f"its function has not ended after {timeout:g} s"
             raise PeerRefused(f"context {context.name}", why) from error
-
-    def _action_blocked(self, call: FencedCall, what: str) -> None:
-        """A function that was given up has attempted an action; called in any thread."""
-        if what not in call.reported:
-            call.reported.add(what)
-            text = f"the function of context {call.name} was given up; it has no effect: {what}"
-            self._runtime.call_in_loop(self._adapter.report_late_action, call.name, text)
 
     def _apply(self, name: str, context: Context | None) -> None:
         resource = self._runtime.resource

@@ -24,20 +24,19 @@ class FencedCall:
     Args:
         kind: ``profile`` or ``context``.
         name: Its name.
-        on_blocked: ``(call, action)``: called in any thread when the function attempts an action after the call was
-            given up.
+        on_late_action: ``(name, text)``: called in any thread, once for each kind of action that the function
+            attempts after the call was given up.
     """
 
-    def __init__(self, kind: str, name: str, on_blocked: Callable[[FencedCall, str], None]) -> None:
+    def __init__(self, kind: str, name: str, on_late_action: Callable[[str, str], None]) -> None:
         self.kind = kind
         self.name = name
         self.began = 0.0
         """When the function was called, seconds of the loop's clock; 0: not yet."""
         self.in_thread = False
         """Whether it runs in a thread now, which cannot be stopped from outside."""
-        self.reported: set[str] = set()
-        """Its actions without effect that were reported already."""
-        self._on_blocked = on_blocked
+        self._reported: set[str] = set()
+        self._on_late_action = on_late_action
         self._closed = False
         # Giving up waits for the action under way: one parameter is set, one message handed on.
         self._lock = threading.RLock()
@@ -64,7 +63,10 @@ class FencedCall:
 
     def report_blocked(self, what: str) -> None:
         """Report an action that came too late."""
-        self._on_blocked(self, what)
+        if what not in self._reported:
+            self._reported.add(what)
+            text = f"the function of {self.kind} {self.name} was given up; it has no effect: {what}"
+            self._on_late_action(self.name, text)
 
     async def run(self, function: Hook) -> None:
         """Call the function: a coroutine function in the event loop, a plain one in a thread of its own.
