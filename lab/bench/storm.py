@@ -1,8 +1,8 @@
 """Does control work delay data? A relayed stream at 1 kHz while tools and nodes ask a master 200 times a second.
 
-The same calls go to nobody, to the core inside the agent, and to an ``rmpa core`` in a process of its own on the same
+The same calls go nowhere, to the core inside the agent, and to an ``rmpa core`` in a process of its own on the same
 host: that is one process against control in its own. Beside it direct roscpp, idle and while its rosmaster is asked,
-which tells what the calls cost everybody on so few processors.
+which shows what the calls cost any program on so few processors.
 """
 
 from __future__ import annotations
