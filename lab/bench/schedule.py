@@ -53,6 +53,19 @@ _AGENT_PRIORITY: Final = 50
 """What ``--realtime`` asks for by default."""
 
 
+@dataclass(frozen=True, slots=True)
+class Rounds:
+    """How much is measured.
+
+    Args:
+        seconds: Of each round; short, so that a bad spell of the machine meets all that take turns.
+        rounds: Turns of each.
+    """
+
+    seconds: float
+    rounds: int
+
+
 @dataclass(slots=True)
 class Arrivals:
     """The arrivals of one round, without its lead-in.

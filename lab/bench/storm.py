@@ -46,21 +46,8 @@ _SEPARATE_PORT: Final = 11399
 _FILL_DEADLINE: Final = 60.0
 
 
-@dataclass(frozen=True, slots=True)
-class StormPlan:
-    """How much is measured.
-
-    Args:
-        seconds: Of each round; short, so that a bad spell of the machine meets all cases.
-        rounds: Turns of each case.
-    """
-
-    seconds: float
-    rounds: int
-
-
-FULL: Final = StormPlan(4.0, 12)
-QUICK: Final = StormPlan(2.6, 4)
+FULL: Final = schedule.Rounds(4.0, 12)
+QUICK: Final = schedule.Rounds(2.6, 4)
 
 
 @dataclass(slots=True)

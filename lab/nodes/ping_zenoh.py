@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 import zenoh
 
-from roundtrips import measure, say
+from node import say
+from roundtrips import measure
 
 if TYPE_CHECKING:
     from collections.abc import Callable
