@@ -80,7 +80,7 @@ KEYS: Final = (
     RuleKey("max_rate", RATE, "Messages a second that cross at most; the newest are kept."),
     RuleKey("outage", OUTAGE, "How long a reliable topic is kept when its link is gone."),
 )
-"""What one ``[[contract]]`` may say."""
+"""The keys that one ``[[contract]]`` may have."""
 _FIELDS: Final = {"liveliness_lease_duration": "liveliness_lease"}
 """The contract's field, for a key that has another name."""
 
@@ -115,7 +115,7 @@ CONTRACT_RULES: Final = tables_of(KEYS, _read_rule)
 
 
 def contract_warnings(rules: Sequence[ContractRule]) -> Iterator[ConfigWarning]:
-    """What is probably a mistake in the rules of a file."""
+    """Warnings about rules that can be used but are probably mistakes."""
     leased = any(rule.values.get("liveliness_lease") is not None for rule in rules)
     reliable = any(rule.values.get("reliability") == Reliability.RELIABLE for rule in rules)
     for index, rule in enumerate(rules):

@@ -120,7 +120,7 @@ def _check_against(rules: Sequence[FollowRule], rule: FollowRule) -> None:
 
 
 def follow_problems(rules: Sequence[FollowRule], time_owner: str, name: str) -> Iterator[tuple[str, Place, str]]:
-    """What only shows when all settings are known: ``(setting, place in it, problem)``.
+    """Problems that only show when all settings are known: ``(setting, place in it, problem)``.
 
     Args:
         rules: Of ``[[param]]``.

@@ -100,7 +100,7 @@ class _Placed:
     target: str
 
     def below(self, key: str | int) -> _Placed:
-        """The same, one level deeper in the file."""
+        """This renaming with a place that is one level deeper in the file."""
         return replace(self, at=(key, *self.at))
 
 
@@ -350,7 +350,7 @@ def _first_fit(rules: Sequence[_Placed], name: str) -> tuple[_Placed | None, str
 
 
 def peer_warnings(rules: Sequence[PeerRule]) -> Iterator[ConfigWarning]:
-    """What is probably a mistake in the rules of a file."""
+    """Warnings about rules that can be used but are probably mistakes."""
     for index, rule in enumerate(rules):
         if rule == PeerRule(rule.name):
             yield ConfigWarning((index,), "a rule that sets nothing")

@@ -10,7 +10,7 @@ from rmpa.config.values import TOPIC_GLOB, TYPE_GLOB, list_of
 
 @dataclass(frozen=True, slots=True)
 class PolicySettings:
-    """What may cross the mesh, by globs (``core.names.matches``).
+    """The topics and types that may cross the mesh, by globs (``core.names.matches``).
 
     A topic crosses if one of ``allow`` matches it and none of ``deny``, its type likewise; of several policies each
     must let it cross.

@@ -11,11 +11,11 @@ from rmpa.config.values import BadValue, JsonSchema, ValueType, shown
 
 _QUANTITY: Final = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)\s*([a-zµ]*)")
 _SECONDS: Final = {"us": 1e6, "µs": 1e6, "ms": 1e3, "s": 1.0, "min": 1 / 60, "h": 1 / 3600}
-"""How many of each unit are a second. Dividing by these rounds once: ``"100 ms"`` is 0.1, as a user writes it."""
+"""By unit: so many of it are a second. Dividing by these rounds only once, so that ``"100 ms"`` is exactly 0.1."""
 _INFINITE: Final = "infinite"
 """ROS 2's own word for a duration without a bound; it lifts the bound that an earlier rule has set."""
 _UNLIMITED: Final = "unlimited"
-"""The same for a rate."""
+"""The word for a rate without a bound, likewise."""
 
 
 def read_duration(raw: object, what: str = "a duration") -> float | None:

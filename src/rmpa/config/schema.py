@@ -1,4 +1,4 @@
-"""How a setting is declared: once, as a field of a settings dataclass.
+"""Declares settings: each once, as a field of a settings dataclass.
 
 ::
 
@@ -110,7 +110,7 @@ class Setting:
 
     @property
     def title(self) -> str:
-        """What users call it: ``core.port``, ``[[contract]]``, or the variable of one that is not in the file."""
+        """Its name for users: ``core.port``, ``[[contract]]``, or the variable if it is not in the file."""
         if self.is_list_of_tables:
             return f"[[{self.key[0]}]]"
         return ".".join(self.key) or self.env

@@ -95,7 +95,7 @@ class ServiceSettings:
 
 @dataclass(frozen=True, slots=True)
 class NodeSettings:
-    """What peers may do with this module's nodes."""
+    """Rights of peers over this module's nodes."""
 
     kill: tuple[str, ...] = setting(
         ("/**",), list_of(NODE_GLOB), "Nodes that peers may end (rosnode kill, rmpa node kill).", env="RMPA_NODE_KILL"
@@ -104,7 +104,7 @@ class NodeSettings:
 
 @dataclass(frozen=True, slots=True)
 class ParamSettings:
-    """What peers may do with this module's parameters, and which of theirs it follows (no two within each other)."""
+    """Rights of peers over this module's parameters; the peers' parameters that it follows (none within another)."""
 
     remote_get: tuple[str, ...] = setting(
         ("/**",), list_of(PARAM_GLOB), "Parameters that peers may read and follow.", env="RMPA_REMOTE_GET"
@@ -129,7 +129,7 @@ class TimeSettings:
 
 @dataclass(frozen=True, slots=True)
 class LimitSettings:
-    """How much is accepted from one peer and offered to peers; what is beyond stays hidden and is reported."""
+    """Bounds of what is accepted from one peer and offered to peers; the rest stays hidden and is reported."""
 
     nodes: int = setting(
         limits.NODES_PER_PEER_MAX, BOUND, "Nodes of one peer that stand in the local graph.", env="RMPA_LIMIT_NODES"
@@ -156,7 +156,7 @@ class LimitSettings:
 
 @dataclass(frozen=True, slots=True)
 class LaneSettings:
-    """How the packets of each lane are marked: DSCP (RFC 2474) for the network, SO_PRIORITY for this machine."""
+    """The marks of each lane's packets: DSCP (RFC 2474) for the network, SO_PRIORITY for this machine."""
 
     express_dscp: int = setting(
         48,
@@ -176,7 +176,7 @@ class LaneSettings:
 
 @dataclass(frozen=True, slots=True)
 class RealtimeSettings:
-    """What the agent asks the kernel for; the log says what was not granted."""
+    """Requests to the kernel for real-time behaviour; refusals are logged."""
 
     enabled: bool = setting(
         False,
@@ -367,4 +367,4 @@ TABLES: Final = {
     "relay": "Whether this module joins networks that are not routed to each other.",
     "log": "What the log says, and how.",
 }
-"""What each table of ``rmpa.toml`` is about."""
+"""The tables of ``rmpa.toml``, each with its description."""

@@ -89,7 +89,7 @@ class Given:
 
 
 _Layer = dict[str, Given]
-"""What one source gives, by the setting's name."""
+"""The raw values of one source, by the setting's name."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def value_at(table: object, place: Place) -> object:
-    """What stands at a place of a parsed file, or ``None``."""
+    """The value at a place of a parsed file; ``None`` if there is none."""
     for part in place:
         in_table = isinstance(table, dict) and part in table
         in_list = isinstance(table, list) and isinstance(part, int) and part < len(table)

@@ -42,7 +42,7 @@ ROUTE_QUEUE_MESSAGES: Final = 1000
 CUT_THROUGH_BYTES: Final = 96 * KIB
 """Messages above this are forwarded while they still arrive."""
 RESUME_WINDOW: Final = 30.0
-"""How long a reliable route's messages are kept after its link fell, unless its contract says another ``outage``: a
+"""How long a reliable route's messages are kept after its link was lost, unless a contract sets ``outage``: a
 robot drives through a shadow, an access point restarts. Longer is left to contracts: a module that is off
 seems to publish for as long, and afterwards its subscribers get all of the old messages. Latched topics of a peer
 that fell silent stay as long."""

@@ -20,7 +20,7 @@ _NEVER: Final = float("-inf")
 
 
 class EndpointChange(Enum):
-    """What a beacon, or a link that came or fell, changes at an endpoint."""
+    """The change of an endpoint by a beacon, or by a link that came or was lost."""
 
     NEW = auto()
     """The endpoint had no current run; it has one now."""

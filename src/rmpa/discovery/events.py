@@ -32,7 +32,7 @@ class LossReason(Enum):
 
 
 class ConflictKind(Enum):
-    """What two live peers have in common, though it must be unique."""
+    """The property that two live peers share, though it must be unique."""
 
     GUID = "guid"
     OWN_GUID = "own guid"

@@ -79,7 +79,7 @@ BEACONS_PER_SOURCE: Final = 200
 BEACONS_UNLINKED_PER_SECOND: Final = 200.0
 """Beacons a second of peers that we have no link with, over all addresses, which can be forged: 5 % of a core."""
 BEACONS_UNLINKED_BURST: Final = 1000
-"""The same at once: a hundred peers that start together send 400 and answer each other."""
+"""Such beacons at once: a hundred peers that start together send 400 and answer each other."""
 BEACON_SOURCES_MAX: Final = 1024
 """Source addresses counted for that; the oldest is forgotten first."""
 BEACON_REPEATS: Final = 128

@@ -524,7 +524,7 @@ class MembershipProtocol:
     def _infer_multicast(
         self, peer: PeerInstance, beacon: Beacon, source: Address, now: float, *, was_candidate: bool
     ) -> None:
-        """How a peer was found whose first beacon came by unicast.
+        """Infer how a peer was found whose first beacon came by unicast.
 
         A candidate was found by gossip. One that answers unasked has heard a multicast of ours; its own multicasts
         are expected to be heard here too, for a while.

@@ -185,7 +185,7 @@ class DirectSelector(selectors.BaseSelector):
                 self._data.unregister(fd)
 
     def get_map(self) -> Mapping[FileDescriptorLike, selectors.SelectorKey]:
-        """What is watched, by file descriptor."""
+        """The keys of all watched file objects, by file descriptor."""
         return cast("Mapping[FileDescriptorLike, selectors.SelectorKey]", self._keys)
 
     def get_key(self, fileobj: FileDescriptorLike) -> selectors.SelectorKey:
@@ -251,13 +251,13 @@ class AgentLoop(asyncio.SelectorEventLoop):
         self._direct_selector.call_directly(fd, self._guarded(fd, "reader", callback))
 
     def add_writer(self, fd: FileDescriptorLike, callback: Callable[[*_Ts], Any], *args: *_Ts) -> None:
-        """As asyncio's; called by the selector itself where ``fd`` has a direct reader."""
+        """Like asyncio's, but the selector itself calls the writer where ``fd`` has a direct reader."""
         super().add_writer(fd, callback, *args)
         number = _fd(fd)
         self._direct_selector.write_directly(number, self._guarded(number, "writer", lambda: callback(*args)))
 
     def remove_writer(self, fd: FileDescriptorLike) -> bool:
-        """As asyncio's."""
+        """Stop watching for writing, as in asyncio."""
         self._direct_selector.write_directly(_fd(fd), None)
         return super().remove_writer(fd)
 

@@ -36,16 +36,16 @@ late (p50) with Python's own 5 ms, and 0.16 ms with this."""
 COLLECT_LOOK: Final = 0.25
 """Interval of the checks for cyclic garbage."""
 COLLECT_LOOK_AGAIN: Final = 0.02
-"""The same after a check that found many objects: passing messages are freed by then, and several small collections
+"""Interval after a check that found many objects: passing messages are freed by then, and several small collections
 pause the loop less than one large one."""
 COLLECT_YOUNG: Final = 300
 """Surviving objects since the last collection that make one due: those of 40 XML-RPC calls, some 0.1 ms."""
 COLLECT_BURST: Final = 1000
-"""The same at the yields of long work, for all objects that were made: a tenth of a millisecond."""
+"""Objects made since the last collection that make one due at a yield of long work: a tenth of a millisecond."""
 COLLECT_GROWTH: Final = 50_000
 """Growth of the heap in memory blocks, some 5 MB, that makes a full collection due while no data flows."""
 COLLECT_GROWTH_MAX: Final = 500_000
-"""The same, some 50 MB, even while data flows; it takes about 10 ms."""
+"""Growth of the heap in memory blocks, some 50 MB, that makes a full collection due even while data flows (10 ms)."""
 COLLECT_QUIET_BYTES: Final = 16 * KIB
 """No data flows below this many bytes a second over all links: these are keepalives, or very slow streams."""
 

@@ -73,13 +73,13 @@ class SegmentedSocket:
             yield piece, filled
 
     def recv_into(self, buffer: memoryview) -> int:
-        """As a socket's."""
+        """Read into a buffer, as ``socket.recv_into``."""
         return self._sock.recv_into(buffer)
 
     def shutdown(self, how: int) -> None:
-        """As a socket's."""
+        """Close one direction, as ``socket.shutdown``."""
         self._sock.shutdown(how)
 
     def close(self) -> None:
-        """As a socket's."""
+        """Close the socket."""
         self._sock.close()
