@@ -23,7 +23,7 @@ WALL = 1_700_000_000 * SECOND
 def clock(offset: float = 0.0, error: float = 0.0, now: float = 0.0) -> PeerClock:
     """A clock of which one thing is known."""
     found = PeerClock()
-    found.told(offset, error, now)
+    found.add(offset, error, now)
     return found
 
 
@@ -124,7 +124,7 @@ def test_each_latency_is_corrected_by_what_was_known_at_its_time() -> None:
     for second in range(51):
         ahead = 2.0 + second * 1e-5
         feed(quality, [second + 0.5], latency=0.001, ahead=ahead + 5e-6)
-        known.told(ahead + 1e-5, 0.0001, second + 1.0)
+        known.add(ahead + 1e-5, 0.0001, second + 1.0)
     s = quality.summary(known, 51.0)
     assert s.latency is not None
     assert s.latency.count == 51
@@ -136,10 +136,10 @@ def test_each_latency_is_corrected_by_what_was_known_at_its_time() -> None:
 def test_latencies_of_before_a_clock_was_set_are_forgotten() -> None:
     quality, known = Quality(), PeerClock()
     feed(quality, [1.0, 2.0], latency=0.001)
-    known.told(0.0, 0.0005, 2.5)
-    known.told(0.0004, 0.0002, 3.6)  # within both bounds
+    known.add(0.0, 0.0005, 2.5)
+    known.add(0.0004, 0.0002, 3.6)  # within both bounds
     assert quality.summary(known, 3.7).latency is not None
-    known.told(5.0, 0.0005, 4.0)  # the peer's clock was put five seconds forward
+    known.add(5.0, 0.0005, 4.0)  # the peer's clock was put five seconds forward
     assert quality.summary(known, 4.0).latency is None
     feed(quality, [4.5], latency=0.001, ahead=5.0)
     s = quality.summary(known, 4.6)

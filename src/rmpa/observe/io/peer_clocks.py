@@ -32,4 +32,4 @@ class PeerClocks:
             clock = self._clocks[attached.peer] = before.get(attached.peer) or PeerClock()
             offset, error = attached.link.clock_offset, attached.link.clock_error
             if offset is not None and error is not None and attached.away is None:
-                clock.told(offset, error, now)
+                clock.add(offset, error, now)
