@@ -34,7 +34,7 @@ def test_drift_is_no_setting() -> None:
     assert len(list(clock)) == 2
 
 
-def test_of_estimates_that_come_at_once_the_better_is_kept() -> None:
+def test_better_of_two_near_estimates_is_kept() -> None:
     clock = PeerClock()
     for now, error in ((0.0, 0.01), (0.1, 0.002), (0.2, 0.01), (0.3, 0.001), (1.5, 0.01)):
         clock.add(1.0, error, now)

@@ -60,7 +60,7 @@ def on_bulk(link: Link, leg: RouteSender) -> None:
 
 
 @pytest.mark.usefixtures("clock")
-def test_small_messages_go_at_once_numbered_from_1_with_their_stamp() -> None:
+def test_small_messages_are_sent_at_once() -> None:
     link = Link()
     leg = best_effort(link)
     for n in range(5):
@@ -72,7 +72,7 @@ def test_small_messages_go_at_once_numbered_from_1_with_their_stamp() -> None:
 
 
 @pytest.mark.usefixtures("clock")
-def test_the_first_large_one_and_what_follows_wait_for_the_fence_and_keep_their_order() -> None:
+def test_messages_behind_a_fence_keep_their_order() -> None:
     link = Link()
     leg = best_effort(link)
     leg.message(0, b"1")
@@ -114,7 +114,7 @@ def test_from_express_to_bulk_and_back_again(clock: Clock) -> None:
     assert link.sent[-1][:2] == ("bulk", ROW + 4)
 
 
-def test_a_large_one_while_the_way_back_is_fenced_does_not_go_by_the_express_lane(clock: Clock) -> None:
+def test_large_message_waits_for_the_fence_on_the_way_back(clock: Clock) -> None:
     link = Link()
     leg = best_effort(link)
     on_bulk(link, leg)
@@ -134,7 +134,7 @@ def test_a_large_one_while_the_way_back_is_fenced_does_not_go_by_the_express_lan
 
 @pytest.mark.usefixtures("clock")
 @pytest.mark.parametrize(("history", "kept"), [(History.KEEP_LAST, 3), (History.KEEP_ALL, 10)])
-def test_what_is_held_keeps_to_the_depth_and_the_newest_stay(history: History, kept: int) -> None:
+def test_held_messages_keep_to_the_depth(history: History, kept: int) -> None:
     link = Link()
     leg = best_effort(link, Contract(depth=3, history=history), large=True)
     drops = [leg.message(0, bytes([n])) for n in range(10)]
@@ -145,9 +145,7 @@ def test_what_is_held_keeps_to_the_depth_and_the_newest_stay(history: History, k
     assert link.numbers == list(range(11 - kept, 11)), "the gap says how many are missing"
 
 
-def test_what_is_held_keeps_to_the_bytes_but_one_message_always_fits(
-    clock: Clock, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_held_bytes_are_bounded(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mesh_limits, "LINK_QUEUE_BYTES", 1000)
     link = Link()
     leg = best_effort(link, large=True)
@@ -183,7 +181,7 @@ def test_the_priority_outweighs_the_size(priority: Priority, lane: str | None) -
 
 
 @pytest.mark.usefixtures("clock")
-def test_a_source_that_is_known_to_be_large_changes_its_lane_before_its_first_message() -> None:
+def test_large_source_changes_its_lane_first() -> None:
     link = Link()
     leg = best_effort(link, large=True)
     assert list(link.fences) == [("express", 1)]
@@ -194,7 +192,7 @@ def test_a_source_that_is_known_to_be_large_changes_its_lane_before_its_first_me
 
 
 @pytest.mark.usefixtures("clock")
-def test_bulk_lost_while_the_fence_is_on_the_express_lane_its_answer_is_waited_for() -> None:
+def test_bulk_lost_during_an_express_fence_waits_for_it() -> None:
     link = Link()
     leg = best_effort(link, large=True)
     leg.message(0, SMALL)
@@ -204,7 +202,7 @@ def test_bulk_lost_while_the_fence_is_on_the_express_lane_its_answer_is_waited_f
     assert link.lanes == ["bulk"]
 
 
-def test_bulk_lost_nothing_of_it_comes_behind_what_goes_by_the_express_lane_now(clock: Clock) -> None:
+def test_lost_bulk_lane_delivers_nothing_late(clock: Clock) -> None:
     """What waits for the lane's next connection would come late; the fence behind it would never be answered."""
     link = Link()
     leg = best_effort(link)
@@ -223,7 +221,7 @@ def test_bulk_lost_nothing_of_it_comes_behind_what_goes_by_the_express_lane_now(
 
 
 @pytest.mark.usefixtures("clock")
-def test_bulk_lost_without_a_fence_what_waits_for_its_next_connection_stays() -> None:
+def test_bulk_lost_without_a_fence_keeps_what_waits() -> None:
     link = Link()
     leg = best_effort(link)
     on_bulk(link, leg)
@@ -255,7 +253,7 @@ def test_bulk_lost_without_a_fence_what_waits_for_its_next_connection_stays() ->
         ),
     ],
 )
-def test_both_lanes_are_told_what_may_wait(
+def test_both_lanes_get_the_bounds(
     contract: Contract, depth: int, ages: tuple[float | None, ...], strict: bool
 ) -> None:
     link = Link()
@@ -265,7 +263,7 @@ def test_both_lanes_are_told_what_may_wait(
 
 
 @pytest.mark.usefixtures("clock")
-def test_what_a_lane_dropped_is_told_to_the_caller() -> None:
+def test_drops_of_a_lane_are_returned() -> None:
     link = Link()
     leg = best_effort(link)
     link.drops.extend([3, 0, 2])
@@ -322,7 +320,7 @@ def test_parts_of_an_urgent_topic_go_by_the_express_lane() -> None:
 
 
 @pytest.mark.usefixtures("clock")
-def test_an_abort_takes_its_number_with_it_and_the_next_one_begins_anew() -> None:
+def test_aborted_message_uses_its_number() -> None:
     link = Link()
     leg = best_effort(link, large=True)
     answer(link, leg)
@@ -354,7 +352,7 @@ def test_of_too_many_the_newest_goes_when_its_turn_comes(clock: Clock) -> None:
     assert clock.due == []
 
 
-def test_a_newer_one_that_comes_on_the_beat_takes_the_place_of_the_one_that_waits(clock: Clock) -> None:
+def test_newer_message_replaces_the_waiting_one(clock: Clock) -> None:
     link = Link()
     leg = best_effort(link, Contract(max_rate=10.0))
     leg.message(0, b"a")
@@ -378,7 +376,7 @@ def test_a_pause_costs_the_next_one_nothing(clock: Clock) -> None:
 
 
 @pytest.mark.parametrize("hertz", [30.01, 29.99, 30.0])
-def test_a_source_of_nearly_the_same_rate_loses_only_what_it_has_too_many_of(clock: Clock, hertz: float) -> None:
+def test_nearly_equal_rate_loses_only_the_surplus(clock: Clock, hertz: float) -> None:
     link = Link()
     leg = best_effort(link, Contract(max_rate=30.0))
     for _ in range(9_000):
@@ -390,7 +388,7 @@ def test_a_source_of_nearly_the_same_rate_loses_only_what_it_has_too_many_of(clo
 
 @settings(deadline=None, max_examples=60)
 @given(st.sampled_from([1.0, 30.0, 200.0]), st.lists(st.floats(0, 3), min_size=1, max_size=80))
-def test_any_source_keeps_to_the_rate_and_ends_with_its_newest(rate: float, gaps: list[float]) -> None:
+def test_rate_is_kept_and_the_newest_is_sent(rate: float, gaps: list[float]) -> None:
     with running(Clock()) as clock:
         link, went = Link(), []
         leg = best_effort(link, Contract(max_rate=rate))
@@ -415,7 +413,7 @@ def test_any_source_keeps_to_the_rate_and_ends_with_its_newest(rate: float, gaps
                 assert last - first <= (went[last] - went[first]) * rate + 0.6 + 1e-3
 
 
-def test_a_throttled_topic_of_large_messages_is_wanted_whole_and_changes_its_lane_too(clock: Clock) -> None:
+def test_downsampled_large_messages_are_sent_whole(clock: Clock) -> None:
     link = Link()
     leg = best_effort(link, Contract(max_rate=10.0))
     for n in range(4):
@@ -449,9 +447,7 @@ def test_nothing_more_happens_when_it_is_closed(clock: Clock) -> None:
 # --- reliable -------------------------------------------------------------------------------------------------
 
 
-def test_the_window_bounds_what_is_under_way_and_acknowledgements_move_it(
-    clock: Clock, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_acknowledgements_move_the_window(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mesh_limits, "RELIABLE_WINDOW_MESSAGES", 4)
     link = Link()
     leg = reliable(link)
@@ -483,7 +479,7 @@ def test_beyond_its_bounds_the_oldest_is_lost_and_said(monkeypatch: pytest.Monke
 
 
 @pytest.mark.usefixtures("clock")
-def test_it_is_wanted_whole_and_changes_its_lane_behind_a_fence() -> None:
+def test_reliable_message_changes_its_lane_behind_a_fence() -> None:
     link = Link()
     leg = reliable(link)
     leg.message(0, SMALL)
@@ -499,7 +495,7 @@ def test_it_is_wanted_whole_and_changes_its_lane_behind_a_fence() -> None:
 
 
 @pytest.mark.usefixtures("clock")
-def test_bulk_lost_what_was_on_it_is_sent_again_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lost_bulk_lane_is_replayed(monkeypatch: pytest.MonkeyPatch) -> None:
     link = Link()
     leg = reliable(link)
     leg.message(0, LARGE)
@@ -522,7 +518,7 @@ def test_bulk_lost_what_was_on_it_is_sent_again_and_nothing_else(monkeypatch: py
 
 
 @pytest.mark.usefixtures("clock")
-def test_bulk_lost_while_a_fence_is_on_the_express_lane_nothing_is_sent_twice() -> None:
+def test_bulk_lost_during_an_express_fence_replays_nothing() -> None:
     link = Link()
     leg = reliable(link)
     leg.message(0, SMALL)
@@ -533,7 +529,7 @@ def test_bulk_lost_while_a_fence_is_on_the_express_lane_nothing_is_sent_twice() 
     assert link.numbers == [1, 2]
 
 
-def test_bulk_lost_on_the_way_back_all_goes_by_the_express_lane(clock: Clock) -> None:
+def test_bulk_lost_on_the_way_back_uses_the_express_lane(clock: Clock) -> None:
     link = Link()
     leg = reliable(link)
     leg.message(0, LARGE)
@@ -564,7 +560,7 @@ def test_an_old_acknowledgement_does_no_harm() -> None:
 
 
 @pytest.mark.usefixtures("clock")
-def test_an_acknowledgement_of_what_was_never_sent_is_the_peers_error() -> None:
+def test_acknowledgement_of_unsent_messages_is_an_error() -> None:
     link = Link()
     leg = reliable(link)
     leg.message(0, SMALL)
@@ -574,7 +570,7 @@ def test_an_acknowledgement_of_what_was_never_sent_is_the_peers_error() -> None:
 
 @pytest.mark.usefixtures("clock")
 @pytest.mark.parametrize("after", [0, 1, 2, 3])
-def test_over_a_new_link_it_goes_on_behind_what_the_peer_has(after: int) -> None:
+def test_new_link_goes_on_behind_the_peers_position(after: int) -> None:
     old, new = Link(), Link()
     leg = reliable(old)
     for n in range(3):
@@ -596,7 +592,7 @@ def test_over_a_new_link_it_goes_on_behind_what_the_peer_has(after: int) -> None
 
 
 @pytest.mark.usefixtures("clock")
-def test_over_a_new_link_a_topic_of_large_messages_changes_its_lane_first() -> None:
+def test_large_topic_changes_its_lane_on_a_new_link() -> None:
     old, new = Link(), Link()
     leg = reliable(old, large=True)
     answer(old, leg)
@@ -613,7 +609,7 @@ def test_over_a_new_link_a_topic_of_large_messages_changes_its_lane_first() -> N
 
 
 @pytest.mark.usefixtures("clock")
-def test_what_was_acknowledged_since_a_peer_said_where_it_is_counts() -> None:
+def test_later_acknowledgement_outweighs_the_position() -> None:
     """Of two links that come up at once, the word of the one that is given up comes last."""
     old, new = Link(), Link()
     leg = reliable(old)
@@ -639,7 +635,7 @@ def test_a_peer_cannot_go_on_where_it_never_was() -> None:
     assert new.numbers == [2]
 
 
-def test_a_throttled_one_keeps_the_newest_over_the_loss_of_its_link(clock: Clock) -> None:
+def test_downsampled_route_keeps_the_newest_over_a_link_loss(clock: Clock) -> None:
     old, new = Link(), Link()
     leg = reliable(old, Contract(reliability=Reliability.RELIABLE, max_rate=10.0))
     for n in range(3):
