@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.bed.processes import eventually
 from rmpa.bridge.actions import Describe, Publish
 from rmpa.bridge.messages import Description as About
 from rmpa.bridge.messages import Source
 from rmpa.bridge.topics.io.proxies import PeerProxies
 from rmpa.core.contract import Contract
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.experiments.bed.processes import eventually
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.http.client import call_api
@@ -33,8 +33,8 @@ from tests.ros.node.peers import RawSubscriber
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from rmpa.experiments.bed.agents import Agent
-    from rmpa.experiments.bed.processes import Process
+    from lab.bed.agents import Agent
+    from lab.bed.processes import Process
     from tests.interop.conftest import AgentFactory, ShellFactory
     from tests.interop.ros import Ros
 
