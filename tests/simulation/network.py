@@ -197,7 +197,7 @@ class End:
         self.on_close: Callable[[bool], None] = lambda _: None
         self._network = network
         self._stream = stream
-        self._in_flight: deque[tuple[float, bytes | bool]] = deque()
+        self._packets: deque[tuple[float, bytes | bool]] = deque()
         self._pumping = False
         self._early: list[bytes | bool] = []
         self.ready = False
@@ -216,7 +216,7 @@ class End:
             return
         self.closed = True
         if reset:
-            self._in_flight.clear()
+            self._packets.clear()
         self._push(reset)
 
     def begin(self) -> None:
@@ -241,27 +241,27 @@ class End:
 
     def _push(self, item: bytes | bool) -> None:
         when = self._network.world.now + self._network.delay()
-        if self._in_flight:
-            when = max(when, self._in_flight[-1][0])
-        self._in_flight.append((when, item))
+        if self._packets:
+            when = max(when, self._packets[-1][0])
+        self._packets.append((when, item))
         if not self._pumping:
             self._pumping = True
             self._network.world.at(when, self._pump)
 
     def _pump(self) -> None:
         world = self._network.world
-        while self._in_flight and self._in_flight[0][0] <= world.now:
+        while self._packets and self._packets[0][0] <= world.now:
             if self.other.closed:
-                self._in_flight.clear()
+                self._packets.clear()
                 break
             if not self._network.reaches(self.host, self.other.host):
                 world.after(_RETRY, self._pump)
                 return
-            _, item = self._in_flight.popleft()
+            _, item = self._packets.popleft()
             self.other.arrive(item)
-        self._pumping = bool(self._in_flight)
+        self._pumping = bool(self._packets)
         if self._pumping:
-            world.at(self._in_flight[0][0], self._pump)
+            world.at(self._packets[0][0], self._pump)
         else:
             self._forget()
 
