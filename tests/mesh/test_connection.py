@@ -1,4 +1,4 @@
-"""Two link machines back to back."""
+"""Two connection machines back to back."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_handshake_control_data_and_bye_in_pieces(chunk: int) -> None:
     assert dialler.link.state is ConnectionState.CLOSING
     deliver(dialler.link.take_output(), acceptor.link, time.now, chunk)
     assert acceptor.last() == ConnectionClosed("low left: shutting down", orderly=True)
-    dialler.link.drained()
+    dialler.link.lost("the other side closed the connection")
     assert dialler.last() == ConnectionClosed("shutting down", orderly=True)
 
 
@@ -85,7 +85,7 @@ def test_a_refusal_reaches_the_dialler_and_both_end() -> None:
         Refused(refuse, by_us=False),
         ConnectionClosed("? refused: busy: come later", orderly=True),
     ]
-    acceptor.link.drained()
+    acceptor.link.lost("the other side closed the connection")
     assert acceptor.last() == ConnectionClosed("refused: busy: come later", orderly=True)
 
 

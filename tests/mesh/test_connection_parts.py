@@ -1,4 +1,4 @@
-"""Messages in parts, marks between them, and what a bulk lane's machine does otherwise."""
+"""Messages in parts, marks between them, and how a bulk lane's machine differs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hello, welcome, refuse: golden bytes, malformed, and every reason to say no."""
+"""Hello, welcome, refuse: golden bytes, malformed, and every reason to refuse."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ HOST = "10.0.0.2"
 
 
 class Lane:
-    """A connection whose data stands still, looked at from time to time."""
+    """A connection whose data stalls, sampled from time to time."""
 
     def __init__(self, segment: int | None = None, **changes: float) -> None:
         self.now = 100.0
@@ -97,7 +97,7 @@ def test_little_data_that_stands_still_is_no_sign() -> None:
 
 
 def test_a_window_that_is_closed_is_no_sign() -> None:
-    """A stopped peer: its kernel acknowledges what it took, and nothing is repeated."""
+    """A stopped peer: its kernel acknowledges what it took, and nothing is retransmitted."""
     lane = Lane()
     for _ in range(20):
         assert lane.look(0.5, 0) is Progress.FLOWING

@@ -1,4 +1,4 @@
-"""Who dials whom, when, and which of two links stays."""
+"""Which side dials, when, and which of two links stays."""
 
 from __future__ import annotations
 
@@ -250,7 +250,7 @@ def test_own_identity_is_no_peer() -> None:
 
 
 class Crossing:
-    """Both dial at once; what is under way is delivered in an order that the test chooses.
+    """Both dial at once; what is in flight is delivered in an order that the test chooses.
 
     Link ids are 1 for the lower's call and 2 for the higher's, on both sides. What one side sends on one
     connection stays in order, as TCP keeps it.
@@ -329,7 +329,7 @@ def stranger(number: int) -> Identity:
 
 
 class Network:
-    """Answers the dials of one peering at once: who is there is linked, nobody else answers."""
+    """Answers the dials of one peering at once: existing peers are linked, others do not answer."""
 
     def __init__(self, *there: Identity) -> None:
         self.peering = of(LOW)

@@ -1,4 +1,4 @@
-"""Reliable delivery: each message once, in order, or counted; whatever becomes of the links."""
+"""Reliable delivery: each message once, in order, or counted as lost, however often links fall."""
 
 from __future__ import annotations
 
@@ -251,7 +251,7 @@ def test_bounds_that_cannot_be_are_our_own_fault(depth: int, window: int) -> Non
 
 
 def cost(waiting: int, *, dropping: bool) -> float:
-    """Seconds of this process for 2000 messages, with so many others waiting, half of them under way."""
+    """Seconds of this process for 2000 messages, with so many others waiting, half of them in flight."""
     depth = waiting + 10 * (not dropping)
     machine = sender(depth=depth, max_bytes=1 << 30, window=depth, window_bytes=1 << 30)
     fill(machine, waiting)

@@ -1,4 +1,4 @@
-"""Down-sampling: the rate is kept over every window, and the beat is steady."""
+"""Down-sampling: the rate is kept over every window, and the period is steady."""
 
 from __future__ import annotations
 

@@ -130,7 +130,7 @@ def test_new_link_begins_on_the_express_lane() -> None:
 
 
 class TwoLanes(RuleBasedStateMachine):
-    """A sender as ``judge`` says, over two queues of which each may be as slow as it likes."""
+    """A sender that follows ``judge``, over two queues that are independently slow."""
 
     def __init__(self) -> None:
         super().__init__()

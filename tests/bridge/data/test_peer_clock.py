@@ -1,4 +1,4 @@
-"""What another machine's clock was."""
+"""The history of a peer's clock."""
 
 from __future__ import annotations
 

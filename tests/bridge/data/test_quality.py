@@ -21,7 +21,7 @@ WALL = 1_700_000_000 * SECOND
 
 
 def clock(offset: float = 0.0, error: float = 0.0, now: float = 0.0) -> PeerClock:
-    """A clock of which one thing is known."""
+    """A clock with one estimate."""
     found = PeerClock()
     found.add(offset, error, now)
     return found

@@ -60,7 +60,7 @@ async def test_one_side_alone_knows_the_other() -> None:
 
 
 async def test_of_several_addresses_whichever_answers_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody answers at the GUID's own address; at the next one nobody listens, and at the third a stranger does."""
+    """The GUID's own address does not answer, the next one refuses, at the third another program answers."""
     one, other = sorted((Peer(1, host="127.0.0.4"), Peer(2, host="127.0.0.4")), key=lambda p: p.identity.guid)
     connect = one.mesh.dialler.connect  # where packets are swallowed
 
@@ -91,7 +91,7 @@ async def test_of_several_addresses_whichever_answers_is_used(monkeypatch: pytes
 async def test_link_that_ends_during_its_redial_leaks_no_socket(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The race of addresses ends when the silent link, and its socket, are closed already."""
+    """The race of addresses ends after the silent link and its socket were closed."""
     async with peers(2) as made:
         one, other = sorted(made, key=lambda peer: peer.identity.guid)
         await until(lambda: one.linked(other) and other.linked(one), "a link")
@@ -291,7 +291,7 @@ async def test_unread_control_frames_close_the_link(monkeypatch: pytest.MonkeyPa
 
 
 def test_kernel_queue_stays_short_for_a_slow_peer() -> None:
-    """What waits in our own queue can be overtaken and dropped; a pong behind megabytes of data was 5 s late."""
+    """Messages in the agent's own queue can be overtaken; a pong behind megabytes of data was 5 s late."""
     counters = Counters()
     with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as sock:
         tune_express(sock, LaneSettings(), counters)

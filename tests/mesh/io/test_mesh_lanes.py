@@ -30,7 +30,7 @@ HAND_MADE = Identity(Guid.of("127.0.0.1", 9), b"h" * 16, "hand_made")
 
 
 def large(number: int, size: int) -> bytes:
-    """Bytes of which no piece is like another."""
+    """Bytes without repetitions."""
     block = hashlib.sha256(number.to_bytes(4, "big")).digest()
     return b"".join(hashlib.sha256(block + n.to_bytes(4, "big")).digest() for n in range(size // 32 + 1))[:size]
 
@@ -369,7 +369,7 @@ async def test_a_killed_peer_leaves_no_lane_behind() -> None:
 
 
 async def test_new_bulk_lane_replaces_a_stuck_one() -> None:
-    """The peer gave its connection up, and we have not heard of it: a router forgot it, perhaps."""
+    """The peer gave its connection up without this side noticing: perhaps a router forgot it."""
     async with peers(1) as (one,):
         express, _ = await raw(one, HAND_MADE, lease=60.0)
         stuck, answer = await raw(one, HAND_MADE, lease=60.0, lane=Lane.BULK)
@@ -485,7 +485,7 @@ async def test_fence_waits_for_the_lanes_connection() -> None:
 
 
 async def test_fence_on_an_unused_link_is_not_answered() -> None:
-    """The answer would say that they were taken."""
+    """An answer would mean that the messages were delivered."""
     async with peers(1) as (one,):
         sock, _ = await raw(one, HAND_MADE, lease=60.0)
         await until(lambda: bool(one.ups), "a link")

@@ -1,4 +1,4 @@
-"""Links on a path that drops large packets: what the kernel tells is made up, all else is real."""
+"""Links on a path that drops large packets: the kernel's statistics are made up, all else is real."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FIRST, LEAST = limits.SEGMENT_BYTES
 
 
 class Hole:
-    """Lets connections stand still that send segments larger than ``passes`` bytes."""
+    """Stalls connections that send segments larger than ``passes`` bytes."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, *peers: Peer) -> None:
         self.passes = 0

@@ -1,4 +1,4 @@
-"""What happens to each message on its way through the bridge, with a clock that is told the time."""
+"""What happens to each message on its way through the bridge, under a simulated clock."""
 
 from __future__ import annotations
 
@@ -184,8 +184,8 @@ def test_parts_or_the_whole_go_to_each_sender() -> None:
     flow.part(memoryview(payload)[100:])
     assert got(streams) == [(1, b"small"), (2, payload)]
     assert got(whole) == [(1, b"small")]
-    leg = flow.by_peer[2]
-    leg.fenced(whole.fences.popleft()[1])
+    sender = flow.by_peer[2]
+    sender.fenced(whole.fences.popleft()[1])
     assert got(whole) == [(1, b"small"), (2, payload)]
     assert got(slow) == [(1, b"small")]
     assert (flow.messages, flow.bytes) == (2, len(payload) + 5)
@@ -252,18 +252,18 @@ def test_dead_publisher_leaves_no_partial_message(latching: bool) -> None:
 
 def test_only_reliable_routes_are_suspended() -> None:
     flow, old, new, other = ExportFlow(), Link(), Link(), Link()
-    leg = flow.add(1, old, 7, RELIABLE, 3)
+    sender = flow.add(1, old, 7, RELIABLE, 3)
     flow.add(2, other, 7, BEST, 0)
     flow.message(memoryview(b"a"))
     for peer in (1, 2, 3):
         flow.suspend(peer)
     flow.message(memoryview(b"b"))
     give(flow, bytes(BIG))
-    assert leg.reliable
-    leg.resume(new, 8, 1)  # type: ignore[attr-defined]
+    assert sender.reliable
+    sender.resume(new, 8, 1)  # type: ignore[attr-defined]
     assert got(old) == [(1, b"a")]
     assert got(new) == [(2, b"b")]
-    leg.fenced(new.fences.popleft()[1])
+    sender.fenced(new.fences.popleft()[1])
     assert got(new) == [(2, b"b"), (3, bytes(BIG))]
     assert [payload for _, _, payload in other.sent] == [b"a", b"b"]
 
@@ -272,7 +272,7 @@ def test_only_reliable_routes_are_suspended() -> None:
 
 
 class Inlet:
-    """A flow from a peer, and what came of it.
+    """A flow from a peer, and what it delivered.
 
     Args:
         contract: Of the route.
@@ -473,7 +473,7 @@ def test_lost_lane_loses_the_message_in_parts() -> None:
 
 @pytest.mark.parametrize("small", [False, True])
 def test_newer_message_ends_one_in_parts(small: bool) -> None:
-    """The sender knows sooner than we do that a lane has gone, and goes on by the other one."""
+    """The sender notices sooner than the receiver that a lane is gone, and goes on by the other one."""
     inlet = Inlet()
     inlet.message(1, b"one")
     inlet.parts(2, bytes(BIG), 50, end=1)
