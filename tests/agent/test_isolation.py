@@ -262,7 +262,7 @@ async def plans_are_reconciled(world: World) -> None:
             assert agent.bridge._reconciler is not None
             agent.bridge._reconciler.cancel()
             agent.bridge._reconcile()
-        await world.until(lambda: not (world.near.bridge._changed or world.far.bridge._changed))
+        await world.until(lambda: world.near.bridge.topics.idle and world.far.bridge.topics.idle)
 
 
 async def other_rules_hold(world: World) -> None:
@@ -280,7 +280,7 @@ async def the_link_falls_and_comes_back(world: World) -> None:
     for _ in range(4):
         attached = next(iter(world.near.bridge.attached()))
         attached.link.abort("pulled")
-        await world.until(lambda attached=attached: attached.away is None and world.linked())  # type: ignore[misc]
+        await world.until(lambda attached=attached: attached.linked and world.linked())  # type: ignore[misc]
         await world.until(lambda: world.shown() == TOPICS)
 
 

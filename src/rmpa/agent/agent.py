@@ -50,7 +50,7 @@ from rmpa.runtime.service_manager import notify_service_manager
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.bridge.io.bridge import PeerSession
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.config.sources import Loaded
     from rmpa.mesh.io.link import MeshLink
@@ -120,14 +120,31 @@ class Agent:
             started=time.time(),
             wishes=wishes,
         )
-        self.params = Params(self.core, self.bridge, settings.params, settings.time, settings.limits.params)
+        self.params = Params(
+            self.core,
+            self.bridge.node,
+            self.bridge.asks,
+            self.bridge.sessions.linked,
+            self.bridge.counters,
+            settings.params,
+            settings.time,
+            settings.limits.params,
+        )
         self.bridge.add(self.params)
         rules = ServiceRules(
             settings.services, Policy(settings.policy, settings.peers, settings.time), Names(settings.peers)
         )
-        self.services = Services(self.core, self.bridge, rules, settings.limits)
+        self.services = Services(
+            self.core,
+            self.bridge.sessions,
+            self.bridge.asks,
+            self.bridge.relay,
+            rules,
+            settings.limits,
+            self.bridge.counters,
+        )
         self.bridge.add(self.services)
-        bounds = Bounds(self.bridge, self.services, settings.limits)
+        bounds = Bounds(self.bridge.sessions, self.bridge.asks, self.bridge.topics, self.services, settings.limits)
         self.bridge.add(bounds)
         self._view.watch(bounds)
         self._view.services = ServicesSection(self.services)

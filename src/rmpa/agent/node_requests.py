@@ -23,7 +23,8 @@ from rmpa.runtime.event_loop import yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.bridge.io.bridge import Bridge
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.ros.core.api import Core
 
@@ -93,7 +94,7 @@ class NodeRequests:
             value = await self._bridge.asks.ask(attached, LIST, {})
             return PeerNodes(peer=peer, nodes=msgspec.convert(value, tuple[NodeLine, ...]))
         except (RmpaError, msgspec.ValidationError) as error:
-            nodes = tuple(NodeLine(name=node) for node, _ in attached.inbound)
+            nodes = tuple(NodeLine(name=node) for node, _ in attached.proxies)
             return PeerNodes(peer=peer, nodes=nodes, problem=str(error))
 
     # --- the peers' questions ------------------------------------------------------------------------------------

@@ -13,9 +13,9 @@ from rmpa.observe.snapshot import FollowedInfo
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.bridge.io.bridge import PeerSession
     from rmpa.bridge.params.io.part import Params
     from rmpa.bridge.session.peer_rpc import PeerRpc
+    from rmpa.bridge.session.peer_session import PeerSession
 
 
 class ParamOps:

@@ -336,6 +336,10 @@ _INSTANCE: Final = re.compile(r"[0-9a-f]{32}")
 _ROUTE_MAX: Final = (1 << 32) - 1
 
 
+_OP: Final = b'{"op":"'
+_OP_MAX: Final = 32
+
+
 def is_crossing_name(name: str) -> bool:
     """Whether a topic's or node's name may be in a message: a global one that is not too long."""
     return len(name) <= config_limits.CROSSING_NAME_MAX and is_global_name(name)
@@ -349,6 +353,15 @@ def is_crossing_type(name: str) -> bool:
 def encode(message: Message) -> bytes:
     """One message as the payload of a control frame."""
     return _ENCODER.encode(message)
+
+
+def op_of(payload: bytes | bytearray | memoryview) -> str:
+    """The kind of a control message, without parsing it; empty if its text does not begin with it.
+
+    Those of our encoder do; others are parsed at once, which costs only time.
+    """
+    head = bytes(payload[:_OP_MAX])
+    return head[len(_OP) :].partition(b'"')[0].decode("ascii", "replace") if head.startswith(_OP) else ""
 
 
 def decode(payload: bytes | bytearray | memoryview) -> Message:

@@ -18,12 +18,14 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from rmpa.bridge import limits
+from rmpa.bridge.messages import Origin
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.bridge.messages import Origin, Source
+    from rmpa.bridge.messages import Source
     from rmpa.core.guid import Guid
+    from rmpa.core.identity import Identity
 
 Place = tuple[str, str]
 """A topic and the proxy that publishes it, as they are in the local graph."""
@@ -42,6 +44,20 @@ class Relay:
         """Our own, as 32 hexadecimal digits."""
         self._origins: dict[Place, tuple[int, Source, Origin]] = {}
         self._places: dict[tuple[int, Source], Place] = {}
+
+    def pass_on(self, peer: int, relay: Identity, source: Source, place: Place, origin: Origin | None) -> None:
+        """Offer what a peer brings to others, if this module relays.
+
+        Args:
+            peer: By whose link it came.
+            relay: That peer.
+            source: As that peer knows it.
+            place: What it is here.
+            origin: Whose it is; ``None``: that peer's own.
+        """
+        if self.enabled:
+            own = Origin(relay.name, str(relay.guid), relay.instance.hex(), source.node)
+            self.shown(peer, source, place, origin or own)
 
     def shown(self, peer: int, source: Source, place: Place, origin: Origin) -> None:
         """A peer's source is about to appear in the local graph.

@@ -44,15 +44,16 @@ def lost_at_receiver(side: Side) -> int:
     """What the receiving module says is lost."""
     (attached,) = side.attached
     entry = side.bridge.imports.get(attached.peer, SURE)
-    flow = attached.inbound.flow(SURE, entry.route if entry is not None else 0)
-    past = attached.inbound.past(SURE)
+    topics = side.bridge.topics.of(attached)
+    flow = topics.flow(SURE, entry.route if entry is not None else 0)
+    past = topics.past(SURE)
     return flow.lost if flow is not None else past.lost if past is not None else 0
 
 
 def unknown_at_receiver(side: Side) -> int:
     """How often it says that nobody knows how many."""
     (attached,) = side.attached
-    flow = attached.inbound.flow(SURE, 0)
+    flow = side.bridge.topics.of(attached).flow(SURE, 0)
     return flow.watch.counts[QosEventKind.LOSS_UNKNOWN] if flow is not None else 0
 
 
@@ -334,11 +335,11 @@ def test_the_links_end_ends_the_waiting_for_its_claims(monkeypatch: pytest.Monke
         monkeypatch.setattr(limits, "TELL_PATIENCE", 1e9)
         await back_on_a_busy_lane(world, speaker)
         (attached,) = a.attached
-        timer = attached.back
-        assert timer is not None
+        claims = a.bridge.topics._claims
+        assert claims.untold == {attached.peer}
         for index in (0, 1):
             world.notice(index, silent=True)
-        assert timer.cancelled()
+        assert claims.next_timer() is None
         await asyncio.sleep(2 * mesh_limits.RESUME_CLAIM_MAX)
         assert waits(a), "its outage goes on"
 

@@ -21,8 +21,9 @@ BIG = Source("/big", "/one")
 
 def there(world: World) -> ImportFlow:
     """The flow at the receiver."""
-    (attached,) = world.sides[1].attached
-    flow = attached.inbound.flow(BIG, 0)
+    side = world.sides[1]
+    (attached,) = side.attached
+    flow = side.bridge.topics.of(attached).flow(BIG, 0)
     assert flow is not None
     return flow
 

@@ -55,6 +55,7 @@ class NetworkEndpoint:
         clock = SystemClock()
         self._settings = settings
         self._bridge = bridge
+        sessions, receiver = bridge.sessions, bridge.receiver
         self._on_displaced = on_displaced
         tcp, udp = open_mesh_port(port)
         self.port: int = tcp.getsockname()[1]
@@ -76,7 +77,7 @@ class NetworkEndpoint:
             on_link_up=self._link_up,
             on_link_down=self._link_down,
             on_control=bridge.control,
-            takers=LinkHandlers(bridge.data, bridge.part, bridge.mark, bridge.clock, bridge.lane_lost),
+            takers=LinkHandlers(receiver.data, receiver.part, receiver.mark, sessions.clock, sessions.lane_lost),
             lanes=settings.lanes,
             clock=clock,
         )
@@ -117,10 +118,10 @@ class NetworkEndpoint:
     def _link_up(self, link: MeshLink) -> None:
         # Its beacons' port is its mesh port, whichever port an accepted connection came from.
         self.discovery.link_up(link.identity, (link.remote_endpoint[0], link.identity.guid.port))
-        self._bridge.link_up(link)
+        self._bridge.sessions.link_up(link)
 
     def _link_down(self, link: MeshLink, reason: str) -> None:
-        self._bridge.link_down(link)
+        self._bridge.sessions.link_down(link)
         if reason != REPLACED:  # the peer is linked all the while: nobody else may take its seat
             self.discovery.link_down(link.identity.guid, link.identity.instance)
 

@@ -13,8 +13,8 @@ from rmpa.ros.core.notifier import MASTER_ID
 from rmpa.ros.wire.xmlrpc import RosReply
 
 if TYPE_CHECKING:
-    from rmpa.bridge.io.bridge import PeerSession
     from rmpa.bridge.session.peer_rpc import PeerRpc
+    from rmpa.bridge.session.peer_session import PeerSession
 
 _log = logging.getLogger(__name__)
 
@@ -75,7 +75,7 @@ class RemoteKills:
         if self._all.get(caller, 0.0) > loop.time():
             self._all[caller] = loop.time() + limits.NODE_KILL_ALL
             return "kill -a ends the nodes of this module only; name a node of another module to end it"
-        if attached.away is not None:
+        if not attached.linked:
             return f"{attached.link.name} is not linked"
         if self._under_way >= limits.NODE_KILLS_AT_ONCE:
             return f"{self._under_way} other nodes are being ended; try again"

@@ -286,6 +286,17 @@ class ServiceImports:
 
     # --- what peers offer --------------------------------------------------------------------------------------
 
+    @staticmethod
+    def portions(message: AdvertiseServices) -> Iterator[AdvertiseServices]:
+        """Split an advertisement into portions that ``advertised`` deals with in a moment."""
+        first, rest = message, message.added
+        while len(rest) > limits.LEARNT_AT_ONCE:
+            added, rest = rest[: limits.LEARNT_AT_ONCE], rest[limits.LEARNT_AT_ONCE :]
+            # What is no more is taken in at the end: what takes its place must not find it there.
+            yield AdvertiseServices(added, first.removed, first.full, more=True)
+            first = AdvertiseServices()
+        yield AdvertiseServices(rest, first.removed, first.full, more=message.more)
+
     def advertised(self, peer: int, message: AdvertiseServices) -> list[ImportAction]:
         """A peer says what it provides, all or what changed."""
         known = self._peers.get(peer)

@@ -23,8 +23,8 @@ from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
-    from rmpa.bridge.io.bridge import PeerSession
     from rmpa.bridge.messages import Message
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.core.counters import Counters
 
 _log = logging.getLogger(__name__)

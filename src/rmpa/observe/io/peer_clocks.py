@@ -31,5 +31,5 @@ class PeerClocks:
         for attached in self._bridge.everyone():
             clock = self._clocks[attached.peer] = before.get(attached.peer) or PeerClock()
             offset, error = attached.link.clock_offset, attached.link.clock_error
-            if offset is not None and error is not None and attached.away is None:
+            if offset is not None and error is not None and attached.linked:
                 clock.told(offset, error, now)

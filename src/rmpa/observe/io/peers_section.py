@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rmpa.bridge.io.bounds import Bounds
-    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.io.network_endpoint import NetworkEndpoint
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.discovery.events import PeerView
     from rmpa.mesh.io.link import MeshLink
     from rmpa.mesh.io.path_monitor import PathMonitor

@@ -18,8 +18,9 @@ from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.runtime.event_loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.services.io.part import Services
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.ros.core.api import Core
 

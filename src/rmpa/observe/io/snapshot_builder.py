@@ -124,7 +124,7 @@ class SnapshotBuilder:
 
     def _agent(self) -> AgentInfo:
         identity = self.station.identity if self.station is not None else None
-        proxies = sum(attached.inbound.count for attached in self._bridge.everyone())
+        proxies = sum(len(attached.proxies) for attached in self._bridge.everyone())
         return AgentInfo(
             name=self._settings.name,
             guid=str(identity.guid) if identity else "",

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 from rmpa.bridge import limits as bridge_limits
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Policy, is_own
-from rmpa.bridge.proxy_names import proxy_name
 from rmpa.config import limits as config_limits
 from rmpa.config.values import did_you_mean
 from rmpa.core.contract import Reliability
@@ -19,7 +18,8 @@ from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.event_loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.bridge.io.bridge import Bridge
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.observe.io.snapshot_builder import SnapshotBuilder
     from rmpa.observe.snapshot import PeerInfo
@@ -76,7 +76,7 @@ class TopicFacts:
             return NearTopic(snapshot, topic)
         only, registered, conflict = set(), set(), set()
         readers, mismatches, proxies = {}, {}, {}
-        publishers, standing = self._core.publishers(topic), dict(attached.inbound)
+        publishers, standing = self._core.publishers(topic), dict(attached.proxies)
         for number, source in list(self._bridge.imports.at(topic)):
             entry = self._bridge.imports.get(number, source)
             if number != attached.peer or entry is None:
@@ -87,7 +87,7 @@ class TopicFacts:
             only.add(node)
             if entry.conflict:
                 conflict.add(node)
-            name = attached.inbound.names.get(node) or proxy_name(attached.inbound.prefix, node)
+            name = attached.proxies.name(node)
             proxies[node] = name
             if node in standing and publishers.get(name) == standing[node].node.uri:
                 registered.add(node)
@@ -105,9 +105,8 @@ class TopicFacts:
             mismatches,
         )
 
-    @staticmethod
-    def _readers(attached: PeerSession, source: Source) -> tuple[Reader, ...]:
-        publication = attached.inbound.publication(source)
+    def _readers(self, attached: PeerSession, source: Source) -> tuple[Reader, ...]:
+        publication = self._bridge.topics.of(attached).publication(source)
         return tuple(
             Reader(
                 number=link.number,

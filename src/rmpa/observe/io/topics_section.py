@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.data.peer_clock import PeerClock
     from rmpa.bridge.data.quality import QualitySummary
-    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.bridge.io.bridge import Bridge
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
     from rmpa.bridge.topics.imports import RemoteTopic
     from rmpa.config.settings import Settings
@@ -170,14 +171,15 @@ class TopicsSection:
             )
 
     def _import(self, at: PeerSession, source: Source, entry: RemoteTopic, clock: PeerClock) -> RouteInfo:
-        flow = at.inbound.flow(source, entry.route)
-        publication = at.inbound.publication(source)
-        past = at.inbound.past(source) if flow is None else None
+        topics = self._bridge.topics.of(at)
+        flow = topics.flow(source, entry.route)
+        publication = topics.publication(source)
+        past = topics.past(source) if flow is None else None
         happened = flow.watch if flow is not None else past
         latched = entry.description.latching if entry.description else False
         now = self._clock.now()
         quality = flow.quality.summary(clock, now, latching=latched) if flow else None
-        problem = at.inbound.problems.get(source.node, "")
+        problem = at.proxies.problems.get(source.node, "")
         if not problem and entry.state is not RouteState.OPEN:
             problem = entry.problem
         return RouteInfo(

@@ -18,8 +18,9 @@ from rmpa.observe.why.services import FarService, walk_service
 from rmpa.observe.why.topics import find_peer, walk_peer, walk_topic
 
 if TYPE_CHECKING:
-    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.services.io.part import Services
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.observe.io.snapshot_builder import SnapshotBuilder
     from rmpa.observe.snapshot import PeerInfo

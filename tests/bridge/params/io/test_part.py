@@ -25,8 +25,9 @@ from rmpa.ros.master.effects import ParamUpdate
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.ros.core.api import Core
+    from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 OURS = "http://127.0.0.1:1/"
@@ -74,11 +75,14 @@ class Side:
         self.counters = Counters()
         self.asks = PeerRpc(self.counters)
         self.links: dict[int, PeerSession] = {}
-        bridge = SimpleNamespace(
-            node=SimpleNamespace(uri=OURS), asks=self.asks, counters=self.counters, attached=self.links.values
-        )
         self.params = Params(
-            cast("Core", self.core), cast("Bridge", bridge), params or ParamSettings(), time or TimeSettings()
+            cast("Core", self.core),
+            cast("SlaveNode", SimpleNamespace(uri=OURS)),
+            self.asks,
+            self.links.values,
+            self.counters,
+            params or ParamSettings(),
+            time or TimeSettings(),
         )
         self.core.told = self.params.param_update
 

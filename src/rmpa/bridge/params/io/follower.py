@@ -16,9 +16,9 @@ from rmpa.core.errors import RemoteProtocolError, RmpaError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rmpa.bridge.io.bridge import PeerSession
     from rmpa.bridge.params.rules import Followed
     from rmpa.bridge.session.peer_rpc import PeerRpc
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import FollowRule
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 

@@ -20,9 +20,9 @@ from rmpa.runtime.event_loop import yield_to_data, yielding_to_data
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from rmpa.bridge.io.bridge import PeerSession
     from rmpa.bridge.params.rules import ParamPolicy
     from rmpa.bridge.session.peer_rpc import PeerRpc
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 _log = logging.getLogger(__name__)

@@ -17,12 +17,15 @@ from rmpa.config import limits as config_limits
 from rmpa.core.errors import RmpaError, UnreachableError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
-    from rmpa.bridge.io.bridge import Bridge, PeerSession
     from rmpa.bridge.params.rules import Followed
+    from rmpa.bridge.session.peer_rpc import PeerRpc
+    from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import ParamSettings, Settings, TimeSettings
+    from rmpa.core.counters import Counters
     from rmpa.ros.core.api import Core
+    from rmpa.ros.node.slave_node import SlaveNode
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
 _log = logging.getLogger(__name__)
@@ -33,7 +36,10 @@ class Params(Part):
 
     Args:
         core: The local core.
-        bridge: Its node is told of changes, its asks carry the questions; add this part to it.
+        node: The agent's own node, which is told of changes.
+        rpc: Carries the requests between the modules.
+        linked: The peers that have a link now.
+        counters: Counts ``param.put_back`` and ``param.refused``.
         params: What peers may do, and what is followed.
         time: Whether time is shared, and whose is followed.
         most: How many parameters one peer may follow here.
@@ -42,16 +48,17 @@ class Params(Part):
     def __init__(
         self,
         core: Core,
-        bridge: Bridge,
+        node: SlaveNode,
+        rpc: PeerRpc,
+        linked: Callable[[], Iterable[PeerSession]],
+        counters: Counters,
         params: ParamSettings,
         time: TimeSettings,
         most: int = config_limits.FOLLOWED_MAX,
     ) -> None:
-        self._core = ParamCore(core, bridge.node)
-        self._desk = ParamServer(self._core, ParamPolicy(params, time), bridge.asks, most)
-        self._follower = ParamFollower(
-            self._core, bridge.asks, bridge.attached, follow_rules(params, time), bridge.counters
-        )
+        self._core = ParamCore(core, node)
+        self._desk = ParamServer(self._core, ParamPolicy(params, time), rpc, most)
+        self._follower = ParamFollower(self._core, rpc, linked, follow_rules(params, time), counters)
         self._looking: asyncio.Task[None] | None = None
         self._run: XmlRpcValue = None
 
