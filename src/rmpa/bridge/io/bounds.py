@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.bridge.bounds import Beyond, from_json, to_json
+from rmpa.bridge.catalogue.bounds import Beyond, from_json, to_json
 from rmpa.bridge.session.part import Part
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rmpa.config.settings import LimitSettings, Settings
 
 HIDDEN: Final = "limits.hidden"
-"""The news: what of the peer that gets it is hidden here (``bridge.bounds.to_json``); empty when nothing is."""
+"""The news: what of the peer that gets it is hidden here, as ``Beyond`` in JSON; empty when nothing is."""
 
 
 class Bounds(Part):

@@ -21,8 +21,9 @@ from enum import Enum, auto
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Final
 
-from rmpa.bridge import bounds, limits
+from rmpa.bridge import limits
 from rmpa.bridge.actions import Send, Warn
+from rmpa.bridge.catalogue import bounds
 from rmpa.bridge.messages import (
     AdvertiseServices,
     CloseService,

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Send, Warn
+from rmpa.bridge.catalogue.pacing import Pacing
 from rmpa.bridge.messages import decode, encode
-from rmpa.bridge.pacing import Pacing
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.machine_timer import MachineTimer

@@ -26,8 +26,9 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec import UnsetType
 
-from rmpa.bridge import bounds, limits
+from rmpa.bridge import limits
 from rmpa.bridge.actions import Action, Describe, Detach, Publish, Retract, Send, Warn
+from rmpa.bridge.catalogue import bounds
 from rmpa.bridge.messages import (
     Advertise,
     CloseRoute,

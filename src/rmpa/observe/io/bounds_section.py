@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from rmpa.observe.snapshot import BoundInfo
 
 if TYPE_CHECKING:
-    from rmpa.bridge.bounds import Beyond
+    from rmpa.bridge.catalogue.bounds import Beyond
 
 _DENY = {"services": "services.deny"}
 
