@@ -78,7 +78,9 @@ async def test_figures_of_a_topic_that_crosses(tmp_path: Path) -> None:
         await send(publisher, 20, 0.01)
         await until(
             lambda: all(
-                flow.quality.messages == 20 for at in b.bridge.attached() for flow in b.bridge.topics.of(at).flows.values()
+                flow.quality.messages == 20
+                for at in b.bridge.attached()
+                for flow in b.bridge.topics.of(at).flows.values()
             )
         )
         route = await shown("b", tmp_path, "/chatter")

@@ -130,7 +130,7 @@ def test_a_link_that_was_away_for_a_moment_keeps_who_stands_and_who_waits() -> N
     made.link_away(1, briefly=True)
     made.link_up(1, "far")
     for portion in made.portions(1, Advertise(added=offers(range(5)), full=True)):
-        assert published(made.advertised(1, portion)) == []
+        assert published(made.take_in(1, portion, 0.0)) == []
     assert shown(made) == {"/n0"}
     assert (len(made.crowded(1)), made.beyond(1).hidden) == (2, 2)
 

@@ -188,8 +188,7 @@ class Map:
                 self.act(here, module.service_imports.advertised(module.links[there], message))
                 continue
             assert isinstance(message, Advertise)
-            for portion in module.imports.portions(module.links[there], message):
-                self.act(here, module.imports.advertised(module.links[there], portion))
+            self.act(here, module.imports.advertised(module.links[there], message))
         raise AssertionError("it never settles")
 
     def reachable(self, start: int) -> set[int]:

@@ -38,7 +38,8 @@ from rmpa.bridge.messages import (
 from rmpa.bridge.naming import Names
 from rmpa.bridge.policy import Policy
 from rmpa.bridge.topics.exports import Exports, LocalSource
-from rmpa.bridge.topics.imports import Imports, RouteState
+from rmpa.bridge.topics.imports import Imports
+from rmpa.bridge.topics.remote_topic import RouteState
 from rmpa.config.settings import PeerRule, PolicySettings, Remap
 from rmpa.core.contract import Contract, ContractRule, Contracts, Priority, Reliability
 

@@ -24,6 +24,8 @@ from typing import TYPE_CHECKING, Final
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Send, Warn
 from rmpa.bridge.catalogue import bounds
+from rmpa.bridge.catalogue.bounds import Beyond, NodePlaces
+from rmpa.bridge.catalogue.peer_offers import PeerOffers
 from rmpa.bridge.messages import (
     AdvertiseServices,
     CloseService,
@@ -42,6 +44,7 @@ from rmpa.core.guid import Guid
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
 
+    from rmpa.bridge.catalogue.peer_offers import Change
     from rmpa.bridge.messages import Origin
     from rmpa.bridge.services.rules import ServiceRules
 
@@ -156,31 +159,19 @@ class RemoteService:
     origin: Origin | None = None
 
 
-@dataclass(slots=True)
-class _ServiceImportPeer:
-    """What one run of a peer offers.
+@dataclass(slots=True, kw_only=True)
+class _ServiceImportPeer(PeerOffers[str, RemoteService, ServiceOffer]):
+    """What one run of a peer offers; its nodes' places are for the services' names here.
 
     Args:
-        name: The peer's name.
         rank: The lower one is shown.
-        nodes: Which of its nodes stand here, and what waits for a place.
-        surplus: What it offers beyond ``limits.services``.
-        services: What it offers, by the name on the way.
         routes: What is asked for or open, by our route.
         serial: Counts our routes: odd ones, the even ones are for its calls.
-        away: Whether it has no link, and may come back.
-        doubtful: What it offered over its last link and has not offered again since.
     """
 
-    name: str
     rank: int
-    nodes: bounds.NodePlaces[str]
-    surplus: bounds.Surplus[ServiceOffer]
-    services: dict[str, RemoteService] = field(default_factory=dict)
     routes: dict[int, RemoteService] = field(default_factory=dict)
     serial: int = -1
-    away: bool = False
-    doubtful: set[str] = field(default_factory=set)
 
 
 _DEFAULT_LIMITS: Final = LimitSettings()
@@ -208,7 +199,7 @@ class ServiceImports:
     def __iter__(self) -> Iterator[tuple[int, RemoteService]]:
         """Each service of each peer."""
         for number, peer in self._peers.items():
-            for remote in peer.services.values():
+            for remote in peer.entries.values():
                 yield number, remote
 
     def get(self, peer: int, service: str) -> RemoteService | None:
@@ -227,8 +218,8 @@ class ServiceImports:
 
     def beyond(self, peer: int) -> bounds.Beyond:
         """What a peer offers beyond ``limits.services``."""
-        known = self._peers.get(peer)
-        return bounds.Beyond("services", self._most.services, len(known.surplus) if known is not None else 0)
+        known, limit = self._peers.get(peer), self._most.services
+        return known.beyond("services", limit) if known is not None else Beyond("services", limit, 0)
 
     def crowded(self, peer: int) -> Mapping[str, Collection[str]]:
         """The nodes of a peer whose services have no place here (``limits.nodes``), and these."""
@@ -240,8 +231,7 @@ class ServiceImports:
         """A link is up, of a new peer or of one that was away."""
         known = self._peers.get(peer)
         if known is None:
-            places: bounds.NodePlaces[str] = bounds.NodePlaces(self._most.nodes)
-            self._peers[peer] = _ServiceImportPeer(name, rank, places, bounds.Surplus(limits.SURPLUS_MAX))
+            self._peers[peer] = _ServiceImportPeer(name=name, nodes=NodePlaces(self._most.nodes), rank=rank)
         else:
             known.away = False
             known.serial = -1
@@ -278,60 +268,47 @@ class ServiceImports:
         if known is None:
             return []
         actions = self.link_down(peer)
-        known.nodes.give_up()
-        known.surplus.clear()
-        for wire in list(known.services):
+        known.give_up()
+        for wire in list(known.entries):
             actions += self._remove(peer, wire, f"{known.name} is gone")
         del self._peers[peer]
         return actions
 
     # --- what peers offer --------------------------------------------------------------------------------------
 
-    @staticmethod
-    def portions(message: AdvertiseServices) -> Iterator[AdvertiseServices]:
-        """Split an advertisement into portions that ``advertised`` deals with in a moment."""
-        first, rest = message, message.added
-        while len(rest) > limits.LEARNT_AT_ONCE:
-            added, rest = rest[: limits.LEARNT_AT_ONCE], rest[limits.LEARNT_AT_ONCE :]
-            # What is no more is taken in at the end: what takes its place must not find it there.
-            yield AdvertiseServices(added, first.removed, first.full, more=True)
-            first = AdvertiseServices()
-        yield AdvertiseServices(rest, first.removed, first.full, more=message.more)
+    def portions(self, peer: int, message: AdvertiseServices) -> Iterator[Change[ServiceOffer, str]]:
+        """Split an advertisement into portions that ``take_in`` deals with in a moment."""
+        known, full, more = self._peers.get(peer), message.full, message.more
+        if known is None:
+            return iter(())
+        return known.changes(message.added, message.removed, lambda offer: offer.service, full=full, more=more)
 
-    def advertised(self, peer: int, message: AdvertiseServices) -> list[ImportAction]:
-        """A peer says what it provides, all or what changed."""
+    def take_in(self, peer: int, change: Change[ServiceOffer, str]) -> list[ImportAction]:
+        """A peer provides more, or less."""
         known = self._peers.get(peer)
         if known is None:
             return []
-        if message.full:
-            known.doubtful = set(known.services)
-            known.surplus.clear()
         actions: list[ImportAction] = []
-        for wire in message.removed:
-            if wire not in known.services:
+        for wire in change.removed:
+            if wire not in known.entries:
                 known.surplus.discard(wire)
             actions += self._remove(peer, wire, f"its server at {known.name} has gone")
-        for offer in message.added:
+        for offer in change.added:
             actions += self._offer(peer, known, offer)
-        if message.full or known.doubtful:
-            known.doubtful -= {offer.service for offer in message.added}
-            if not message.more:
-                for wire in known.doubtful:
-                    actions += self._remove(peer, wire, f"its server at {known.name} has gone")
-                known.doubtful = set()
-        for admitted in islice(self._admit(peer), limits.LEARNT_AT_ONCE):
-            actions += admitted
-        return actions
+        admitted = islice(self._admit(peer), limits.LEARNT_AT_ONCE)
+        return actions + [action for one in admitted for action in one]
+
+    def advertised(self, peer: int, message: AdvertiseServices) -> list[ImportAction]:
+        """A peer says what it provides: all portions at once."""
+        return [action for change in self.portions(peer, message) for action in self.take_in(peer, change)]
 
     def _admit(self, peer: int) -> Iterator[list[ImportAction]]:
         """Take in what was beyond ``limits.services`` while there is room, one after the other."""
-        while (known := self._peers.get(peer)) is not None and len(known.services) < self._most.services:
-            if (offer := known.surplus.pop()) is None:
-                return
+        while (known := self._peers.get(peer)) and (offer := known.admitted(self._most.services)):
             yield self._offer(peer, known, offer)
 
     def _offer(self, peer: int, known: _ServiceImportPeer, offer: ServiceOffer) -> list[ImportAction]:
-        before = known.services.get(offer.service)
+        before = known.entries.get(offer.service)
         actions: list[ImportAction] = []
         if before is not None and (before.node, before.origin) == (offer.node, offer.origin):
             # The same once more: another server behind it, or a new link; what it is may have changed.
@@ -339,12 +316,12 @@ class ServiceImports:
             return [ForgetAbout(peer, before.name)] if before.shown else []
         if before is not None:
             actions += self._remove(peer, offer.service, f"another node of {known.name} provides it now")
-        elif len(known.services) >= self._most.services:
+        elif len(known.entries) >= self._most.services:
             known.surplus.add(offer.service, offer)
             text = bounds.warning(known.name, "services", self._most.services)
             return [Warn("services.too_many", known.name, text)]
         name = self._rules.local_name(offer.origin.name if offer.origin else known.name, offer.service)
-        remote = known.services[offer.service] = RemoteService(offer.service, offer.node, name, origin=offer.origin)
+        remote = known.entries[offer.service] = RemoteService(offer.service, offer.node, name, origin=offer.origin)
         if offer.origin is not None and self.ways.learn(peer, offer.origin):
             actions += self._choose_of({offer.origin.instance})
         if not is_crossing_name(name):
@@ -359,7 +336,7 @@ class ServiceImports:
 
     def _remove(self, peer: int, wire: str, reason: str) -> list[ImportAction]:
         known = self._peers[peer]
-        remote = known.services.pop(wire, None)
+        remote = known.entries.pop(wire, None)
         if remote is None:
             return []
         known.nodes.leave(remote.node, remote.name)
@@ -409,14 +386,14 @@ class ServiceImports:
         self._rules, self._most = rules, most
         for known in self._peers.values():
             known.nodes.bound(most.nodes)
-        offers = [(number, wire) for number, known in self._peers.items() for wire in known.services]
+        offers = [(number, wire) for number, known in self._peers.items() for wire in known.entries]
         # A second time, for those whose new name was still another one's old one.
         judged = (self._rejudge(number, wire, again=again) for again in (False, True) for number, wire in offers)
         return chain(judged, (actions for number in list(self._peers) for actions in self._admit(number)))
 
     def _rejudge(self, number: int, wire: str, *, again: bool) -> list[ImportAction]:
         known = self._peers.get(number)
-        remote = known.services.get(wire) if known is not None else None
+        remote = known.entries.get(wire) if known is not None else None
         if known is None or remote is None:
             return []
         name = self._rules.local_name(remote.origin.name if remote.origin else known.name, wire)

@@ -12,7 +12,7 @@ from rmpa.bridge.data.io.route_sender import ReliableRouteSender
 from rmpa.bridge.data.qos_events import shown_seconds
 from rmpa.bridge.messages import Source
 from rmpa.bridge.policy import Policy, PolicyDecision, is_own
-from rmpa.bridge.topics.imports import RouteState
+from rmpa.bridge.topics.remote_topic import RouteState
 from rmpa.config.param_rules import CLOCK
 from rmpa.core import limits
 from rmpa.core.contract import KEYS, Contract, Contracts
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.io.bridge import Bridge
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.bridge.topics.exports import LocalSource
-    from rmpa.bridge.topics.imports import RemoteTopic
+    from rmpa.bridge.topics.remote_topic import RemoteTopic
     from rmpa.config.settings import Settings
     from rmpa.core.stats import SampleSummary
     from rmpa.observe.io.peer_clocks import PeerClocks

@@ -252,7 +252,7 @@ class Services(Part):
         if message.added or message.removed:
             changes = (len(message.added), len(message.removed))
             _log.info("< %s provides %d more services, %d less", session.link.name, *changes)
-        return (self.imports.advertised(session.peer, part) for part in self.imports.portions(message))
+        return (self.imports.take_in(session.peer, change) for change in self.imports.portions(session.peer, message))
 
     def graph_changed(self, change: GraphChange) -> None:
         """A node provides a service, or no longer does."""

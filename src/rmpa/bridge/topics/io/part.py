@@ -334,8 +334,8 @@ class Topics(Part):
             _log.info("< %s publishes %d more topics, %d less", session.link.name, *changes)
         now = asyncio.get_running_loop().time
         return (
-            self.imports.advertised(session.peer, portion, now())
-            for portion in self.imports.portions(session.peer, message)
+            self.imports.take_in(session.peer, change, now())
+            for change in self.imports.portions(session.peer, message)
         )
 
     # --- peers that are back ------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.messages import Audience, encode
 from rmpa.bridge.proxy_names import proxied_node, proxy_name
 from rmpa.bridge.topics.audience import audience, is_watched
-from rmpa.bridge.topics.imports import RouteState
+from rmpa.bridge.topics.remote_topic import RouteState
 from rmpa.ros.node.subscription import PublisherConnection
 
 if TYPE_CHECKING:
