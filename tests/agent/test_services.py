@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.agent import Agent
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
 
 __all__ = ["settings"]
 
@@ -73,7 +73,7 @@ async def connect(agent: Agent, service: str = "/add", md5sum: str = "*") -> Ser
     return await ServiceConnection.open(uri, service, "/client", md5sum=md5sum)
 
 
-def fall_silent(*agents: Agent) -> list[tuple[Agent, MeshLink]]:
+def fall_silent(*agents: Agent) -> list[tuple[Agent, PeerLink]]:
     """The link between two agents falls silent, as far as their bridges are told."""
     links = [(agent, session.link) for agent in agents for session in agent.bridge.sessions.linked()]
     for agent, link in links:
@@ -82,7 +82,7 @@ def fall_silent(*agents: Agent) -> list[tuple[Agent, MeshLink]]:
     return links
 
 
-def come_back(links: list[tuple[Agent, MeshLink]]) -> None:
+def come_back(links: list[tuple[Agent, PeerLink]]) -> None:
     """They have a link again. The last one first: what the first one offers may arrive before the loop goes on."""
     for agent, link in reversed(links):
         link.silent = False

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import psutil
 import pytest
 
+from lab.bed.processes import Process, eventually
 from rmpa.cli.run import prepared
 from rmpa.core.errors import ConfigError
-from rmpa.experiments.bed.processes import Process, eventually
 from tests.interop.ros import free_port
 
 if TYPE_CHECKING:

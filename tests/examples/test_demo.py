@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import psutil
 import pytest
 
-from rmpa.experiments.bed.processes import Process, eventually
+from lab.bed.processes import Process, eventually
 from rmpa.observe.io.control_client import ControlClient, choose_agent
 from rmpa.resource import ResourceClient, at_least, at_most
 from rmpa.ros.node.node import Node

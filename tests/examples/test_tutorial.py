@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
+from lab.bed.processes import Process, eventually
 from rmpa.cli.run import load
 from rmpa.cli.topic_pub import read_values
-from rmpa.experiments.bed.processes import Process, eventually
 from rmpa.resource.declare.requirement_text import parse_requirement
 from tests.interop.ros import free_port
 

@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.experiments.bed.processes import CommandFailed, eventually
+from lab.bed.processes import CommandFailed, eventually
 from tests.interop.modules import Module, flows
 from tests.interop.ros import PYTHON
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rmpa.experiments.bed.namespaces import Host, Lab
+    from lab.bed.namespaces import Host, Lab
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
-from rmpa.experiments.bed.agents import RMPA
-from rmpa.experiments.bed.processes import Process, eventually
+from lab.bed.agents import RMPA
+from lab.bed.processes import Process, eventually
 from tests.interop.ros import PYTHON, lacks
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.experiments.bed.processes import Event
+    from lab.bed.processes import Event
     from tests.interop.conftest import ModuleFactory
     from tests.interop.modules import Module
 

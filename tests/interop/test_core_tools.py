@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.experiments.bed.processes import Process, eventually
+from lab.bed.processes import Process, eventually
 from tests.interop.ros import PYTHON, Ros, free_port
 
 if TYPE_CHECKING:

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually
+from lab.bed.processes import eventually
 from tests.interop.modules import Module, flows
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.experiments.bed.agents import Agent
-    from rmpa.experiments.bed.namespaces import Lab
-    from rmpa.experiments.bed.processes import Process
+    from lab.bed.agents import Agent
+    from lab.bed.namespaces import Lab
+    from lab.bed.processes import Process
     from tests.interop.conftest import AgentFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]

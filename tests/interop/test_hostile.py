@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.bed.processes import Process, eventually, run
 from rmpa.core import limits
-from rmpa.experiments.bed.processes import Process, eventually, run
 from rmpa.observe.io.control_client import ControlClient
 from tests.interop.modules import Module, flows
 from tests.interop.ros import NODES
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.namespaces import Lab
+    from lab.bed.namespaces import Lab
     from rmpa.observe.snapshot import Snapshot
     from tests.interop.conftest import ModuleFactory
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually
+from lab.bed.processes import eventually
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.namespaces import Host
-    from rmpa.experiments.bed.processes import Event, Process
+    from lab.bed.namespaces import Host
+    from lab.bed.processes import Event, Process
     from tests.interop.conftest import ModuleFactory
     from tests.interop.modules import Module
 

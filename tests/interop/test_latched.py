@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually
+from lab.bed.processes import eventually
 from tests.interop.modules import Module, flows
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.namespaces import Lab
-    from rmpa.experiments.bed.processes import Event, Process
+    from lab.bed.namespaces import Lab
+    from lab.bed.processes import Event, Process
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]

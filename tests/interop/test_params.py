@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.agents import RMPA
-from rmpa.experiments.bed.processes import Process, eventually
+from lab.bed.agents import RMPA
+from lab.bed.processes import Process, eventually
 from tests.interop.modules import Module
 from tests.interop.ros import free_port
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rmpa.experiments.bed.namespaces import Lab
+    from lab.bed.namespaces import Lab
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
     from tests.interop.ros import Ros
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually
-from rmpa.experiments.bed.ros import PYTHON
+from lab.bed.processes import eventually
+from lab.bed.ros import PYTHON
 from tests.interop.modules import Module, flows
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.namespaces import Host, Lab
+    from lab.bed.namespaces import Host, Lab
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.experiments.bed.namespaces import Host
-from rmpa.experiments.bed.processes import eventually
+from lab.bed.namespaces import Host
+from lab.bed.processes import eventually
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rmpa.experiments.bed.agents import Agent
+    from lab.bed.agents import Agent
     from tests.interop.conftest import AgentFactory
 
 FIFO: Final = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK

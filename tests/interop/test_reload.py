@@ -14,7 +14,7 @@ from tests.interop.modules import Module, flows, whole
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rmpa.experiments.bed.namespaces import Lab
+    from lab.bed.namespaces import Lab
     from tests.interop.conftest import AgentFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.experiments.bed.agents import RMPA, Agent
-from rmpa.experiments.bed.processes import Event, Process, eventually
+from lab.bed.agents import RMPA, Agent
+from lab.bed.processes import Event, Process, eventually
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.experiments.bed.namespaces import Host, Lab
+    from lab.bed.namespaces import Host, Lab
     from tests.interop.conftest import ShellFactory
     from tests.interop.ros import Ros
 

@@ -18,7 +18,7 @@ from tests.interop.nodes.payload import Pattern
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from rmpa.experiments.bed.processes import Process
+    from lab.bed.processes import Process
     from tests.interop.conftest import ShellFactory
     from tests.interop.ros import Ros
 

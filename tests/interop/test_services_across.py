@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.processes import CommandFailed, eventually
+from lab.bed.processes import CommandFailed, eventually
 from tests.interop.ros import PYTHON
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.namespaces import Lab
-    from rmpa.experiments.bed.processes import Event, Process
+    from lab.bed.namespaces import Lab
+    from lab.bed.processes import Event, Process
     from tests.interop.conftest import ModuleFactory, ShellFactory
     from tests.interop.modules import Module
     from tests.interop.ros import Ros

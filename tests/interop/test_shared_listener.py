@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.bed.agents import Agent
+from lab.bed.processes import DEADLINE, eventually, run
 from rmpa.core.counters import Counters
-from rmpa.experiments.bed.agents import Agent
-from rmpa.experiments.bed.processes import DEADLINE, eventually, run
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.shared_listener import SharedListener
@@ -25,7 +25,7 @@ from tests.interop.ros import PYTHON
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rmpa.experiments.bed.namespaces import Host, Lab
+    from lab.bed.namespaces import Host, Lab
     from tests.interop.conftest import AgentFactory, ShellFactory
     from tests.interop.ros import Ros
 

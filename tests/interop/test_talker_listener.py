@@ -9,7 +9,7 @@ import pytest
 from tests.interop.modules import flows, whole
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.processes import Event
+    from lab.bed.processes import Event
     from tests.interop.conftest import ModuleFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]

@@ -27,7 +27,7 @@ from tests.interop.ros import PYTHON
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from rmpa.experiments.bed.processes import Process
+    from lab.bed.processes import Process
     from rmpa.ros.node.node import Publisher, Received
     from tests.interop.conftest import ShellFactory
     from tests.interop.ros import Ros

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, cast
 
 import pytest
 
+from lab.bed.processes import eventually
 from rmpa.bridge.actions import Describe, Publish
 from rmpa.bridge.messages import Description as About
 from rmpa.bridge.messages import Source
@@ -21,7 +22,6 @@ from rmpa.bridge.session.proxy_nodes import ProxyNodes
 from rmpa.bridge.topics.io.peer_topics import PeerTopics
 from rmpa.core.contract import Contract
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.experiments.bed.processes import eventually
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.http.client import call_api
@@ -36,9 +36,9 @@ from tests.ros.node.peers import RawSubscriber
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from rmpa.experiments.bed.agents import Agent
-    from rmpa.experiments.bed.processes import Process
-    from rmpa.mesh.io.link import MeshLink
+    from lab.bed.agents import Agent
+    from lab.bed.processes import Process
+    from rmpa.mesh.io.link import PeerLink
     from tests.interop.conftest import AgentFactory, ShellFactory
     from tests.interop.ros import Ros
 
@@ -221,7 +221,7 @@ async def proxied(core: RosCore, listener: Process, closing: AsyncExitStack) -> 
     closing.push_async_callback(proxies.close)
     inbound = PeerTopics(
         core,
-        PeerSession(1, cast("MeshLink", None), proxies),
+        PeerSession(1, cast("PeerLink", None), proxies),
         on_demand=lambda _s, _w: None,
         on_mismatch=lambda _s, _c, _t: None,
         on_occurred=lambda _s, _o: None,

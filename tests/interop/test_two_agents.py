@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.agents import Agent
-from rmpa.experiments.bed.namespaces import MACHINE
+from lab.bed.agents import Agent
+from lab.bed.namespaces import MACHINE
 from tests.interop.modules import whole
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.experiments.bed.agents import RMPA
-from rmpa.experiments.bed.processes import run
+from lab.bed.agents import RMPA
+from lab.bed.processes import run
 from rmpa.ros.types.definitions import known_text
 from tests.interop.ros import PYTHON
 from tests.ros.types.workspaces import package

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually, run
+from lab.bed.processes import eventually, run
 from tests.interop.modules import Module, flows
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.agents import Agent
-    from rmpa.experiments.bed.namespaces import Lab
+    from lab.bed.agents import Agent
+    from lab.bed.namespaces import Lab
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
@@ -173,6 +173,6 @@ def test_the_doctor_finds_the_firewall_of_a_host(lab: Lab, agent: AgentFactory) 
 
 
 def _rmpa() -> list[str]:
-    from rmpa.experiments.bed.agents import RMPA
+    from lab.bed.agents import RMPA
 
     return [str(RMPA)]

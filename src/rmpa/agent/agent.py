@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.config.sources import Loaded
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.observe.reload_reply import ReloadReply
     from rmpa.observe.why.diagnosis import Diagnosis
     from rmpa.ros.core.api import Core
@@ -264,7 +264,7 @@ class Agent:
     def _followed(self, args: dict[str, object]) -> tuple[FollowedInfo, ...]:
         return self._param_ops.followed(args)
 
-    def _link(self, peer: str) -> MeshLink:
+    def _link(self, peer: str) -> PeerLink:
         return self._attached(peer).link
 
     def _attached(self, peer: str) -> PeerSession:

@@ -1,4 +1,4 @@
-"""``rmpa doctor``: what on this machine would keep modules apart."""
+"""``rmpa doctor``: checks this machine for what would keep modules apart."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from rmpa.cli.options import json_option
-from rmpa.cli.output import coloured, print_json, print_line, printable
+from rmpa.cli.output import print_json, printable
 from rmpa.observe.doctor.finding import FindingLevel, exit_code
 
 if TYPE_CHECKING:
@@ -42,31 +42,28 @@ Examples:
 def doctor(config: str | None, quiet: bool, as_json: bool) -> int:
     """Check this machine: settings, agents, network, ROS environment, clock and rights.
 
-    It changes nothing. It sends one packet on each interface to the agents' multicast group, which agents pass over,
-    and looks whether it is heard. A firewall on another machine, or a switch between, shows only there: run it on
-    both sides, and `rmpa multicast` between them.
+    It changes nothing. It sends one packet on each interface to the agents' multicast group, which agents ignore, and
+    checks that it comes back. It cannot see a firewall on another machine or a switch in between: run it on both
+    machines, and `rmpa multicast` between them.
     """
     from rmpa.observe.doctor.io.checks import examine, look_at
 
-    found = []
+    found, shown = [], []
     for finding in examine(look_at(os.environ, config)):
         found.append(finding)
-        if not as_json and (not quiet or finding.level in (FindingLevel.WARN, FindingLevel.FAIL)):
-            for line in _lines(finding):
-                print_line(line)
+        if not quiet or finding.level in (FindingLevel.WARN, FindingLevel.FAIL):
+            shown.append(finding)
+            if not as_json:
+                click.echo("\n".join(_lines(finding)))
     if as_json:
-        print_json(
-            [finding for finding in found if not quiet or finding.level in (FindingLevel.WARN, FindingLevel.FAIL)]
-        )
+        print_json(shown)
     else:
-        print_line(_summary(found))
+        click.echo(_summary(found))
     return exit_code(found)
 
 
 def _lines(finding: Finding) -> list[str]:
-    mark = f"{finding.level.value:<7}"
-    if coloured():
-        mark = click.style(mark, fg=_COLOURS[finding.level])
+    mark = click.style(f"{finding.level.value:<7}", fg=_COLOURS[finding.level])
     what = f"{finding.check} {finding.subject}".strip()
     lines = [f"{mark}  {printable(what)}: {printable(finding.text)}"]
     if finding.remedy:

@@ -1,4 +1,4 @@
-"""``rmpa why``: where on its way a topic gets lost."""
+"""``rmpa why``: the stage at which a topic of a peer, or a service, stops."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.master import read_topic
+from rmpa.cli.graph import read_name
 from rmpa.cli.options import agent_option, json_option
-from rmpa.cli.output import coloured, print_json, printable
+from rmpa.cli.output import print_json, printable
 from rmpa.observe import limits
 from rmpa.observe.io.control_client import ControlClient, choose_agent
 from rmpa.observe.why.diagnosis import Diagnosis, PathStage, StageResult
@@ -49,9 +49,9 @@ def why(name: str, service: bool, as_json: bool, agent: str | None) -> int:
     PEER is a name or a GUID. Without PEER every module that publishes the topic is looked at, and for one of this
     module's own topics every peer says how it arrives there.
     """
-    wanted = read_topic(name)
+    wanted = read_name(name)
     with ControlClient(choose_agent(os.environ, agent).path, timeout=limits.CONTROL_HANDLER_TIMEOUT) as client:
-        found = client.call("why", tuple[Diagnosis, ...], name=wanted.topic, peer=wanted.peer, service=service)
+        found = client.call("why", tuple[Diagnosis, ...], name=wanted.name, peer=wanted.peer, service=service)
     if as_json:
         print_json(found)
     else:
@@ -64,7 +64,7 @@ def why(name: str, service: bool, as_json: bool, agent: str | None) -> int:
 
 
 def exit_code(diagnoses: Sequence[Diagnosis]) -> int:
-    """0 if something gets through on every way that was meant, else 1."""
+    """0 if messages or calls get through on every path that was asked about, else 1."""
     return 0 if diagnoses and all(diagnosis.flows for diagnosis in diagnoses) else 1
 
 
@@ -92,4 +92,4 @@ def _line(stage: PathStage, width: int) -> str:
 
 
 def _paint(text: str, verdict: StageResult) -> str:
-    return click.style(text, fg=_COLOURS[verdict]) if coloured() else text
+    return click.style(text, fg=_COLOURS[verdict])

@@ -17,10 +17,10 @@ from rmpa.config.settings import PolicySettings
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 
 if TYPE_CHECKING:
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.core.embedded import RosCore
 
-LINK = cast("MeshLink", object())
+LINK = cast("PeerLink", object())
 
 
 class Core:
@@ -49,7 +49,7 @@ async def test_a_longer_one_ends_the_link_unparsed(bridge: Bridge) -> None:
     payload = encode(Advertise()).replace(b"[]", b" " * limits.ADVERTISEMENT_MAX + b"[]", 1)
     with pytest.raises(LimitExceeded):
         bridge.control(LINK, payload)
-    bridge.control(cast("MeshLink", object()), payload)  # of a link that is gone
+    bridge.control(cast("PeerLink", object()), payload)  # of a link that is gone
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.topics.io.loss_reports import LossReports
     from rmpa.config.settings import Settings
     from rmpa.core.identity import Identity
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.core.api import Core
     from rmpa.ros.master.effects import GraphChange
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
@@ -183,7 +183,7 @@ class Bridge:
 
     # --- the mesh's side ---------------------------------------------------------------------------------------
 
-    def control(self, link: MeshLink, payload: bytes | bytearray | memoryview) -> None:
+    def control(self, link: PeerLink, payload: bytes | bytearray | memoryview) -> None:
         """A control frame came.
 
         Raises:

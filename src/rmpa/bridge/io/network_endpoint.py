@@ -19,7 +19,7 @@ from rmpa.discovery.io.discovery import Discovery
 from rmpa.discovery.io.interfaces import choose, further_addresses, list_interfaces, pick_address
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
-from rmpa.mesh.peering import REPLACED
+from rmpa.mesh.peering import LinkDown, LinkDownCause
 from rmpa.runtime.sockets import open_mesh_port
 from rmpa.runtime.system_clock import SystemClock
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rmpa.config.settings import Settings
     from rmpa.discovery.events import Event
     from rmpa.discovery.io.interfaces import Interface
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
 
 _log = logging.getLogger(__name__)
 
@@ -77,7 +77,7 @@ class NetworkEndpoint:
             on_link_up=self._link_up,
             on_link_down=self._link_down,
             on_control=bridge.control,
-            takers=LinkHandlers(receiver.data, receiver.part, receiver.mark, sessions.clock, sessions.lane_lost),
+            handlers=LinkHandlers(receiver.data, receiver.part, receiver.mark, sessions.clock, sessions.lane_lost),
             lanes=settings.lanes,
             clock=clock,
         )
@@ -115,14 +115,14 @@ class NetworkEndpoint:
             case PeerConflict():
                 pass  # said by the discovery, no more often than a log can bear
 
-    def _link_up(self, link: MeshLink) -> None:
+    def _link_up(self, link: PeerLink) -> None:
         # Its beacons' port is its mesh port, whichever port an accepted connection came from.
         self.discovery.link_up(link.identity, (link.remote_endpoint[0], link.identity.guid.port))
         self._bridge.sessions.link_up(link)
 
-    def _link_down(self, link: MeshLink, reason: str) -> None:
+    def _link_down(self, link: PeerLink, down: LinkDown) -> None:
         self._bridge.sessions.link_down(link)
-        if reason != REPLACED:  # the peer is linked all the while: nobody else may take its seat
+        if down.cause is not LinkDownCause.REPLACED:  # the peer is still linked, and keeps its place in the roster
             self.discovery.link_down(link.identity.guid, link.identity.instance)
 
     def _interfaces(self, everything: tuple[Interface, ...]) -> bool:

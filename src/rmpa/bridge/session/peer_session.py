@@ -11,7 +11,7 @@ from rmpa.bridge.data.io.link_time import LinkTime
 if TYPE_CHECKING:
     from rmpa.bridge.data.io.receiver import DataHandler
     from rmpa.bridge.session.peer_proxies import PeerProxies
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
 
 
 class PeerState(Enum):
@@ -48,7 +48,7 @@ class PeerSession:
     """
 
     peer: int
-    link: MeshLink
+    link: PeerLink
     proxies: PeerProxies
     handlers: dict[int, DataHandler] = field(default_factory=dict)
     time: LinkTime = field(default_factory=LinkTime)

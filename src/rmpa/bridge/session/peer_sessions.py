@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.messages import Origin
     from rmpa.bridge.session.part import Part
     from rmpa.bridge.session.proxy_nodes import ProxyNodes
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.wire.xmlrpc import RosReply
 
 
@@ -47,7 +47,7 @@ class PeerSessions:
         self._on_kill = on_kill
         self._numbers = itertools.count(1)
         self._by_number: dict[int, PeerSession] = {}
-        self._by_link: dict[MeshLink, PeerSession] = {}
+        self._by_link: dict[PeerLink, PeerSession] = {}
         self._namespaces = ProxyNamespaces()
         self._closing: set[asyncio.Task[None]] = set()
         self._timer = MachineTimer(self._next_timer, self._handle_timer)
@@ -64,7 +64,7 @@ class PeerSessions:
         """A session by its number."""
         return self._by_number.get(peer)
 
-    def of(self, link: MeshLink) -> PeerSession | None:
+    def of(self, link: PeerLink) -> PeerSession | None:
         """The session that a link belongs to; ``None`` once the link is gone."""
         return self._by_link.get(link)
 
@@ -76,7 +76,7 @@ class PeerSessions:
 
     # --- links ---------------------------------------------------------------------------------------------------
 
-    def link_up(self, link: MeshLink) -> None:
+    def link_up(self, link: PeerLink) -> None:
         """A link is up: of a new peer, or of one whose session waits for it."""
         session = self._waiting_for(link)
         if session is not None:
@@ -90,7 +90,7 @@ class PeerSessions:
         for part in self._parts:
             part.link_up(session)
 
-    def _begin(self, link: MeshLink) -> PeerSession:
+    def _begin(self, link: PeerLink) -> PeerSession:
         remembered = (part.remembered(link.identity) for part in self._parts)
         peer = next((number for number in remembered if number is not None), None)
         if peer is None:
@@ -102,7 +102,7 @@ class PeerSessions:
         session = self._by_number[peer] = PeerSession(peer, link, proxies)
         return session
 
-    def _waiting_for(self, link: MeshLink) -> PeerSession | None:
+    def _waiting_for(self, link: PeerLink) -> PeerSession | None:
         """The session of this run of the peer, if it waits. One of an earlier run ends, for that will not be back."""
         for session in self:
             if session.linked:
@@ -113,7 +113,7 @@ class PeerSessions:
                 self._end(session)
         return None
 
-    def link_down(self, link: MeshLink) -> None:
+    def link_down(self, link: PeerLink) -> None:
         """A link is gone; its peer may come back."""
         session = self._by_link.pop(link, None)
         if session is None:
@@ -189,14 +189,14 @@ class PeerSessions:
 
     # --- the rest ------------------------------------------------------------------------------------------------
 
-    def lane_lost(self, link: MeshLink) -> None:
+    def lane_lost(self, link: PeerLink) -> None:
         """A link has lost its bulk lane's connection, and perhaps half a message in either direction."""
         session = self._by_link.get(link)
         if session is not None:
             for part in self._parts:
                 part.lane_lost(session)
 
-    def clock(self, link: MeshLink) -> None:
+    def clock(self, link: PeerLink) -> None:
         """A link knows its peer's clock better."""
         session = self._by_link.get(link)
         if session is not None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rmpa.bridge.io.network_endpoint import NetworkEndpoint
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.discovery.events import PeerView
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.mesh.io.path_monitor import PathMonitor
     from rmpa.mesh.peering import PeerStatus
     from rmpa.observe.snapshot import BoundInfo
@@ -113,7 +113,7 @@ class PeersSection:
         )
 
     @staticmethod
-    def _link(link: MeshLink, paths: PathMonitor, now: float) -> LinkInfo:
+    def _link(link: PeerLink, paths: PathMonitor, now: float) -> LinkInfo:
         host, port = link.remote_endpoint
         problem = paths.problem(link)
         return LinkInfo(

@@ -10,6 +10,8 @@ import math
 import struct
 from typing import TYPE_CHECKING, Final
 
+from rmpa.core.serial_number import SERIAL_HALF, SERIAL_MASK
+
 if TYPE_CHECKING:
     from rmpa.resource.declare.attributes import Attribute, Value
 
@@ -17,8 +19,6 @@ _HEADER: Final = struct.Struct("<III")
 _SECOND: Final = 1_000_000_000
 _SOURCES: Final = 64
 """Publishers of one topic whose numbers are followed; with more of them all begin anew."""
-_SEQUENCES: Final = 1 << 32
-_HALF: Final = 1 << 31
 
 
 class TopicQuality:
@@ -88,8 +88,8 @@ class TopicQuality:
             self._sequences.clear()
         self._sequences[source] = sequence
         if before is not None:
-            gap = (sequence - before - 1) % _SEQUENCES
-            if gap < _HALF:
+            gap = sequence - before - 1 & SERIAL_MASK
+            if gap < SERIAL_HALF:
                 self._lost += gap
 
     def restart(self, now: float) -> None:

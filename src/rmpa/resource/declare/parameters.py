@@ -8,11 +8,12 @@ from typing import Any, Final, Protocol
 
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError
+from rmpa.core.sizes import INT32_MAX, INT32_MIN
 from rmpa.resource.declare.fence import passage
 
 ParameterValue = bool | int | float | str
-INT_MIN: Final = -(2**31)
-INT_MAX: Final = 2**31 - 1
+INT_MIN: Final = INT32_MIN
+INT_MAX: Final = INT32_MAX
 
 
 class ParameterWatch(Protocol):

@@ -15,6 +15,7 @@ from collections import Counter, deque
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.core.errors import LocalProtocolError, RmpaError
+from rmpa.core.serial_number import SERIAL_MASK
 from rmpa.resource import limits
 from rmpa.resource.declare.fence import around
 from rmpa.resource.run.descriptor import TOPIC, describe, topic_of
@@ -318,7 +319,7 @@ class _Outlet:
                 raise MessageError(f"{self._output.name} has messages of type {kind.name}, not {shown}")
         header: Any = getattr(message, "header", None)
         if self._numbered and hasattr(header, "seq"):
-            header.seq = next(self._number) & 0xFFFF_FFFF  # as rospy does: whoever receives it sees what was lost
+            header.seq = next(self._number) & SERIAL_MASK  # as rospy does: whoever receives it sees what was lost
         raw, fence = kind.serialize(message), around()
         if fence is None:
             self._runtime.call_in_loop(self._runtime.send, self._output, raw)

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.data.io.route_sender import RouteSender
     from rmpa.core.counters import Counters
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
 
 
 class DataHandler(Protocol):
@@ -38,10 +38,10 @@ class DataReceiver:
     def __init__(self, counters: Counters, sender: Callable[[int, int], RouteSender | None]) -> None:
         self._counters = counters
         self._sender = sender
-        self._handlers: dict[MeshLink, Mapping[int, DataHandler]] = {}
-        self._peers: dict[MeshLink, int] = {}
+        self._handlers: dict[PeerLink, Mapping[int, DataHandler]] = {}
+        self._peers: dict[PeerLink, int] = {}
 
-    def link_up(self, link: MeshLink, peer: int, handlers: Mapping[int, DataHandler]) -> None:
+    def link_up(self, link: PeerLink, peer: int, handlers: Mapping[int, DataHandler]) -> None:
         """Data may come on a link from now on.
 
         Args:
@@ -52,12 +52,12 @@ class DataReceiver:
         self._handlers[link] = handlers
         self._peers[link] = peer
 
-    def link_down(self, link: MeshLink) -> None:
+    def link_down(self, link: PeerLink) -> None:
         """A link is gone: what still comes on it is dropped."""
         self._handlers.pop(link, None)
         self._peers.pop(link, None)
 
-    def data(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
+    def data(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
         """A data frame with a whole message came.
 
         Raises:
@@ -74,7 +74,7 @@ class DataReceiver:
             )
         handler.message(sequence, stamp_ns, payload)
 
-    def part(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
+    def part(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
         """A part of a large message came."""
         handlers = self._handlers.get(link)
         if handlers is None:
@@ -85,7 +85,7 @@ class DataReceiver:
         else:
             handler.part(sequence, stamp_ns, flags, part)
 
-    def mark(self, link: MeshLink, kind: FrameKind, route: int, sequence: int) -> None:
+    def mark(self, link: PeerLink, kind: FrameKind, route: int, sequence: int) -> None:
         """An acknowledgement, or the answer to a fence, came."""
         peer = self._peers.get(link)
         sender = self._sender(peer, route) if peer is not None else None

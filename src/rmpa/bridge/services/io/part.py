@@ -160,6 +160,11 @@ class Services(Part):
         return self._shown.get((peer, service))
 
     @property
+    def idle(self) -> bool:
+        """Whether every change of the local graph was looked at."""
+        return self._driver.idle
+
+    @property
     def served(self) -> Mapping[str, CallStats]:
         """What became of the calls of our services by peers."""
         return self._serving.stats

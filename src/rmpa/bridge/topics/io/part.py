@@ -51,7 +51,7 @@ from rmpa.runtime.machine_timer import MachineTimer
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from rmpa.bridge.data.io.flows import ExportFlow
+    from rmpa.bridge.data.io.export_flow import ExportFlow
     from rmpa.bridge.data.qos_events import QosEvent
     from rmpa.bridge.messages import Message
     from rmpa.bridge.relay import Relay

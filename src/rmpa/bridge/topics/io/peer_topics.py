@@ -10,7 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
-from rmpa.bridge.data.io.flows import ImportFlow
+from rmpa.bridge.data.io.import_flow import ImportFlow
 from rmpa.core.contract import Durability, Reliability
 from rmpa.mesh import limits as mesh_limits
 from rmpa.ros.node.publication import Publication
