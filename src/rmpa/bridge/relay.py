@@ -6,8 +6,8 @@
     a ──── /cmd ───► r (relay) ──── /cmd, origin a, path r ───► b     shown there as /rmpa/a/…
 
 The relay offers what stands for another module's nodes in its own graph, with the *origin* beside it; that lists
-every relay on the way, so nothing goes round: it is not offered to its origin, nor to who passed it on, and who is
-on its list does not show it. Who can reach the origin itself, or by a better relay, leaves the offer hidden.
+every relay on the way, so nothing goes round: it is not offered to its origin, nor to the relay it came from, and a
+relay on its list does not show it. A module that reaches the origin itself, or by a better relay, keeps it hidden.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Place = tuple[str, str]
 
 
 class Relay:
-    """The passing side: which proxies of the local graph are offered on, and as whose.
+    """The passing side: which proxies of the local graph are offered on, and with which origin.
 
     Args:
         enabled: Whether this module relays at all.
@@ -49,11 +49,11 @@ class Relay:
         """Offer what a peer brings to others, if this module relays.
 
         Args:
-            peer: By whose link it came.
+            peer: The peer whose link it came by.
             relay: That peer.
             source: As that peer knows it.
             place: What it is here.
-            origin: Whose it is; ``None``: that peer's own.
+            origin: Its module and node; ``None``: that peer's own.
         """
         if self.enabled:
             own = Origin(relay.name, str(relay.guid), relay.instance.hex(), source.node)
@@ -63,10 +63,10 @@ class Relay:
         """A peer's source is about to appear in the local graph.
 
         Args:
-            peer: Whose link it came by.
+            peer: The peer whose link it came by.
             source: As that peer knows it.
             place: What it is here.
-            origin: Whose it is; its path does not name us.
+            origin: Its module and node; its path does not name this one.
         """
         self._places[peer, source] = place
         self._origins[place] = (peer, source, origin)

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class LocalService:
-    """Who provides a service in the local graph: the node, its ``rosrpc://`` address, and whose it is if we relay."""
+    """A service's server in the local graph: its node, its ``rosrpc://`` address, and its origin if relayed."""
 
     node: str
     uri: str
@@ -74,7 +74,7 @@ class ServeRoute:
         route: The caller's id.
         requests: Ours.
         service: The service's local name.
-        server: Who provides it.
+        server: The node that provides it.
         timeout: Seconds that the caller waits for each.
     """
 
@@ -88,7 +88,7 @@ class ServeRoute:
 
 @dataclass(frozen=True, slots=True)
 class EndRoute:
-    """No more calls come on a route, and nobody waits for replies."""
+    """No more calls come on a route, and no replies are waited for."""
 
     peer: int
     route: int
@@ -194,7 +194,7 @@ class ServiceExports:
     # --- the local graph ---------------------------------------------------------------------------------------
 
     def graph(self, service: str, server: LocalService | None) -> list[ExportAction]:
-        """Say who provides a service in the local graph now, proxies left out; peers hear it by ``tell``."""
+        """Set the server that a service has in the local graph now, proxies left out; peers are told by ``tell``."""
         if self._seen.get(service) == server:
             return []
         if server is None:
@@ -324,7 +324,7 @@ class ServiceExports:
         return self._start(service)
 
     def refused(self, service: str, reason: str) -> list[ExportAction]:
-        """A server does not answer, or says no: those who wait for it are told."""
+        """A server does not answer, or refuses: the peers that wait for it are told."""
         actions: list[ExportAction] = []
         for number, peer in self._peers.items():
             for route, session in list(peer.sessions.items()):

@@ -2,7 +2,7 @@
 
 Sans-I/O, like ``bridge.topics.imports`` for topics: the driver tells what peers say, what the local graph provides
 itself
-and what somebody local wants to call; it gets back actions. A graph has one provider for each service, so of several
+and what local nodes want to call; it gets back actions. A graph has one provider for each service, so of several
 one is shown: a local one always, else that of the peer with the lowest GUID; the others are hidden, with the reason,
 and come when it goes. Each service of each peer is in one state of this table::
 
@@ -53,7 +53,7 @@ class SessionState(Enum):
     """Where a remote service stands."""
 
     IDLE = auto()
-    """Nobody calls it."""
+    """It is not called."""
     OPENING = auto()
     """Asked for, not answered."""
     OPEN = auto()
@@ -73,7 +73,7 @@ class Provide:
     """Let a peer's service appear in the local graph, as one of its node's proxy.
 
     Args:
-        peer: Whose.
+        peer: The peer's number.
         service: Its name here.
         node: Its node, in the peer's graph.
     """
@@ -85,7 +85,7 @@ class Provide:
 
 @dataclass(frozen=True, slots=True)
 class Withdraw:
-    """Let it disappear; who is just calling it is told the reason."""
+    """Let it disappear; calls under way fail with the reason."""
 
     peer: int
     service: str
@@ -106,7 +106,7 @@ class OpenedService:
 
 @dataclass(frozen=True, slots=True)
 class EndedService:
-    """It cannot be called (``route`` is its reply route, if it had one open): whoever waits is told the reason."""
+    """It cannot be called (``route`` is its reply route, if it had one): waiting calls fail with the reason."""
 
     peer: int
     service: str
@@ -142,7 +142,7 @@ class RemoteService:
         due: While it is asked for: when that has taken too long, monotonic seconds.
         about: What it is, once known.
         problem: Why it could not be opened last, or empty.
-        origin: Whose it is, if its peer only passes it on.
+        origin: Its module and node, if its peer only passes it on.
     """
 
     wire: str
@@ -190,9 +190,9 @@ class ServiceImports:
         self._most = most
         self._peers: dict[int, _ServiceImportPeer] = {}
         self.ways = RelayPaths()
-        """By which of its ways each module is reached whose services relays offer."""
+        """The path by which each relayed module is reached."""
         self._local: dict[str, str] = {}
-        # By the name here: who offers it.
+        # By the name here: the peers that offer it.
         self._claims: dict[str, dict[int, RemoteService]] = {}
         self._opening: dict[tuple[int, int], RemoteService] = {}
 
@@ -367,7 +367,7 @@ class ServiceImports:
                     actions += self._choose(name)
         return actions
 
-    # --- who is shown ------------------------------------------------------------------------------------------
+    # --- which is shown ----------------------------------------------------------------------------------------
 
     def local(self, service: str, node: str | None) -> list[ImportAction]:
         """Say which node of this module provides a service now, if any."""
@@ -404,7 +404,7 @@ class ServiceImports:
         return [] if again or claimed is not remote else self._choose(name)
 
     def _choose(self, service: str) -> list[ImportAction]:
-        """Show one of those who offer a service, and hide the others."""
+        """Show the service of one peer, and hide those of the others."""
         claims = self._claims[service]
         local = self._local.get(service)
         seen: str | None = f"{local} of this module provides it itself" if local is not None else None
@@ -456,7 +456,7 @@ class ServiceImports:
     # --- calling -----------------------------------------------------------------------------------------------
 
     def want(self, peer: int, service: str, now: float) -> list[ImportAction]:
-        """Somebody local wants to call, or to know what it is: ``OpenedService`` or ``EndedService`` will follow.
+        """A local node wants to call it, or to know its type: ``OpenedService`` or ``EndedService`` will follow.
 
         Raises:
             LocalProtocolError: It is not shown, or its peer has no link: ask before.
@@ -501,7 +501,7 @@ class ServiceImports:
         return self._end(peer, message.route, message.reason)
 
     def release(self, peer: int, service: str, reason: str = "nobody calls it") -> list[ImportAction]:
-        """Nobody here has called it for a while."""
+        """It was not called for a while."""
         remote = self.get(peer, service)
         return self._release(peer, remote, reason) if remote is not None else []
 

@@ -9,7 +9,7 @@ A source is connected while at least one peer wants it::
       ▲               │ refused, lost          │ lost, restarted, gone
       └───────────────┴────────────────────────┘  every route of it: Closed(reason)
 
-Who lost a route asks again: the one that wants the data is the one that retries. A reliable route outlives its
+A peer that lost a route asks again: the side that wants the data retries. A reliable route outlives its
 link: it is suspended, its source stays connected, and the peer's next ``OpenRoute`` goes on where it was
 (``link_away``).
 
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class LocalSource:
-    """A source of the local graph: its message type, its node's slave API, and whose it is if we relay it."""
+    """A source of the local graph: its message type, its node's slave API, and its origin where it is relayed."""
 
     type: str
     uri: str
@@ -132,7 +132,7 @@ class Exports:
         contracts: What our side promises.
         names: How our names read at the peers.
         most: How much is offered.
-        kept: Who keeps the messages of reliable routes.
+        kept: Keeps the messages of reliable routes.
     """
 
     def __init__(
@@ -249,7 +249,7 @@ class Exports:
         return actions
 
     def graph(self, topic: str, publishers: Mapping[str, LocalSource]) -> list[Action]:
-        """Say who publishes a topic in the local graph now, by node, proxies left out; peers hear it by ``tell``."""
+        """Set a topic's publishers in the local graph now, by node, proxies left out; peers are told by ``tell``."""
         before = self._topics.get(topic, _NOTHING)
         if before.seen == publishers and (before.rules == self._rules or not publishers):
             return []
@@ -284,7 +284,7 @@ class Exports:
             return [self._catalogue.warning("sources.too_many")]
         if before is None or (before.type, before.origin) != (local.type, local.origin):
             self._catalogue.note(source)
-        # A new address is nobody's business but ours.
+        # Peers need not know of a new address.
         flow = self._flows.get(source)
         return self._end(source, "the node has restarted") if flow is not None and flow.uri != local.uri else []
 
@@ -306,7 +306,7 @@ class Exports:
         ]
 
     def _told_portion(self, peer: int, portion: Portion[Source, TopicOffer, Source], *, full: bool) -> list[Action]:
-        """A portion as a message, and what becomes of routes whose sources the peer may not have any more."""
+        """A portion as a message; routes of sources that the peer may not have any more end."""
         actions: list[Action] = []
         for source in portion.ended:
             actions += self._end_for(source, peer, "it is not offered here any more, or by another name")
@@ -337,7 +337,7 @@ class Exports:
         """A link is up: begin to tell all we have; ``tell`` goes on with it.
 
         Args:
-            peer: Whose.
+            peer: The peer's number.
             name: The peer's name, which its rules go by.
             instance: Its run, as 32 hexadecimal digits; nothing that came from there is relayed back to it.
         """
@@ -501,7 +501,7 @@ class Exports:
         return actions + self._disconnect(source, flow)
 
     def _disconnect(self, source: Source, flow: _ExportedFlow) -> list[Action]:
-        """Leave a source that nobody wants any more."""
+        """Leave a source that no peer wants any more."""
         if flow.wanted:
             return []
         del self._flows[source]

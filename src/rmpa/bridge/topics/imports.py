@@ -3,8 +3,8 @@
 Sans-I/O: the driver says what peers advertise and whether local nodes listen; it gets back actions. The states of
 each source's route are in ``topics.remote_topic``.
 
-What each method costs depends on what it is told, not on how many peers and sources there are; only who takes a long
-advertisement in one piece waits long (``portions``).
+What each method costs depends on what it is told, not on how many peers and sources there are; only a long
+advertisement in one piece takes long (``portions``).
 
 A source is known by its wire name, as its peer has it; under which topic it stands here is ``RemoteTopic.topic``
 (``bridge.naming``), and what the local graph says of topics is about those.
@@ -221,9 +221,9 @@ class Imports:
         """A link is up, perhaps of a peer that was away; its first message begins a full advertisement.
 
         Args:
-            peer: Whose.
+            peer: The peer's number.
             name: The peer's name, which its rules go by.
-            who: Whose link it is: what relays offer of that module is not needed any more.
+            who: The module that has the link: what relays offer of it is not needed any more.
         """
         new = _ImportPeer(name=name, nodes=NodePlaces(self._most.nodes), names=self._names.of(name))
         known = self._peers.setdefault(peer, new)
@@ -235,7 +235,7 @@ class Imports:
         """A link is gone, but its peer may come back: what does not need a reliable route leaves the local graph.
 
         Args:
-            peer: Whose.
+            peer: The peer's number.
             briefly: Nothing leaves yet: the link fell silent, and most of those are back at once. Called again
                 without this when the time is over.
 
@@ -252,7 +252,7 @@ class Imports:
         for source, entry in list(known.entries.items()):
             keep = briefly or entry.outlives(silent=known.silent)
             if entry.route:
-                # Where nobody listens any more, nothing is to go on.
+                # Without a listener, nothing is to go on.
                 goes_on = keep and entry.state is not RouteState.LINGERING
                 missed = entry.wanted and entry.state is not RouteState.LINGERING
                 actions.append(Detach(peer, source, entry.route, keep=goes_on, missed=missed and not goes_on))
@@ -264,7 +264,7 @@ class Imports:
         return actions, bool(known.entries)
 
     def waits_for(self, peer: int) -> bool:
-        """Whether something of a peer stays for a while: what somebody local listens to, reliable or latched."""
+        """Whether something of a peer stays for a while: what local nodes listen to, reliable or latched."""
         known = self._peers[peer]
         return any(entry.outlives(silent=known.silent) for entry in known.entries.values())
 
@@ -312,7 +312,7 @@ class Imports:
         ]
 
     def _names_of(self, known: _ImportPeer, origin: Origin | None) -> PeerNames:
-        """The rules that a source's name goes by: those for its own module, not for who passes it on."""
+        """The rules that a source's name goes by: those for its own module, not for the relay."""
         return known.names if origin is None else self._names.of(origin.name)
 
     def portions(self, peer: int, message: Advertise) -> Iterator[Change[TopicOffer, Source]]:

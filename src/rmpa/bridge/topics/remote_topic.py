@@ -30,15 +30,15 @@ class RouteState(Enum):
     """Where a remote source's route stands."""
 
     IDLE = auto()
-    """Visible in the local graph, nobody listens."""
+    """Visible in the local graph, without a listener."""
     OPENING = auto()
     """Asked for, not answered."""
     OPEN = auto()
     """Data flows."""
     LINGERING = auto()
-    """Data flows, though nobody listens; perhaps somebody comes back."""
+    """Data flows without a listener; perhaps one comes back."""
     WAITING = auto()
-    """It was closed although somebody listens; it will be asked for again."""
+    """It was closed although a node listens; it will be asked for again."""
 
 
 _S = RouteState
@@ -71,11 +71,11 @@ class RemoteTopic:
         timer: When the state is looked at again, monotonic seconds.
         description: What its messages are, once known.
         problem: Why the last attempt failed, or empty.
-        wanted: Whether somebody local listens.
+        wanted: Whether a local node listens.
         contract: What holds for its route, once it was open.
         asked: What was last asked for.
         serial: Of the timer.
-        origin: Whose it is, if its peer only passes it on.
+        origin: Its module and node, if its peer only passes it on.
         crowded: Whether it is hidden because its node has no place here (``limits.nodes``).
     """
 

@@ -290,7 +290,7 @@ async def test_an_owner_that_comes_back_without_it_takes_nothing_away(sides: Any
     again = Side("base")
     sides(again)
     join(again, pad, 2)
-    await until(lambda: again.params._desk._last == {"/robot_description": None})
+    await until(lambda: again.params._server._last == {"/robot_description": None})
     await pad.ask(transfer.NAMES, {}, 2)  # its answer comes behind what was told
     await until(lambda: not pad.params._follower._working)
     await again.look()
@@ -407,7 +407,7 @@ async def test_other_rules_leave_the_rest_alone(sides: Any) -> None:
     await pad.look()
     await base.look()
     assert pad.core.get("/base/robot_description") == "mine", "it is ours again"
-    assert list(base.params._desk.followed) == ["/arm"]
+    assert list(base.params._server.followed) == ["/arm"]
 
 
 async def test_a_namespace_that_may_not_be_read_in_full_is_not_followed(sides: Any) -> None:

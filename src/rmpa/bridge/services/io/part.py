@@ -72,23 +72,23 @@ class ShownService:
     """A peer's service in the local graph.
 
     Args:
-        peer: Whose.
+        peer: The peer's number.
         service: Its name here.
         node: Its node, in the peer's graph.
-        whose: The peer's name.
+        peer_name: The peer's name.
         stats: What became of its calls.
         proxy: The node that stands for that one, once it is there.
         endpoint: What clients connect to, likewise.
         caller: Where calls go, while the service is open.
         waiting: Calls that wait until it is.
-        asking: Who wants to know what it is.
+        asking: Clients that want to know its type.
         mismatch: What a client was told whose md5 sum did not fit; empty if none was.
     """
 
     peer: int
     service: str
     node: str
-    whose: str
+    peer_name: str
     stats: CallStats = field(default_factory=CallStats)
     proxy: SlaveNode | None = None
     endpoint: ServiceEndpoint | None = None
@@ -273,7 +273,7 @@ class Services(Part):
         self._serving.lane_lost(peer)
 
     def reconcile(self) -> None:
-        """Register again what is missing, and close what nobody uses."""
+        """Register again what is missing, and close what is not used."""
         services = self._core.state().services
         self._driver.look((*self.exports.seen, *services))
         before = asyncio.get_running_loop().time() - limits.SERVICE_IDLE
@@ -368,7 +368,7 @@ class Services(Part):
     def _register(self, shown: ShownService, proxy: SlaveNode) -> None:
         providers = self._core.state().services.get(shown.service, {})
         if any(node != proxy.name for node in providers):
-            return  # somebody came first: the scan hides ours, or did so already
+            return  # another node came first: the scan hides this one, or did so already
         code, status, _ = self._core.call("registerService", proxy.name, shown.service, proxy.service_uri, proxy.uri)
         if code != 1:
             _log.error("! the local core does not take %s of %s: %s", shown.service, proxy.name, status)
@@ -379,7 +379,7 @@ class Services(Part):
         if shown is None:
             return
         proxy = shown.proxy
-        text = f"service [{shown.service}] of {shown.whose}: {action.reason}"
+        text = f"service [{shown.service}] of {shown.peer_name}: {action.reason}"
         self._fail_waiting(shown, text)
         if proxy is not None:
             self._core.call("unregisterService", proxy.name, shown.service, proxy.service_uri)
@@ -410,7 +410,7 @@ class Services(Part):
         """Open a service; if its peer has no link at this moment, its next link or its end will go on from here."""
         remote = self.imports.get(shown.peer, shown.service)
         if remote is None or not remote.shown:
-            self._fail_waiting(shown, f"service [{shown.service}] of {shown.whose} has just gone")
+            self._fail_waiting(shown, f"service [{shown.service}] of {shown.peer_name} has just gone")
         elif remote.state is SessionState.IDLE and not self.imports.is_away(shown.peer):
             self._act(self.imports.want(shown.peer, shown.service, asyncio.get_running_loop().time()))
 
@@ -419,7 +419,7 @@ class Services(Part):
         session = self._sessions.get(action.peer)
         if shown is None or session is None or not session.linked:
             return
-        what = f"service [{shown.service}] of {shown.whose}"
+        what = f"service [{shown.service}] of {shown.peer_name}"
         caller = shown.caller = Caller(session.link, action.requests, what, self._budgets[action.peer], shown.stats)
         session.handlers[action.route] = caller
         self._callers[action.peer, action.route] = shown
@@ -442,7 +442,7 @@ class Services(Part):
             caller.close(action.reason)
         shown = self._shown.get((action.peer, action.service))
         if shown is not None and shown.caller is None:
-            self._fail_waiting(shown, f"service [{shown.service}] of {shown.whose}: {action.reason}")
+            self._fail_waiting(shown, f"service [{shown.service}] of {shown.peer_name}: {action.reason}")
 
     def _fail_waiting(self, shown: ShownService, text: str) -> None:
         asking, shown.asking = shown.asking, []

@@ -107,7 +107,7 @@ class Serving:
                 server.lane_lost()
 
     def close_idle(self, before: float) -> None:
-        """Close the connections that nobody has used since ``before`` (``loop.time()``)."""
+        """Close the connections that were not used since ``before`` (``loop.time()``)."""
         for service, pool in list(self._pools.items()):
             pool.close_idle(before)
             if pool.unused and not self._exports.callers(service):
@@ -160,7 +160,7 @@ class Serving:
         session.handlers[action.requests] = server
 
     async def _look_after(self) -> None:
-        """Notice servers that were killed: who provides a service and does not listen any more is suspected."""
+        """Notice servers that were killed: a node with a service that does not listen any more is suspected."""
         while True:
             servers = dict(self._exports.offered)
             cost = 0.0
@@ -173,7 +173,7 @@ class Serving:
 
 
 def _listening() -> tuple[set[int] | None, frozenset[str], float]:
-    """Ports that somebody listens at, this machine's addresses, and the processor's seconds; for a thread."""
+    """The ports with a listener, this machine's addresses, and the processor's seconds; for a thread."""
     began = time.thread_time()
     try:
         ports, here = listening_ports(), frozenset(local_addresses())

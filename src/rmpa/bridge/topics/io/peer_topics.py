@@ -128,7 +128,7 @@ class PeerTopics:
             flow.expect_replay(publication.latched)
 
     def position(self, source: Source) -> tuple[int, int] | None:
-        """Where a reliable source goes on that outlived its link, or whose route ended though somebody listens."""
+        """Where a reliable source goes on that outlived its link, or that lost its route though a node listens."""
         flow = self._latest.get(source)
         if flow is not None:
             return flow.position
@@ -154,7 +154,7 @@ class PeerTopics:
         return True
 
     def unheard(self, subscribed: Callable[[str], bool]) -> None:
-        """Nobody misses what comes on topics that nobody subscribes to any more.
+        """Messages of topics without a local subscriber are not missed any more.
 
         Args:
             subscribed: Whether a local node subscribes to a topic.
@@ -212,7 +212,7 @@ class PeerTopics:
         Args:
             flow: The source's.
             action: What the peer says.
-            missed: Whether somebody listened before, so that nothing may be lost unseen.
+            missed: Whether a node listened before, so that nothing may be lost unseen.
             same: Whether the numbering goes on.
         """
         if same:
@@ -239,7 +239,7 @@ class PeerTopics:
 
         Args:
             source: Which.
-            missed: Whether somebody listens all the same.
+            missed: Whether a local node listens all the same.
         """
         flow = self._latest.pop(source, None)
         if flow is None:
@@ -279,10 +279,10 @@ class PeerTopics:
             self._register(published)
 
     def link_down(self) -> int:
-        """The link is gone: what it brought in part is dropped, and nobody says any more that its sources live.
+        """The link is gone: what it brought in part is dropped, and the sources are not known to live any more.
 
         Returns:
-            How many best-effort routes were open: what they miss from now on nobody can count.
+            How many best-effort routes were open: what they miss from now on cannot be counted.
         """
         now = asyncio.get_running_loop().time()
         for flow in self.flows.values():

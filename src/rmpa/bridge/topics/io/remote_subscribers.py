@@ -1,4 +1,4 @@
-"""Who listens over there: names the local listeners to a peer, and lets a peer's listeners be seen here.
+"""Names the local subscribers to a peer, and lets a peer's subscribers be seen by publishers here.
 
 See ``bridge.topics.audience`` for the topics that need it.
 """
@@ -72,7 +72,7 @@ class RemoteSubscribers:
         self._topics = topics
         self._refusals = refusals
         self._told: dict[tuple[int, Source], tuple[int, tuple[str, ...]]] = {}
-        """What each peer was last told: the route, and who listens."""
+        """What each peer was last told: the route, and the listeners."""
         self._changed: dict[tuple[int, Source], None] = {}
         self._soon: asyncio.Handle | None = None
         self._shown: dict[tuple[int, Source], dict[str, PublisherConnection]] = {}
@@ -85,7 +85,7 @@ class RemoteSubscribers:
     # --- our listeners, to the peer that publishes ------------------------------------------------------------------
 
     def changed(self, peer: int, source: Source) -> None:
-        """Somebody local has begun or ceased to listen to a peer's source, or its route is open."""
+        """A local node has begun or ceased to listen to a peer's source, or its route is open."""
         entry = self._imports.get(peer, source)
         if entry is None or not is_watched(entry.type):
             return
@@ -112,7 +112,7 @@ class RemoteSubscribers:
     # --- the peer's listeners, to our publisher ---------------------------------------------------------------------
 
     def message(self, session: PeerSession, message: Message) -> bool:
-        """A peer says who listens to one of its routes; one that was closed meanwhile is left alone."""
+        """A peer names the listeners of one of its routes; one that was closed meanwhile is left alone."""
         if not isinstance(message, Audience):
             return False
         source = self._exports.source(session.peer, message.route)
