@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 import subprocess
@@ -10,6 +11,8 @@ import time
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
+
+import pandas as pd
 
 from lab.experiments.code import code_here
 
@@ -51,11 +54,9 @@ def lateness(seconds: float, period: float = 0.001) -> list[float]:
 
 def histogram(late: Sequence[float]) -> dict[str, int]:
     """Count samples in µs by class, each named by its upper bound."""
-    classes = dict.fromkeys([f"≤{bound}" for bound in _BOUNDS] + [f">{_BOUNDS[-1]}"], 0)
-    for sample in late:
-        name = next((f"≤{bound}" for bound in _BOUNDS if sample <= bound), f">{_BOUNDS[-1]}")
-        classes[name] += 1
-    return classes
+    names = [*(f"≤{bound}" for bound in _BOUNDS), f">{_BOUNDS[-1]}"]
+    classes = pd.cut(pd.Series(late, dtype="float64"), [-math.inf, *_BOUNDS, math.inf], labels=names)
+    return {str(name): int(count) for name, count in classes.value_counts(sort=False).items()}
 
 
 def _optimised() -> bool:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
+
+import numpy as np
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,16 +34,16 @@ class Summary:
     largest: float | None
 
 
-def percentile(ordered: Sequence[float], percent: float) -> float:
-    """The nearest-rank percentile of samples in ascending order."""
-    return ordered[max(0, math.ceil(len(ordered) * percent / 100) - 1)]
+def percentile(samples: Sequence[float], percent: float) -> float:
+    """The nearest-rank percentile: one of the samples, which may be in any order."""
+    return float(np.percentile(samples, percent, method="inverted_cdf"))
 
 
 def summary(samples: Sequence[float], lost: int = 0) -> Summary:
     """Summarise samples in any order."""
-    ordered = sorted(samples)
-
-    def at(percent: float) -> float | None:
-        return percentile(ordered, percent) if len(ordered) >= _NEEDED[percent] else None
-
-    return Summary(len(ordered), lost, at(50.0), at(95.0), at(99.0), at(99.9), ordered[-1] if ordered else None)
+    count = len(samples)
+    asked = [percent for percent, needed in _NEEDED.items() if count >= needed]
+    values = list(np.percentile(samples, asked, method="inverted_cdf")) if asked else []
+    found = dict(zip(asked, map(float, values), strict=True))
+    p50, p95, p99, p999 = (found.get(percent) for percent in _NEEDED)
+    return Summary(count, lost, p50, p95, p99, p999, float(max(samples)) if count else None)

@@ -1,6 +1,6 @@
-"""What the experiments ask of their samples: periods, losses, outages, straight lines, ratios over rounds.
+"""What the experiments ask of their samples: periods, outages, straight lines, ratios over rounds.
 
-Pure functions of numbers, without numpy; percentiles are in ``samples``. Times are in ns where they are moments of a
+Pure functions of numbers; percentiles are in ``samples``. Times are in ns where they are moments of a
 clock (``came_ns``), in seconds where they are spans. A flow is rows of ``(sequence, came_ns)``, as a sink noted it.
 """
 
@@ -107,49 +107,7 @@ def delays(earlier: Iterable[tuple[int, int]], later: Iterable[tuple[int, int]])
     return [(number, (ended[number] - begun[number]) / 1e9) for number in sorted(begun.keys() & ended.keys())]
 
 
-# --- losses and outages ---------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Losses:
-    """What became of the messages of one flow.
-
-    Args:
-        sent: How many there were.
-        lost: How many of them never came.
-        doubled: Copies beyond the first.
-        unordered: How many came after one with a higher number.
-        missing: Runs of numbers that never came: (first, last).
-    """
-
-    sent: int
-    lost: int
-    doubled: int
-    unordered: int
-    missing: tuple[tuple[int, int], ...]
-
-
-def losses(rows: Sequence[tuple[int, int]], sent: int, first: int = 0) -> Losses:
-    """Count what was lost of the numbers ``first`` to ``first + sent - 1``; rows are in the order of arrival."""
-    wanted = range(first, first + sent)
-    came = {number for number, _ in rows if number in wanted}
-    missing: list[tuple[int, int]] = []
-    for number in wanted:
-        if number in came:
-            continue
-        if missing and missing[-1][1] == number - 1:
-            missing[-1] = (missing[-1][0], number)
-        else:
-            missing.append((number, number))
-    numbers = [number for number, _ in rows if number in wanted]
-    highest = itertools.accumulate(numbers, max)
-    doubled = len(numbers) - len(came)
-    seen: set[int] = set()
-    unordered = 0
-    for number, top in zip(numbers, highest, strict=True):
-        unordered += number < top and number not in seen
-        seen.add(number)
-    return Losses(sent, sent - len(came), doubled, unordered, tuple(missing))
+# --- outages ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +143,7 @@ def outages(rows: Iterable[tuple[int, int]], longest: float, span: tuple[int, in
     Returns:
         In order. ``lost`` counts numbers left out between the message before and the one after; where the numbering
         begins again (its source was restarted), the numbers before the first one of the new numbering. Before the
-        first and after the last message it is 0: nobody knows what was sent there; see ``losses``.
+        first and after the last message it is 0: nobody knows what was sent there.
     """
     arrivals = sorted((came, number) for number, came in rows)
     found: list[Outage] = []
@@ -308,18 +266,3 @@ def _ranks(count: int, *, tail: bool) -> list[int]:
     ends = _DRAWN // 4
     step = (last - ends) / (_DRAWN - ends)
     return [int(i * step) for i in range(_DRAWN - ends)] + list(range(last - ends, last))
-
-
-def histogram(samples: Sequence[float], classes: int, low: float, high: float) -> list[int]:
-    """Count samples by classes of equal width from ``low`` to ``high``; what lies outside is not counted.
-
-    Raises:
-        ValueError: There is no room between the bounds, or no class.
-    """
-    if not low < high or classes < 1:
-        raise ValueError(f"no {classes} classes from {low} to {high}")
-    counts = [0] * classes
-    for sample in samples:
-        if low <= sample <= high:
-            counts[min(classes - 1, int((sample - low) / (high - low) * classes))] += 1
-    return counts

@@ -1,8 +1,7 @@
-"""What the tables of the measurements share: numbers as text, processes on a path, and what was to be reached."""
+"""Tables of the measurements on the terminal: numbers as text, percentiles, processes on a path."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from rich.table import Table
@@ -10,43 +9,8 @@ from rich.table import Table
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from rich.console import Console
-
+    from lab.samples import Summary
     from lab.usage import Usage
-
-
-@dataclass(frozen=True, slots=True)
-class Target:
-    """A figure of the project's own that a measurement is held against.
-
-    Args:
-        what: The figure, in words.
-        value: What came out; ``None`` if the samples were too few to say.
-        limit: What it may be at the most, or at the least.
-        at_least: Which of the two.
-    """
-
-    what: str
-    value: float | None
-    limit: float
-    at_least: bool = False
-
-    @property
-    def reached(self) -> bool | None:
-        """Whether it was reached; ``None`` if nobody knows."""
-        if self.value is None:
-            return None
-        return self.value >= self.limit if self.at_least else self.value <= self.limit
-
-
-def show_targets(console: Console, targets: Sequence[Target]) -> list[dict[str, object]]:
-    """Print each with its verdict; return them for the result."""
-    for target in targets:
-        word = {True: "reached", False: "not reached", None: "too few samples to say"}[target.reached]
-        style = {True: "green", False: "red", None: "yellow"}[target.reached]
-        sign = "≥" if target.at_least else "≤"
-        console.print(f"{target.what}: {dash(target.value)} (to reach: {sign} {target.limit:g}): {word}", style=style)
-    return [{**asdict(target), "reached": target.reached} for target in targets]
 
 
 def ratio(value: float | None, base: float | None) -> float | None:
@@ -81,18 +45,29 @@ def usage_row(usage: Usage, messages: int) -> dict[str, float]:
     }
 
 
+def table_of(title: str, left: Sequence[str], right: Sequence[str]) -> Table:
+    """An empty table with columns of words (``left``) and of figures (``right``)."""
+    made = Table(title=title)
+    for head in left:
+        made.add_column(head)
+    for head in right:
+        made.add_column(head, justify="right")
+    return made
+
+
+def percentiles(found: Summary) -> list[str]:
+    """The cells p50, p95, p99, p99.9 and max, in µs."""
+    return [us(value) for value in (found.p50, found.p95, found.p99, found.p999, found.largest)]
+
+
 def usage_table(title: str, rows: Iterable[tuple[str, Mapping[str, Usage], int]], unit: str = "message") -> Table:
     """The processes of each path; a row is the path's title, its processes' usage, and the messages in that span."""
-    table = Table(title=title)
-    for head in ("path", "process"):
-        table.add_column(head)
-    for head in (f"µs of CPU a {unit}", "% of a core", "RSS, MB"):
-        table.add_column(head, justify="right")
+    made = table_of(title, ("path", "process"), (f"µs of CPU a {unit}", "% of a core", "RSS, MB"))
     for path, processes, messages in rows:
         first = path  # named once for its block
         for name, usage in processes.items():
             row = usage_row(usage, messages)
             cells = [str(row[key]) for key in ("cpu_us_per_message", "cpu_percent", "rss_mb")]
-            table.add_row(first, name, *cells)
+            made.add_row(first, name, *cells)
             first = ""
-    return table
+    return made

@@ -17,7 +17,7 @@ _CORE_PORT: Final = 11311
 
 
 class NetworkPlace:
-    """Hosts of one lab; see ``bed.robot.Place``.
+    """Hosts of one lab; see ``bed.system.Place``.
 
     Args:
         lab: Where they are made.

@@ -17,7 +17,7 @@ _NOTHING: Final = dict.fromkeys(("tx_bytes", "tx_packets", "rx_bytes", "rx_packe
 
 
 class Loopback:
-    """Hosts that are this machine; see ``bed.robot.Place``.
+    """Hosts that are this machine; see ``bed.system.Place``.
 
     Args:
         hosts: Their names.

@@ -12,14 +12,13 @@ from lab.bed import namespaces, ros
 from lab.bed.hosts import NetworkPlace
 from lab.bed.loopback import Loopback
 from lab.bed.namespaces import Lab
-from lab.bed.robot import Classic, Rmpa
+from lab.bed.system import Classic, Rmpa
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from lab.bed.robot import Place, Robot
-    from lab.bed.system import Kind
-    from lab.experiments.model import Plan
+    from lab.bed.plan import Kind, Plan
+    from lab.bed.system import Place, System
 
 PROGRAMS = ("source", "velocity", "sink")
 """The nodes of ``nodes/``."""
@@ -34,17 +33,17 @@ def why_not(plan: Plan) -> str:
 
 
 @contextmanager
-def make_stage(plan: Plan) -> Iterator[PlannedStage]:
+def make_stage(plan: Plan) -> Iterator[Stage]:
     """A stage for one cell; all that was started on it has ended after the ``with``."""
     if "roscpp" in plan.clients:
         for program in PROGRAMS:
             ros.compiled(program)
     with tempfile.TemporaryDirectory(prefix="rmpa-experiment-") as made:
-        yield PlannedStage(plan, Path(made))
+        yield Stage(plan, Path(made))
 
 
-class PlannedStage:
-    """The stage of a plan; see ``bed.system.Stage``.
+class Stage:
+    """Where one cell is measured; all that was started on it has ended when the cell is over.
 
     Args:
         plan: Says where the hosts are, and what their cables carry.
@@ -79,13 +78,23 @@ class PlannedStage:
         config: str = "",
         flags: Sequence[str] = (),
         linked: bool = True,
-    ) -> Iterator[Robot]:
-        """Set a system up; it is torn down at the end of the ``with``. Arguments as of ``Stage.system``."""
+    ) -> Iterator[System]:
+        """Set a system up; it is torn down at the end of the ``with``.
+
+        Args:
+            kind: Which.
+            hosts: Their names; classic's roscore runs on ``pc``, else on the last.
+            link: What each cable carries (``100mbit``); empty for unshaped; ``None``: as the plan says.
+            bands: Whether packets leave by the kernel's usual three bands (``pfifo_fast``), as on a real interface.
+            config: Text of every agent's ``rmpa.toml``.
+            flags: Further words for ``rmpa up``.
+            linked: Whether to wait until every agent is linked with every other (classic: until the master answers).
+        """
         home = self._home / f"system{next(self._numbers)}"
         home.mkdir()
         with ExitStack() as stack:
             place = self._place(stack, hosts, self._plan.link if link is None else link, bands=bands)
-            made: Robot
+            made: System
             if kind == "classic":
                 made = Classic(place, hosts, home)
             else:

@@ -16,12 +16,13 @@ import time
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
-from rich.table import Table
-
-from lab import plot, results, samples
+from lab import samples
 from lab.bed.bench import Bed
 from lab.bench import profile, schedule
-from lab.tables import Target, dash, show_targets, us
+from lab.figures import shapes
+from lab.findings import Claim
+from lab.results import finish
+from lab.tables import dash, table_of, us
 from rmpa.resource.decide.adaptation import AdaptationSettings, Apply, Reacted
 from rmpa.resource.declare.resource import Resource, at_most
 from rmpa.resource.run.client import ResourceClient
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rich.console import Console
+    from rich.table import Table
 
     from rmpa.resource.decide.adaptation import Action
 
@@ -51,7 +53,7 @@ _USUAL: Final = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class BookkeepingPlan:
     """How much is measured.
 
     Args:
@@ -67,8 +69,8 @@ class Plan:
     relayed: float
 
 
-FULL: Final = Plan(400, 1.0, 40, 10.0)
-QUICK: Final = Plan(50, 0.2, 6, 2.0)
+FULL: Final = BookkeepingPlan(400, 1.0, 40, 10.0)
+QUICK: Final = BookkeepingPlan(50, 0.2, 6, 2.0)
 
 
 def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
@@ -79,18 +81,18 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
         way = schedule.agents(bed)
         stream = way.stream(bed, "/relayed")
         pids = {f"agent {number}": agent.pid for number, agent in enumerate(way.agents, 1)}
-        rates = profile.Plan((_USUAL, 4 * _USUAL), plan.relayed, plan.relayed, 0.0)
+        rates = profile.ProfilePlan((_USUAL, 4 * _USUAL), plan.relayed, plan.relayed, 0.0)
         relay = list(profile.relay_costs(stream, pids, rates))
     waits, reported = asyncio.run(_reactions(plan))
     least = min(cost.total for cost in relay if cost.rate == _USUAL)
     console.print(_cost_table(costs, relay))
     console.print(_reaction_table(waits, reported, plan.window))
     targets = [
-        Target(f"measuring an {kind}, share of relaying a message", round(cost / least, 4), _SHARE)
+        Claim(f"measuring an {kind}, share of relaying a message", round(cost / least, 4), _SHARE)
         for kind, cost in costs.items()
     ]
     targets.append(
-        Target(
+        Claim(
             "disturbance to reconfiguration, windows, worst (as the resource says it, without applying the profile)",
             round(max(reported) / plan.window, 2),
             _WINDOWS,
@@ -101,13 +103,18 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
         "relay": [asdict(cost) for cost in relay],
         "reaction_windows": [round(wait / plan.window, 4) for wait in waits],
         "reported_windows": [round(wait / plan.window, 4) for wait in reported],
-        "targets": show_targets(console, targets),
     }
-    written = results.write("bookkeeping", {**asdict(plan), "seed": _SEED}, result, json)
-    image = written.with_suffix(".png")
-    plot.bars(image, {"CPU a message": {**costs, **{f"{c.agent}, {c.rate:g} Hz": c.total for c in relay}}}, "µs")
-    console.print(f"written: {written} and {image.name}")
-    return result
+    return finish(
+        console,
+        "bookkeeping",
+        {**asdict(plan), "seed": _SEED},
+        result,
+        json,
+        claims=targets,
+        panels=shapes.bars(
+            {"CPU a message": {**costs, **{f"{c.agent}, {c.rate:g} Hz": c.total for c in relay}}}, "µs"
+        ),
+    )
 
 
 # --- bookkeeping ----------------------------------------------------------------------------------------------------
@@ -162,7 +169,7 @@ def _batch(function: Callable[[], None]) -> float:
 # --- reaction -------------------------------------------------------------------------------------------------------
 
 
-async def _reactions(plan: Plan) -> tuple[list[float], list[float]]:
+async def _reactions(plan: BookkeepingPlan) -> tuple[list[float], list[float]]:
     """Seconds from each disturbance until another profile ran; and what the resource says, less the applying."""
     chance = random.Random(_SEED)
     running = disturbed = ""
@@ -221,7 +228,7 @@ async def _reactions(plan: Plan) -> tuple[list[float], list[float]]:
 
 
 def _cost_table(costs: dict[str, float], relay: list[profile.Cost]) -> Table:
-    table = Table(title="processor time a message, µs")
+    table = table_of("processor time a message, µs", (), ())
     for head in ("what", "µs", f"share of the cheaper agent's at {_USUAL:g} Hz"):
         table.add_column(head, justify="left" if head == "what" else "right")
     least = min(cost.total for cost in relay if cost.rate == _USUAL)
@@ -233,7 +240,7 @@ def _cost_table(costs: dict[str, float], relay: list[profile.Cost]) -> Table:
 
 
 def _reaction_table(waits: list[float], reported: list[float], window: float) -> Table:
-    table = Table(title=f"disturbance to reconfiguration, in windows of {window:g} s")
+    table = table_of(f"disturbance to reconfiguration, in windows of {window:g} s", (), ())
     for head in ("by", "p50", "largest", "least", "disturbances"):
         table.add_column(head, justify="left" if head == "by" else "right")
     for who, times in (("the stop watch", waits), ("the resource, without the applying", reported)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -20,11 +20,10 @@ from lab.bench import (
     idle,
     joining,
     load,
-    path,
-    peers,
     period,
     profile,
     roscore,
+    roundtrips,
     scale,
     services,
     startup,
@@ -32,6 +31,7 @@ from lab.bench import (
     tasks,
     throughput,
 )
+from lab.bench.contenders import ENTRIES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -57,7 +57,9 @@ class Measurement:
 
 
 MEASUREMENTS: Final[dict[str, Measurement]] = {
-    "path": Measurement("how late a message is, on every path", path.run, needs=()),  # leaves out what cannot start
+    "path": Measurement(
+        "how late a message is, on every path", roundtrips.path, needs=()
+    ),  # leaves out what cannot start
     "period": Measurement(
         "how evenly messages arrive", period.measure, realtime=partial(period.measure, realtime=True)
     ),
@@ -73,7 +75,7 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
         realtime=partial(storm.measure, realtime=True),
     ),
     "scale": Measurement("what more peers and more topics cost one stream", scale.measure),
-    "peers": Measurement("who else carries bytes, in the same run", peers.measure, needs=()),  # likewise
+    "peers": Measurement("who else carries bytes, in the same run", roundtrips.peers, needs=()),  # likewise
     "profile": Measurement("what a relayed message costs an agent, and where that goes", profile.measure),
     "throughput": Measurement("how much goes through", throughput.measure),
     "startup": Measurement("how soon the first message arrives", startup.measure),
@@ -100,7 +102,12 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
 @click.argument("names", nargs=-1, metavar="[NAME]...", type=click.Choice(list(MEASUREMENTS)))
 @click.option("--quick", is_flag=True, help="Few samples: to see whether it works, not to quote.")
 @click.option("--json", "file", type=click.Path(path_type=Path), help="Write the result there too (one measurement).")
-@click.option("--only", default="", metavar="KEYS", help="path: these contenders, comma-separated.")
+@click.option(
+    "--only",
+    default="",
+    metavar="KEYS",
+    help="path: these contenders, comma-separated (lab/bench/contenders.py has them).",
+)
 @click.option(
     "--realtime",
     is_flag=True,
@@ -117,8 +124,9 @@ def bench(names: tuple[str, ...], quick: bool, file: Path | None, only: str, rea
         if reason := next(filter(None, (why() for why in row.needs)), ""):
             console.print(f"{name} is left out: {reason}", style="yellow")
         elif name == "path" and only:
-            plan = path.QUICK if quick else path.FULL
-            path.measure(replace(plan, only=tuple(only.split(","))), console, file)
+            if unknown := sorted({*only.split(",")} - {*ENTRIES}):
+                raise click.BadParameter(f"no {unknown[0]}; there are {', '.join(ENTRIES)}", param_hint="--only")
+            roundtrips.path(quick, console, file, tuple(only.split(",")))
         else:
             measure = (realtime and row.realtime) or row.measure
             measure(quick, console, file)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 from array import array
 from contextlib import contextmanager
@@ -9,8 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from lab.bed.bench import why_no_hosts, why_no_ros
 from lab.bed.namespaces import MACHINE
-from lab.bed.ros import NODES, Ros, compiled
+from lab.bed.ros import NODES, Ros, compiled, free_port
 from lab.usage import Meter, Usage
 
 if TYPE_CHECKING:
@@ -20,12 +22,15 @@ if TYPE_CHECKING:
     from lab.bed.bench import Bed
     from lab.bed.processes import Process
 
+SIZES: Final = (64, 64 * 1024, 1024 * 1024)
+"""Bytes of the messages that are measured."""
 RELAY: Final = Path("/usr/lib/topic_tools/relay")
+_INSTALL: Final = "pip install -c constraints.txt -e '.[lab-peers]'"
 _ROUND_DEADLINE: Final = 120.0
 
 
 @dataclass(slots=True)
-class Contender:
+class RoundTripPath:
     """One path from ``ping`` and back.
 
     Args:
@@ -65,7 +70,7 @@ class Contender:
                 process.freeze()
 
 
-def floor_c(bed: Bed) -> Contender:
+def floor_c(bed: Bed) -> RoundTripPath:
     """Raw TCP in C++."""
     shell = bed.shell()
     program = compiled("floor", NODES)
@@ -74,25 +79,41 @@ def floor_c(bed: Bed) -> Contender:
     return _raw("floor_c", "C, raw TCP", shell.start(program, "ping", port, commands=True), server)
 
 
-def floor_python(bed: Bed) -> Contender:
-    """Raw TCP in Python, with the interpreter that runs the agents."""
-    shell = bed.shell()
-    program = NODES / "floor.py"
-    server = shell.start(sys.executable, program, "serve")
-    port = str(server.wait_event("up")["port"])
-    ping = shell.start(sys.executable, program, "ping", port, commands=True)
-    return _raw("floor_python", "Python, raw TCP", ping, server)
-
-
-def _raw(key: str, title: str, ping: Process, server: Process) -> Contender:
+def _raw(key: str, title: str, ping: Process, server: Process) -> RoundTripPath:
     ping.wait_event("ready")
-    return Contender(key, title, ping, {"ping": ping, "pong": server}, [ping, server])
+    return RoundTripPath(key, title, ping, {"ping": ping, "pong": server}, [ping, server])
 
 
-def direct(client: str, *, nodelay: bool) -> Callable[[Bed], Contender]:
+def script(
+    key: str, title: str, program: str, words: Callable[[], list[str]] = list, *, freeze: bool = False
+) -> Callable[[Bed], RoundTripPath]:
+    """Both ends are one Python script of ``nodes/``, called with ``serve`` and with ``ping``.
+
+    Args:
+        key: Its name in JSON.
+        title: Its name in tables.
+        program: The script.
+        words: Makes the arguments of both ends; without any, ``ping`` gets the port at which ``serve`` listens.
+        freeze: Whether both may be stopped while others are measured: not where ends watch each other's life.
+    """
+
+    def start(bed: Bed) -> RoundTripPath:
+        shell, given = bed.shell(), words()
+        server = shell.start(sys.executable, NODES / program, "serve", *given, name=f"{key} pong")
+        up = server.wait_event("up")
+        given = [str(up["port"])] if "port" in up else given
+        ping = shell.start(sys.executable, NODES / program, "ping", *given, name=f"{key} ping", commands=True)
+        ping.wait_event("ready", 30.0)
+        ends = {"ping": ping, "pong": server}
+        return RoundTripPath(key, title, ping, ends, list(ends.values()) if freeze else [])
+
+    return start
+
+
+def direct(client: str, *, nodelay: bool) -> Callable[[Bed], RoundTripPath]:
     """One client library, straight from node to node."""
 
-    def start(bed: Bed) -> Contender:
+    def start(bed: Bed) -> RoundTripPath:
         shell = bed.shell()
         shell.master()
         word = "tcpNoDelay" if nodelay else "Nagle"
@@ -102,13 +123,13 @@ def direct(client: str, *, nodelay: bool) -> Callable[[Bed], Contender]:
     return start
 
 
-def direct_hosts(bed: Bed) -> Contender:
+def direct_hosts(bed: Bed) -> RoundTripPath:
     """Roscpp straight from host to host by the same kind of cable as the agents': classic ROS at its best."""
     here, there = bed.classic()
     return _nodes("roscpp_hosts", "roscpp direct, two hosts", here, there, "roscpp")
 
 
-def relays(bed: Bed) -> Contender:
+def relays(bed: Bed) -> RoundTripPath:
     """Roscpp through two C++ relays each way: as many hops as through two agents."""
     shell = bed.shell()
     shell.master()
@@ -120,20 +141,20 @@ def relays(bed: Bed) -> Contender:
     return _nodes("relays", "roscpp, two C++ relays", shell, shell, "roscpp", between, ask="/ping2", answer="/pong2")
 
 
-def agents_hosts(bed: Bed) -> Contender:
+def agents_hosts(bed: Bed) -> RoundTripPath:
     """Roscpp through two agents in two network namespaces."""
     a, b = bed.lab.hosts("a", "b")
     first, second = bed.agent(a, name="a"), bed.agent(b, name="b")
     return _through("agents_hosts", "roscpp, two agents, two hosts", bed, first, second)
 
 
-def agents_one_host(bed: Bed) -> Contender:
+def agents_one_host(bed: Bed) -> RoundTripPath:
     """Roscpp through two agents on the real machine."""
     first, second = bed.agent(MACHINE, name="one"), bed.agent(MACHINE, name="two")
     return _through("agents_one_host", "roscpp, two agents, one host", bed, first, second)
 
 
-def _through(key: str, title: str, bed: Bed, first: Agent, second: Agent) -> Contender:
+def _through(key: str, title: str, bed: Bed, first: Agent, second: Agent) -> RoundTripPath:
     between = {"agent 1": first.process, "agent 2": second.process}
     here, there = (bed.shell(agent.host, agent.core_port) for agent in (first, second))
     made = _nodes(key, title, here, there, "roscpp", between)
@@ -152,24 +173,72 @@ def _nodes(
     nodelay: bool = True,
     ask: str = "/ping",
     answer: str = "/pong",
-) -> Contender:
+) -> RoundTripPath:
     pong = there.node(client, "velocity", "__name:=pong", cmd=ask, vel="/pong", nodelay=nodelay)
     start = here.rospy if client == "rospy" else here.roscpp
     ping = start("ping", "__name:=ping", commands=True, topic="/ping", reply=answer, nodelay=nodelay)
     ping.wait_event("ready", 30.0)
     processes = {"ping": ping, **(between or {}), "pong": pong}
-    return Contender(key, title, ping, processes, list(processes.values()))
+    return RoundTripPath(key, title, ping, processes, list(processes.values()))
 
 
-ALL: Final[dict[str, Callable[[Bed], Contender]]] = {
-    "floor_c": floor_c,
-    "floor_python": floor_python,
-    "roscpp_nodelay": direct("roscpp", nodelay=True),
-    "roscpp_nagle": direct("roscpp", nodelay=False),
-    "roscpp_hosts": direct_hosts,
-    "rospy_nodelay": direct("rospy", nodelay=True),
-    "rospy_nagle": direct("rospy", nodelay=False),
-    "relays": relays,
-    "agents_hosts": agents_hosts,
-    "agents_one_host": agents_one_host,
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A contender that may take part.
+
+    Args:
+        start: Starts its processes.
+        module: The Python module that it needs, or empty.
+        needs: Each says why it cannot run here, or an empty string.
+    """
+
+    start: Callable[[Bed], RoundTripPath]
+    module: str = ""
+    needs: tuple[Callable[[], str], ...] = ()
+
+    def why_not(self) -> str:
+        """Why it cannot take part here, or an empty string."""
+        if self.module and importlib.util.find_spec(self.module) is None:
+            return f"{self.module} is not installed ({_INSTALL})"
+        return next(filter(None, (why() for why in self.needs)), "")
+
+
+def _port() -> list[str]:
+    return [str(free_port())]
+
+
+_ROS: Final = (why_no_ros,)
+_HOSTS: Final = (why_no_ros, why_no_hosts)
+ENTRIES: Final[dict[str, Entry]] = {
+    "floor_c": Entry(floor_c, needs=_ROS),  # compiled with the nodes' flags
+    "floor_python": Entry(script("floor_python", "Python, raw TCP", "floor.py", freeze=True)),
+    "roscpp_nodelay": Entry(direct("roscpp", nodelay=True), needs=_ROS),
+    "roscpp_nagle": Entry(direct("roscpp", nodelay=False), needs=_ROS),
+    "roscpp_hosts": Entry(direct_hosts, needs=_HOSTS),
+    "rospy_nodelay": Entry(direct("rospy", nodelay=True), needs=_ROS),
+    "rospy_nagle": Entry(direct("rospy", nodelay=False), needs=_ROS),
+    "relays": Entry(relays, needs=_ROS),
+    "zenoh": Entry(script("zenoh", "zenoh (Python), TCP", "ping_zenoh.py", _port), "zenoh"),
+    "zenoh_shm": Entry(
+        script("zenoh_shm", "zenoh (Python), shared memory", "ping_zenoh.py", lambda: [*_port(), "--shared-memory"]),
+        "zenoh",
+    ),
+    "cyclonedds": Entry(
+        script(
+            "cyclonedds",
+            "cyclonedds (Python), reliable",
+            "ping_dds.py",
+            lambda: [str(free_port() % 200 + 20), *map(str, SIZES)],  # a domain of our own, and the types' sizes
+        ),
+        "cyclonedds",
+    ),
+    "pyzmq": Entry(script("pyzmq", "pyzmq, PAIR over TCP", "ping_zmq.py", freeze=True), "zmq"),
+    "agents_hosts": Entry(agents_hosts, needs=_HOSTS),
+    "agents_one_host": Entry(agents_one_host, needs=_ROS),
 }
+"""All ways to carry bytes from process to process, each at its best (Zenoh peer to peer, DDS over loopback alone)."""
+_LIBRARIES: Final = {"zenoh", "zenoh_shm", "cyclonedds", "pyzmq"}
+PATH: Final = tuple(key for key in ENTRIES if key not in _LIBRARIES)
+"""Those of ``path``: every path of ROS and RMPA."""
+PEERS: Final = tuple(key for key in ENTRIES if key not in {"roscpp_hosts", "relays"})
+"""Those of ``peers``: the libraries beside the nodes."""

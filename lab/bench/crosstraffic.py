@@ -10,17 +10,18 @@ import subprocess
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
-from rich.table import Table
-
-from lab import plot, results
 from lab.bed.bench import Bed
 from lab.bench import schedule
-from lab.tables import Target, dash, ratio, show_targets, us, usage_table
+from lab.figures import shapes
+from lab.findings import Claim
+from lab.results import finish
+from lab.tables import dash, percentiles, ratio, table_of, usage_table
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from rich.console import Console
+    from rich.table import Table
 
     from lab.bed.namespaces import Host
 
@@ -38,7 +39,7 @@ _DEADLINE: Final = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class CrosstrafficPlan:
     """How much is measured.
 
     Args:
@@ -50,16 +51,16 @@ class Plan:
     rounds: int
 
 
-FULL: Final = Plan(20.0, 5)
-QUICK: Final = Plan(8.0, 2)
+FULL: Final = CrosstrafficPlan(20.0, 5)
+QUICK: Final = CrosstrafficPlan(8.0, 2)
 
 
-class Loaded(schedule.Score):
+class LoadedScore(schedule.LatencyScore):
     """Commands beside images, and the images."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.images = schedule.Score()
+        self.images = schedule.LatencyScore()
         self.throughput: list[float] = []
 
     def add_images(self, images: schedule.Arrivals, commands: schedule.Arrivals) -> None:
@@ -74,7 +75,7 @@ class Loaded(schedule.Score):
         return 8 * sum(self.throughput) / len(self.throughput) / _LINK if self.throughput else None
 
 
-Scores = dict[tuple[str, str], Loaded]
+Scores = dict[tuple[str, str], LoadedScore]
 
 
 def measure(quick: bool, console: Console, json: Path | None = None, *, realtime: bool = False) -> dict[str, object]:
@@ -93,7 +94,6 @@ def measure(quick: bool, console: Console, json: Path | None = None, *, realtime
     result: dict[str, object] = {
         "rows": [_row(key, condition, one, scores) for (key, condition), one in scores.items()],
         "scheduling": how,
-        "targets": show_targets(console, _targets(scores)),
         **host.finish(console),
     }
     settings = {
@@ -104,14 +104,18 @@ def measure(quick: bool, console: Console, json: Path | None = None, *, realtime
         "image_hz": _IMAGE_RATE,
         "link_bits_per_s": _LINK,
     }
-    written = results.write(schedule.named("crosstraffic", realtime=realtime), settings, result, json)
-    image = written.with_suffix(".png")
-    plot.tails(image, _panels(scores, titles), "from due to there, µs", _DEADLINE)
-    console.print(f"written: {written} and {image.name}")
-    return result
+    return finish(
+        console,
+        schedule.named("crosstraffic", realtime=realtime),
+        settings,
+        result,
+        json,
+        claims=_targets(scores),
+        panels=shapes.tails(_panels(scores, titles), "from due to there, µs", _DEADLINE),
+    )
 
 
-def _take(plan: Plan, console: Console, *, realtime: bool) -> tuple[Scores, dict[str, str], str]:
+def _take(plan: CrosstrafficPlan, console: Console, *, realtime: bool) -> tuple[Scores, dict[str, str], str]:
     """The scores, the ways' titles by key, and how all that ran was scheduled."""
     scores: Scores = {}
     with Bed() as bed:
@@ -127,17 +131,17 @@ def _take(plan: Plan, console: Console, *, realtime: bool) -> tuple[Scores, dict
         for order in schedule.turns(ways, plan.rounds, console):
             for way in order:
                 for condition in ("unloaded", "loaded"):
-                    score = scores.setdefault((way.key, condition), Loaded())
+                    score = scores.setdefault((way.key, condition), LoadedScore())
                     _round(*streams[way.key], plan.seconds, score, loaded=condition == "loaded")
     return scores, {way.key: way.title for way in ways}, how
 
 
-def _targets(scores: Scores) -> list[Target]:
+def _targets(scores: Scores) -> list[Claim]:
     ours, idle = scores["agents", "loaded"], scores["agents", "unloaded"]
     return [
-        Target("p99 beside images, ms", _ms(ours.summary.p99), 1.0),
-        Target("p99 beside images / unloaded", ratio(ours.summary.p99, idle.summary.p99), 3.0),
-        Target("images, share of the link", ours.share, 0.9, at_least=True),
+        Claim("p99 beside images, ms", _ms(ours.summary.p99), 1.0),
+        Claim("p99 beside images / unloaded", ratio(ours.summary.p99, idle.summary.p99), 3.0),
+        Claim("images, share of the link", ours.share, 0.9, at_least=True),
     ]
 
 
@@ -153,7 +157,14 @@ def shape(host: Host) -> None:
         subprocess.run(command, check=True, capture_output=True, timeout=20)
 
 
-def _round(command: schedule.Stream, image: schedule.Stream, seconds: float, score: Loaded, *, loaded: bool) -> None:
+def _round(
+    command: schedule.MeasuredStream,
+    image: schedule.MeasuredStream,
+    seconds: float,
+    score: LoadedScore,
+    *,
+    loaded: bool,
+) -> None:
     if loaded:
         image.begin(_IMAGE, _IMAGE_RATE, _AHEAD + seconds + 1.0)
         image.wait_lead_in(_AHEAD)
@@ -167,7 +178,7 @@ def _ms(value: float | None) -> float | None:
     return None if value is None else value / 1000
 
 
-def _row(key: str, condition: str, one: Loaded, scores: Scores) -> dict[str, object]:
+def _row(key: str, condition: str, one: LoadedScore, scores: Scores) -> dict[str, object]:
     idle, classic = scores[key, "unloaded"].summary, scores["direct", condition].summary
     row = {
         "way": key,
@@ -187,19 +198,17 @@ def _row(key: str, condition: str, one: Loaded, scores: Scores) -> dict[str, obj
 
 
 def _table(scores: Scores, titles: dict[str, str]) -> Table:
-    table = Table(
-        title=f"a command of {_SIZE} B at {_RATE:.0f} Hz on {_LINK / 1e6:.0f} Mbit/s, from due to there, µs"
-    )
-    for head in ("way", "beside"):
-        table.add_column(head)
     heads = ("p50", "p95", "p99", "p99.9", "max", "count", "lost", ">1 ms", "to unloaded", "to classic")
-    for head in heads:
-        table.add_column(head, justify="right")
+    table = table_of(
+        f"a command of {_SIZE} B at {_RATE:.0f} Hz on {_LINK / 1e6:.0f} Mbit/s, from due to there, µs",
+        ("way", "beside"),
+        heads,
+    )
     for condition, beside in (("unloaded", "nothing"), ("loaded", "images")):
         for key, title in titles.items():
             one = scores[key, condition]
             row = one.summary
-            cells = [us(value) for value in (row.p50, row.p95, row.p99, row.p999, row.largest)]
+            cells = percentiles(row)
             counts = [str(row.count), str(row.lost), f"{100 * one.later_than(_DEADLINE):.2f} %"]
             bases = (scores[key, "unloaded"].summary.p99, scores["direct", condition].summary.p99)
             table.add_row(title, beside, *cells, *counts, *[dash(ratio(row.p99, base)) for base in bases])
@@ -207,12 +216,11 @@ def _table(scores: Scores, titles: dict[str, str]) -> Table:
 
 
 def _image_table(scores: Scores, titles: dict[str, str]) -> Table:
-    table = Table(
-        title=f"images of 1 MB, {_IMAGE_RATE} Hz offered ({8 * _IMAGE * _IMAGE_RATE / _LINK:.2f} of the link)"
+    table = table_of(
+        f"images of 1 MB, {_IMAGE_RATE} Hz offered ({8 * _IMAGE * _IMAGE_RATE / _LINK:.2f} of the link)",
+        ("way",),
+        ("MB/s", "share of the link", "to classic", "p50 late, ms", "max, ms", "came", "dropped"),
     )
-    table.add_column("way")
-    for head in ("MB/s", "share of the link", "to classic", "p50 late, ms", "max, ms", "came", "dropped"):
-        table.add_column(head, justify="right")
     for key, title in titles.items():
         one = scores[key, "loaded"]
         row = one.images.summary

@@ -13,10 +13,11 @@ import time
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
-from rich.table import Table
-
-from lab import plot, results, samples
-from lab.tables import Target, show_targets, us
+from lab import samples
+from lab.figures import shapes
+from lab.findings import Claim
+from lab.results import finish
+from lab.tables import table_of, us
 from rmpa.resource.decide.decision import Decider
 from rmpa.resource.declare.attributes import Attribute, Direction, Scale
 from rmpa.resource.declare.profiles import Profile
@@ -43,11 +44,11 @@ _EXPLAIN_EVERY: Final = 10
 def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
     """Measure, print the table, write the files; return the result."""
     decisions = 1000 if quick else 10_000
-    table = Table(title=f"deciding, µs; {decisions} questions each")
-    for head in ("profiles", "attributes", "clients", "who asks anew", "step"):
-        table.add_column(head)
-    for head in ("p50", "p99", "p99.9", "max"):
-        table.add_column(head, justify="right")
+    table = table_of(
+        f"deciding, µs; {decisions} questions each",
+        ("profiles", "attributes", "clients", "who asks anew", "step"),
+        ("p50", "p99", "p99.9", "max"),
+    )
     rows: list[dict[str, object]] = []
     panels: dict[str, dict[str, list[float]]] = {}
     whole = samples.summary([])
@@ -72,15 +73,19 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
     console.print(table)
     what = "{} profiles x {} attributes x {} clients, all anew, ms".format(*_SIZES[-1])
     targets = [
-        Target(f"{what}, {name}", value / 1000 if value is not None else None, _LIMIT_MS)
+        Claim(f"{what}, {name}", value / 1000 if value is not None else None, _LIMIT_MS)
         for name, value in (("p50", whole.p50), ("p99", whole.p99))
     ]
-    result: dict[str, object] = {"rows": rows, "targets": show_targets(console, targets)}
-    written = results.write("decision", {"decisions": decisions, "seed": _SEED}, result, json)
-    image = written.with_suffix(".png")
-    plot.tails(image, panels, "µs", 1000 * _LIMIT_MS)
-    console.print(f"written: {written} and {image.name}")
-    return result
+    result: dict[str, object] = {"rows": rows}
+    return finish(
+        console,
+        "decision",
+        {"decisions": decisions, "seed": _SEED},
+        result,
+        json,
+        claims=targets,
+        panels=shapes.tails(panels, "µs", 1000 * _LIMIT_MS),
+    )
 
 
 @dataclass(slots=True)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final
 
-from rich.table import Table
-
-from lab import results
 from lab.bed.bench import Bed
+from lab.results import finish
+from lab.tables import table_of
 from lab.usage import Meter
 
 if TYPE_CHECKING:
@@ -23,17 +22,18 @@ _SETTLE: Final = 4.0
 def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
     """Measure, print the table, write the file; return the result."""
     span = 5.0 if quick else 20.0
-    table = Table(title=f"an idle agent over {span:.0f} s (to reach: 1 % of a core, 45 MB)")
-    for head in ("peers", "CPU mean, %", "CPU worst agent, %", "RSS worst agent, MB"):
-        table.add_column(head, justify="right")
+    table = table_of(
+        f"an idle agent over {span:.0f} s (to reach: 1 % of a core, 45 MB)",
+        (),
+        ("peers", "CPU mean, %", "CPU worst agent, %", "RSS worst agent, MB"),
+    )
     result: dict[str, object] = {}
     for peers in (1, 4):
         cpu, rss = _agents(peers + 1, span)
         table.add_row(str(peers), f"{sum(cpu) / len(cpu):.2f}", f"{max(cpu):.2f}", f"{max(rss):.1f}")
         result[f"{peers} peers"] = {"cpu_percent": cpu, "rss_mb": rss}
     console.print(table)
-    console.print(f"written: {results.write('idle', {'seconds': span}, result, json)}")
-    return result
+    return finish(console, "idle", {"seconds": span}, result, json)
 
 
 def _agents(count: int, span: float) -> tuple[list[float], list[float]]:

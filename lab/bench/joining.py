@@ -16,13 +16,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
-from rich.table import Table
-
-from lab import results
 from lab.bed.agents import last_link
 from lab.bed.bench import Bed
 from lab.bed.ros import NODES
-from lab.tables import Target, show_targets
+from lab.findings import Claim
+from lab.results import finish
+from lab.tables import table_of
 from lab.usage import Meter
 from rmpa.core.errors import RmpaError
 from rmpa.observe.io.control_client import ControlClient
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rich.console import Console
+    from rich.table import Table
 
     from lab.bed.agents import Agent
     from rmpa.observe.snapshot import Snapshot
@@ -47,7 +47,7 @@ _INTERFACE: Final = "eth0"
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class JoiningPlan:
     """How much is measured.
 
     Args:
@@ -69,8 +69,8 @@ class Plan:
     services: int = 100
 
 
-FULL: Final = Plan()
-QUICK: Final = Plan(modules=(2, 4, 16), joins=1, idle=5.0, mirrors=1)
+FULL: Final = JoiningPlan()
+QUICK: Final = JoiningPlan(modules=(2, 4, 16), joins=1, idle=5.0, mirrors=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,29 +115,29 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
     result: dict[str, object] = {
         "modules": {str(count): asdict(row) for count, row in rows.items()},
         "mirrored": mirrors,
-        "targets": show_targets(
-            console,
-            [
-                Target(
-                    f"{most} modules: last start to full mesh, median, s", _median(rows[most].joins), _MESH_WITHIN
-                ),
-                Target(f"{most} modules at once: last READY to mesh, s", rows[most].together_ready, _MESH_WITHIN),
-                *(
-                    Target(f"{what} mirrored, from the link, median, s", _median(times), _MIRRORED_WITHIN)
-                    for what in ("topics", "services")
-                    if (times := [seconds for one in mirrors if (seconds := one[what]) is not None])
-                ),
-            ],
-        ),
     }
-    console.print(f"written: {results.write('joining', asdict(plan), result, json)}")
-    return result
+    return finish(
+        console,
+        "joining",
+        asdict(plan),
+        result,
+        json,
+        claims=[
+            Claim(f"{most} modules: last start to full mesh, median, s", _median(rows[most].joins), _MESH_WITHIN),
+            Claim(f"{most} modules at once: last READY to mesh, s", rows[most].together_ready, _MESH_WITHIN),
+            *(
+                Claim(f"{what} mirrored, from the link, median, s", _median(times), _MIRRORED_WITHIN)
+                for what in ("topics", "services")
+                if (times := [seconds for one in mirrors if (seconds := one[what]) is not None])
+            ),
+        ],
+    )
 
 
 # --- modules --------------------------------------------------------------------------------------------------
 
 
-def _modules(plan: Plan, count: int, console: Console) -> Row:
+def _modules(plan: JoiningPlan, count: int, console: Console) -> Row:
     console.print(f"{count} modules", style="dim")
     with Bed() as bed:
         hosts = bed.lab.hosts(*(f"m{number}" for number in range(count)))
@@ -216,7 +216,7 @@ def _traffic(agent: Agent) -> Traffic:
 # --- a graph --------------------------------------------------------------------------------------------------
 
 
-def _mirror(plan: Plan) -> dict[str, float | None]:
+def _mirror(plan: JoiningPlan) -> dict[str, float | None]:
     """Seconds from the link of a joining module to all topics, and to all services, in its graph; from its start."""
     with Bed() as bed:
         there, joins = bed.lab.hosts("there", "joins")
@@ -244,12 +244,14 @@ def _mirror(plan: Plan) -> dict[str, float | None]:
 # --- tables ---------------------------------------------------------------------------------------------------
 
 
-def _table(rows: dict[int, Row], plan: Plan) -> Table:
-    table = Table(title=f"full mesh (to reach: {_MESH_WITHIN:g} s), and each agent over {plan.idle:.0f} s of nothing")
+def _table(rows: dict[int, Row], plan: JoiningPlan) -> Table:
     heads = ["modules", "last start to mesh, s", "worst", "its READY, s", "all at once, s", "after READY"]
     heads += ["CPU mean, %", "worst"]
-    for head in (*heads, "bytes/s", "packets/s"):
-        table.add_column(head, justify="right")
+    table = table_of(
+        f"full mesh (to reach: {_MESH_WITHIN:g} s), and each agent over {plan.idle:.0f} s of nothing",
+        (),
+        (*heads, "bytes/s", "packets/s"),
+    )
     for count, row in rows.items():
         joins = [f"{_median(row.joins):.2f}", f"{max(row.joins):.2f}", f"{_median(row.ready):.2f}"]
         once = [f"{row.together:.2f}", f"{row.together_ready:.2f}"]
@@ -259,12 +261,9 @@ def _table(rows: dict[int, Row], plan: Plan) -> Table:
     return table
 
 
-def _mirror_table(mirrors: Sequence[dict[str, float | None]], plan: Plan) -> Table:
+def _mirror_table(mirrors: Sequence[dict[str, float | None]], plan: JoiningPlan) -> Table:
     title = f"a graph of {plan.nodes} nodes at a module that joins (to reach: {_MIRRORED_WITHIN:g} s from its link)"
-    table = Table(title=title)
-    table.add_column("what")
-    for head in ("from the link, s", "worst", "from its start, s"):
-        table.add_column(head, justify="right")
+    table = table_of(title, ("what",), ("from the link, s", "worst", "from its start, s"))
     for what, count in (("topics", plan.topics), ("services", plan.services)):
         times = [seconds for one in mirrors if (seconds := one[what]) is not None]
         starts = [seconds for one in mirrors if (seconds := one[f"{what}_from_start"]) is not None]

@@ -11,19 +11,21 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
-from rich.table import Table
-
-from lab import machine, plot, results, samples
+from lab import machine, samples
 from lab.bed.bench import Bed
 from lab.bed.processes import Process
 from lab.bench import schedule
-from lab.tables import Target, dash, ratio, show_targets, us, usage_table
+from lab.figures import shapes
+from lab.findings import Claim
+from lab.results import finish
+from lab.tables import dash, percentiles, ratio, table_of, us, usage_table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from rich.console import Console
+    from rich.table import Table
 
 _SIZE, _RATE = 64, 100.0
 _HOGS: Final = max(2, os.cpu_count() or 2)
@@ -33,7 +35,7 @@ _CONDITIONS: Final = ("idle", "hogs")
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class LoadPlan:
     """How much is measured.
 
     Args:
@@ -47,10 +49,10 @@ class Plan:
     rounds: int
 
 
-FULL: Final = Plan(5.0, 20.5, 5)
-QUICK: Final = Plan(5.5, 5.5, 2)
+FULL: Final = LoadPlan(5.0, 20.5, 5)
+QUICK: Final = LoadPlan(5.5, 5.5, 2)
 
-Scores = dict[tuple[str, str], schedule.Score]
+Scores = dict[tuple[str, str], schedule.LatencyScore]
 
 
 def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
@@ -79,20 +81,16 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
         f"late wake-ups under SCHED_FIFO beside the hogs, of a sleeper alone, µs: {machine.histogram(kernel)}"
     )
     ours = scores["agents_realtime", "hogs"].summary
-    target = Target("p99.9 beside hogs with --realtime, ms", ours.p999 and ours.p999 / 1000, 1.0)
+    target = Claim("p99.9 beside hogs with --realtime, ms", ours.p999 and ours.p999 / 1000, 1.0)
     result: dict[str, object] = {
         "rows": [_row(key, condition, one, scores) for (key, condition), one in scores.items()],
         "realtime": how,
-        "targets": show_targets(console, [target]),
         "fifo_wake_ups_beside_hogs_us": asdict(samples.summary(kernel)),
         **host.finish(console),
     }
     settings = {**asdict(plan), "bytes": _SIZE, "hz": _RATE, "hogs": _HOGS, "node_priority": schedule.NODE_PRIORITY}
-    written = results.write("load", settings, result, json)
-    image = written.with_suffix(".png")
-    plot.tails(image, _panels(scores, titles), "from due to there, µs", _DEADLINE)
-    console.print(f"written: {written} and {image.name}")
-    return result
+    panels = shapes.tails(_panels(scores, titles), "from due to there, µs", _DEADLINE)
+    return finish(console, "load", settings, result, json, claims=[target], panels=panels)
 
 
 @contextmanager
@@ -106,11 +104,11 @@ def hogs(count: int) -> Iterator[None]:
             hog.end()
 
 
-def _take(scores: Scores, way: schedule.Way, condition: str, stream: schedule.Stream, seconds: float) -> None:
-    scores.setdefault((way.key, condition), schedule.Score()).add(stream.run(_SIZE, _RATE, seconds))
+def _take(scores: Scores, way: schedule.Way, condition: str, stream: schedule.MeasuredStream, seconds: float) -> None:
+    scores.setdefault((way.key, condition), schedule.LatencyScore()).add(stream.run(_SIZE, _RATE, seconds))
 
 
-def _row(key: str, condition: str, one: schedule.Score, scores: Scores) -> dict[str, object]:
+def _row(key: str, condition: str, one: schedule.LatencyScore, scores: Scores) -> dict[str, object]:
     return {
         "way": key,
         "condition": condition,
@@ -123,17 +121,13 @@ def _row(key: str, condition: str, one: schedule.Score, scores: Scores) -> dict[
 
 def _table(scores: Scores, titles: dict[str, str]) -> Table:
     what = f"{_SIZE} B at {_RATE:.0f} Hz, nodes under SCHED_FIFO {schedule.NODE_PRIORITY}"
-    table = Table(title=f"{what}, from due to there, µs; ratios of p99")
-    for head in ("way", "beside"):
-        table.add_column(head)
     heads = ("p50", "p95", "p99", "p99.9", "max", "count", "lost", ">1 ms", "to idle", "to direct", "p99.9 from send")
-    for head in heads:
-        table.add_column(head, justify="right")
+    table = table_of(f"{what}, from due to there, µs; ratios of p99", ("way", "beside"), heads)
     for condition in _CONDITIONS:
         for key, name in titles.items():
             one = scores[key, condition]
             row = one.summary
-            cells = [us(value) for value in (row.p50, row.p95, row.p99, row.p999, row.largest)]
+            cells = percentiles(row)
             counts = [str(row.count), str(row.lost), f"{100 * one.later_than(_DEADLINE):.2f} %"]
             bases = (scores[key, "idle"].summary.p99, scores["direct", condition].summary.p99)
             beside = f"{_HOGS} hogs" if condition == "hogs" else "nothing"

@@ -12,18 +12,20 @@ from array import array
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
-from rich.table import Table
-
-from lab import plot, results, samples
+from lab import samples
 from lab.bed.bench import Bed
 from lab.bench import schedule
-from lab.tables import Target, dash, ratio, show_targets, us, usage_row, usage_table
+from lab.figures import shapes
+from lab.findings import Claim
+from lab.results import finish
+from lab.tables import dash, ratio, table_of, us, usage_row, usage_table
 from lab.usage import Usage, add
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from rich.console import Console
+    from rich.table import Table
 
 _SIZE: Final = 64
 _LIMIT: Final = 1.1
@@ -31,7 +33,7 @@ _FASTEST: Final = 1000
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class PeriodPlan:
     """How much is measured.
 
     Args:
@@ -43,8 +45,8 @@ class Plan:
     rounds: int
 
 
-FULL: Final = Plan({10: 10.2, 50: 4.2, 100: 3.0, 1000: 2.0}, 10)
-QUICK: Final = Plan({10: 2.0, 50: 1.0, 100: 1.0, 1000: 1.0}, 3)
+FULL: Final = PeriodPlan({10: 10.2, 50: 4.2, 100: 3.0, 1000: 2.0}, 10)
+QUICK: Final = PeriodPlan({10: 2.0, 50: 1.0, 100: 1.0, 1000: 1.0}, 3)
 
 
 class Evenness:
@@ -121,22 +123,19 @@ def measure(quick: bool, console: Console, json: Path | None = None, *, realtime
     rows = [(titles[key], one.usage, one.messages) for (key, rate), one in scores.items() if rate == _FASTEST]
     console.print(usage_table(f"processes on the path, {_FASTEST} Hz", rows))
     targets = [
-        Target(f"period sd at {rate} Hz, through agents / direct", _ratio(scores, rate), _LIMIT)
+        Claim(f"period sd at {rate} Hz, through agents / direct", _ratio(scores, rate), _LIMIT)
         for rate in plan.seconds
     ]
     result: dict[str, object] = {
         "rows": [_row(key, rate, one, scores["direct", rate]) for (key, rate), one in scores.items()],
         "scheduling": how,
-        "targets": show_targets(console, targets),
         **host.finish(console),
     }
-    written = results.write(
-        schedule.named("period", realtime=realtime), {**asdict(plan), "bytes": _SIZE}, result, json
+    settings = {**asdict(plan), "bytes": _SIZE}
+    panels = shapes.shares(_panels(scores, titles), "distance from the period that was meant, µs")
+    return finish(
+        console, schedule.named("period", realtime=realtime), settings, result, json, claims=targets, panels=panels
     )
-    image = written.with_suffix(".png")
-    plot.shares(image, _panels(scores, titles), "distance from the period that was meant, µs")
-    console.print(f"written: {written} and {image.name}")
-    return result
 
 
 def _ratio(scores: Scores, rate: int) -> float | None:
@@ -161,11 +160,8 @@ def _row(key: str, rate: int, one: Evenness, base: Evenness) -> dict[str, object
 
 
 def _table(rate: int, scores: Scores, titles: dict[str, str]) -> Table:
-    table = Table(title=f"period at {rate} Hz, {_SIZE} B, µs; sd: median over rounds")
-    table.add_column("way")
     heads = ("mean", "sd", "p99 - p50", "max", "sd at the source", "periods", "lost", "sd to direct", "same, paired")
-    for head in heads:
-        table.add_column(head, justify="right")
+    table = table_of(f"period at {rate} Hz, {_SIZE} B, µs; sd: median over rounds", ("way",), heads)
     base = scores["direct", rate]
     for key, title in titles.items():
         one = scores[key, rate]

@@ -23,16 +23,17 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 from rich.console import Console
-from rich.table import Table
 
-from lab import plot, results
+from lab import results
 from lab.bed.agents import Agent
 from lab.bed.bench import Bed
 from lab.bed.processes import eventually
 from lab.bed.ros import NODES
 from lab.bench import schedule
 from lab.bench.scale import per_message
-from lab.tables import us
+from lab.figures import shapes
+from lab.results import finish
+from lab.tables import table_of, us
 from lab.usage import Meter
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ _ATTACH: Final = 0.7
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ProfilePlan:
     """How much is measured.
 
     Args:
@@ -70,8 +71,8 @@ class Plan:
     profiled: float
 
 
-FULL: Final = Plan((100.0, _USUAL, 4000.0), 10.0, 10.0, 10.0)
-QUICK: Final = Plan((_USUAL,), 3.0, 5.0, 2.0)
+FULL: Final = ProfilePlan((100.0, _USUAL, 4000.0), 10.0, 10.0, 10.0)
+QUICK: Final = ProfilePlan((_USUAL,), 3.0, 5.0, 2.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +95,7 @@ class Cost:
 
 
 @dataclass(slots=True)
-class Profile:
+class AgentProfile:
     """Where one agent's time goes.
 
     Args:
@@ -119,7 +120,7 @@ class Profile:
 def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
     """Measure, print the tables, write the files; return the result."""
     plan = QUICK if quick else FULL
-    profiles = {"agent 1": Profile(), "agent 2": Profile()}
+    profiles = {"agent 1": AgentProfile(), "agent 2": AgentProfile()}
     with Bed() as bed:
         way = schedule.agents(bed)
         stream = way.stream(bed, _TOPIC)
@@ -135,21 +136,19 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
         "costs": [asdict(cost) for cost in costs],
         "profiles": {name: asdict(profile) for name, profile in profiles.items()},
     }
-    written = results.write("profile", {**asdict(plan), "bytes": _SIZE, "profiled_hz": _PROFILED_RATE}, result, json)
-    text, image = written.with_suffix(".txt"), written.with_suffix(".png")
-    with text.open("w", encoding="utf-8") as file:
+    with results.path_of("profile", ".txt").open("w", encoding="utf-8") as file:
         for where in (console, Console(file=file, width=130)):
             _show(where, costs, profiles)
     base = {cost.agent: cost.total for cost in costs if cost.rate == _USUAL}
-    plot.bars(image, _parts(profiles, base), "µs of CPU a relayed message")
-    console.print(f"written: {written}, {text.name} and {image.name}")
-    return result
+    settings = {**asdict(plan), "bytes": _SIZE, "profiled_hz": _PROFILED_RATE}
+    panels = shapes.bars(_parts(profiles, base), "µs of CPU a relayed message")
+    return finish(console, "profile", settings, result, json, panels=panels)
 
 
 # --- the cost -------------------------------------------------------------------------------------------------------
 
 
-def relay_costs(stream: schedule.Stream, pids: Mapping[str, int], plan: Plan) -> Iterator[Cost]:
+def relay_costs(stream: schedule.MeasuredStream, pids: Mapping[str, int], plan: ProfilePlan) -> Iterator[Cost]:
     """What a relayed message costs each agent, at each of the plan's rates."""
     stream.run(_SIZE, _USUAL, 1.0)
     meter = Meter(pids)
@@ -172,7 +171,7 @@ def relay_costs(stream: schedule.Stream, pids: Mapping[str, int], plan: Plan) ->
 
 
 @contextmanager
-def _streaming(stream: schedule.Stream, seconds: float) -> Iterator[None]:
+def _streaming(stream: schedule.MeasuredStream, seconds: float) -> Iterator[None]:
     """A stream that lasts longer than what looks at it; it ends at the end."""
     stream.begin(_SIZE, _PROFILED_RATE, seconds + 2.0)
     stream.wait_lead_in(0.2)
@@ -180,7 +179,7 @@ def _streaming(stream: schedule.Stream, seconds: float) -> Iterator[None]:
     stream.end()
 
 
-def _perf(into: Profile, pid: int, stream: schedule.Stream, seconds: float, scratch: Path) -> None:
+def _perf(into: AgentProfile, pid: int, stream: schedule.MeasuredStream, seconds: float, scratch: Path) -> None:
     if shutil.which("perf") is None:
         into.missing["perf"] = "not installed (apt install linux-perf)"
         return
@@ -196,7 +195,7 @@ def _perf(into: Profile, pid: int, stream: schedule.Stream, seconds: float, scra
     into.symbols = parse_perf(_run([*report, "dso,symbol"]).stdout)
 
 
-def _strace(into: Profile, pid: int, stream: schedule.Stream, seconds: float, scratch: Path) -> None:
+def _strace(into: AgentProfile, pid: int, stream: schedule.MeasuredStream, seconds: float, scratch: Path) -> None:
     if shutil.which("strace") is None:
         into.missing["strace"] = "not installed (apt install strace)"
         return
@@ -217,7 +216,7 @@ def _strace(into: Profile, pid: int, stream: schedule.Stream, seconds: float, sc
     into.calls = {name: round(count / arrivals.total, 3) for name, count in calls.items()}
 
 
-def _spy(into: Profile, pid: int, stream: schedule.Stream, seconds: float, scratch: Path) -> None:
+def _spy(into: AgentProfile, pid: int, stream: schedule.MeasuredStream, seconds: float, scratch: Path) -> None:
     program = Path(sys.executable).with_name("py-spy")
     if not program.exists():
         into.missing["py-spy"] = "not installed (pip install -c constraints.txt -e '.[lab-peers]')"
@@ -232,7 +231,7 @@ def _spy(into: Profile, pid: int, stream: schedule.Stream, seconds: float, scrat
     into.functions, into.modules = parse_stacks(raw.read_text(encoding="utf-8"))
 
 
-def _count_calls(profiles: Mapping[str, Profile], seconds: float) -> None:
+def _count_calls(profiles: Mapping[str, AgentProfile], seconds: float) -> None:
     """Count with fresh agents, which start with the profiler's help."""
     with Bed() as bed:
         hosts = bed.lab.hosts("a", "b")
@@ -341,10 +340,12 @@ def _short(file: str) -> str:
 # --- showing --------------------------------------------------------------------------------------------------------
 
 
-def _show(console: Console, costs: list[Cost], profiles: Mapping[str, Profile]) -> None:
-    table = Table(title=f"processor time of one agent for a relayed message of {_SIZE} B, µs; idle cost taken off")
-    for head in ("agent", "Hz", "user + system", "user, by ticks", "system, by ticks", "context switches"):
-        table.add_column(head, justify="right")
+def _show(console: Console, costs: list[Cost], profiles: Mapping[str, AgentProfile]) -> None:
+    table = table_of(
+        f"processor time of one agent for a relayed message of {_SIZE} B, µs; idle cost taken off",
+        (),
+        ("agent", "Hz", "user + system", "user, by ticks", "system, by ticks", "context switches"),
+    )
     for cost in costs:
         parts = [us(value) for value in (cost.total, cost.total * cost.user, cost.total * (1 - cost.user))]
         table.add_row(cost.agent, f"{cost.rate:.0f}", *parts, f"{cost.switches:.2f}")
@@ -369,7 +370,7 @@ def _show(console: Console, costs: list[Cost], profiles: Mapping[str, Profile]) 
             console.print(f"  {tool} is left out: {reason}", style="yellow", markup=False)
 
 
-def _parts(profiles: Mapping[str, Profile], costs: Mapping[str, float]) -> dict[str, dict[str, float]]:
+def _parts(profiles: Mapping[str, AgentProfile], costs: Mapping[str, float]) -> dict[str, dict[str, float]]:
     """The cost at 1 kHz by object, as ``perf`` divides it."""
     return {
         name: {what: costs[name] * share / 100 for what, share in profile.objects.items() if share >= 1.0}

@@ -13,11 +13,11 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Final
 
 import psutil
-from rich.table import Table
 
-from lab import results
 from lab.bed.bench import Bed
-from lab.tables import Target, show_targets
+from lab.findings import Claim
+from lab.results import finish
+from lab.tables import table_of
 from lab.usage import Meter
 from rmpa.ros.core.external import ExternalCore
 from rmpa.ros.http.client import call
@@ -45,17 +45,19 @@ _SETTLE: Final = 3.0
 def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
     """Measure, print the table, write the file; return the result."""
     span, changes = (5.0, 5) if quick else (20.0, 40)
-    table = Table(title=f"following a roscore over {span:.0f} s, and {changes} changes of its graph")
-    for head in (
-        "nodes",
-        "topics",
-        "services",
-        "agent, % of a core",
-        "rosmaster, %",
-        "seen after p50, s",
-        "worst, s",
-    ):
-        table.add_column(head, justify="right")
+    table = table_of(
+        f"following a roscore over {span:.0f} s, and {changes} changes of its graph",
+        (),
+        (
+            "nodes",
+            "topics",
+            "services",
+            "agent, % of a core",
+            "rosmaster, %",
+            "seen after p50, s",
+            "worst, s",
+        ),
+    )
     rows: dict[str, dict[str, object]] = {}
     worst = 0.0
     for graph in GRAPHS:
@@ -76,10 +78,9 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
             "delays_s": [round(delay, 3) for delay in delays],
         }
     console.print(table)
-    targets = show_targets(console, [Target(f"with {_TYPICAL} topics a change is seen after, s, worst", worst, 1.0)])
-    result: dict[str, object] = {"graphs": rows, "targets": targets}
-    console.print(f"written: {results.write('roscore', {'seconds': span, 'changes': changes}, result, json)}")
-    return result
+    targets = [Claim(f"with {_TYPICAL} topics a change is seen after, s, worst", worst, 1.0)]
+    result: dict[str, object] = {"graphs": rows}
+    return finish(console, "roscore", {"seconds": span, "changes": changes}, result, json, claims=targets)
 
 
 async def _follow(

@@ -15,16 +15,17 @@ from array import array
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from rich.table import Table
-
-from lab import plot, results, samples
+from lab import samples
 from lab.bed import ros
 from lab.bed.bench import Bed
 from lab.bed.processes import eventually
 from lab.bed.ros import NODES
 from lab.bench import schedule
 from lab.experiments import flow
-from lab.tables import Target, dash, ratio, show_targets, us
+from lab.figures import shapes
+from lab.findings import Claim
+from lab.results import finish
+from lab.tables import dash, ratio, table_of, us
 from lab.usage import Meter, Usage, add
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rich.console import Console
+    from rich.table import Table
 
     from lab.bed.agents import Agent
     from lab.bed.processes import Process
@@ -50,7 +52,7 @@ _RATE: Final = 1000.0
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ScalePlan:
     """How much is measured.
 
     Args:
@@ -70,12 +72,12 @@ class Plan:
     topics: tuple[int, ...] = (10, 100, 1000)
 
 
-FULL: Final = Plan(1.5, 4, 10.0, 3)
-QUICK: Final = Plan(1.2, 2, 5.0, 1)
+FULL: Final = ScalePlan(1.5, 4, 10.0, 3)
+QUICK: Final = ScalePlan(1.2, 2, 5.0, 1)
 
 
 @dataclass(slots=True)
-class Step:
+class ScaleStep:
     """One step of one ladder, over all rounds.
 
     Args:
@@ -122,7 +124,7 @@ def per_message(busy: Usage, idle: Usage, messages: int) -> float:
     return 1e6 * (busy.cpu - resting * busy.wall) / messages
 
 
-class Fan(schedule.Stream):
+class Fan(schedule.MeasuredStream):
     """A stream of which one more receiver, far from the first, may be asked as well.
 
     Args:
@@ -150,7 +152,7 @@ class Fan(schedule.Stream):
         return arrivals
 
 
-class Mesh:
+class MeasuredMesh:
     """Agents that are all linked, one stream between the first two, and its control.
 
     Args:
@@ -195,7 +197,7 @@ class Mesh:
         made.wait_event("up")
         return made
 
-    def step(self, plan: Plan, into: Step) -> None:
+    def step(self, plan: ScalePlan, into: ScaleStep) -> None:
         """Measure as it is now: without the stream, with it, and its control."""
         time.sleep(_SETTLE)
         for stream in (self.stream, self._control):
@@ -229,26 +231,26 @@ class Mesh:
             into.note("others", statistics.fmean(costs[name] for name in others), rest)
 
 
-def climb_peers(plan: Plan, bed: Bed) -> Iterator[tuple[int, Mesh]]:
+def climb_peers(plan: ScalePlan, bed: Bed) -> Iterator[tuple[int, MeasuredMesh]]:
     """The other peers are only linked."""
-    mesh = Mesh(bed, plan.peers[0], _RATE)
+    mesh = MeasuredMesh(bed, plan.peers[0], _RATE)
     for peers in plan.peers:
         mesh.grow(peers)
         yield peers, mesh
 
 
-def climb_subscribers(plan: Plan, bed: Bed) -> Iterator[tuple[int, Mesh]]:
+def climb_subscribers(plan: ScalePlan, bed: Bed) -> Iterator[tuple[int, MeasuredMesh]]:
     """Each of the other peers subscribes too."""
-    mesh = Mesh(bed, plan.peers[0], _FAN_RATE)
+    mesh = MeasuredMesh(bed, plan.peers[0], _FAN_RATE)
     for peers in plan.peers:
         for agent in mesh.grow(peers):
             mesh.stream.far = mesh.receiver(agent)
         yield peers, mesh
 
 
-def climb_topics(plan: Plan, bed: Bed) -> Iterator[tuple[int, Mesh]]:
+def climb_topics(plan: ScalePlan, bed: Bed) -> Iterator[tuple[int, MeasuredMesh]]:
     """The first module's graph grows, and with it what the second one shows."""
-    mesh = Mesh(bed, 2, _RATE)
+    mesh = MeasuredMesh(bed, 2, _RATE)
     first, second = (bed.shell(agent.host, agent.core_port) for agent in mesh.agents)
     crowd = first.start(sys.executable, NODES / "crowd.py", name="crowd", commands=True)
     for topics in plan.topics:
@@ -263,7 +265,7 @@ def climb_topics(plan: Plan, bed: Bed) -> Iterator[tuple[int, Mesh]]:
         yield topics, mesh
 
 
-LADDERS: Final[dict[str, Callable[[Plan, Bed], Iterator[tuple[int, Mesh]]]]] = {
+LADDERS: Final[dict[str, Callable[[ScalePlan, Bed], Iterator[tuple[int, MeasuredMesh]]]]] = {
     "peers": climb_peers,
     "subscribers": climb_subscribers,
     "topics": climb_topics,
@@ -273,7 +275,7 @@ _TITLES: Final = {
     "subscribers": f"peers that all subscribe; {_SIZE} B at {_FAN_RATE:.0f} Hz",
     "topics": f"topics in the graph; {_SIZE} B at {_RATE:.0f} Hz",
 }
-Steps = dict[str, dict[int, Step]]
+Steps = dict[str, dict[int, ScaleStep]]
 
 
 def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
@@ -286,22 +288,25 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
             console.print(f"round {turn + 1} of {plan.rounds}: {ladder}", style="dim")
             with Bed() as bed:
                 for count, mesh in climb(plan, bed):
-                    mesh.step(plan, steps[ladder].setdefault(count, Step()))
+                    mesh.step(plan, steps[ladder].setdefault(count, ScaleStep()))
     for ladder, found in steps.items():
         console.print(_table(ladder, found))
     result: dict[str, object] = {
         "ladders": {
             ladder: [_row(ladder, n, one, found) for n, one in found.items()] for ladder, found in steps.items()
         },
-        "targets": show_targets(console, list(_targets(steps))),
         **host.finish(console),
     }
     settings = {**asdict(plan), "bytes": _SIZE, "hz": _RATE, "hz_subscribers": _FAN_RATE}
-    written = results.write("scale", settings, result, json)
-    image = written.with_suffix(".png")
-    plot.lines(image, _panels(steps), "times the figure of the first step")
-    console.print(f"written: {written} and {image.name}")
-    return result
+    return finish(
+        console,
+        "scale",
+        settings,
+        result,
+        json,
+        claims=list(_targets(steps)),
+        panels=shapes.lines(_panels(steps), "times the figure of the first step"),
+    )
 
 
 def copies(ladder: str, count: int) -> int:
@@ -309,24 +314,24 @@ def copies(ladder: str, count: int) -> int:
     return count - 1 if ladder == "subscribers" else 1
 
 
-def _of_copy(ladder: str, count: int, step: Step) -> float | None:
+def _of_copy(ladder: str, count: int, step: ScaleStep) -> float | None:
     cpu = step.cpu_of("agent 1")
     return None if cpu is None else cpu / copies(ladder, count)
 
 
-def _targets(steps: Steps) -> Iterator[Target]:
+def _targets(steps: Steps) -> Iterator[Claim]:
     for ladder, found in steps.items():
         base, top = min(found), max(found)
         words = f"{ladder}, {base} → {top}"
         if ladder != "subscribers":
-            yield Target(f"{words}: latency p50", ratio(found[top].p50(), found[base].p50()), _LIMIT)
-            yield Target(f"{words}: CPU a message, both agents", ratio(found[top].both, found[base].both), _LIMIT)
+            yield Claim(f"{words}: latency p50", ratio(found[top].p50(), found[base].p50()), _LIMIT)
+            yield Claim(f"{words}: CPU a message, both agents", ratio(found[top].both, found[base].both), _LIMIT)
         else:
             per_copy = [_of_copy(ladder, count, found[count]) for count in (top, base)]
-            yield Target(f"{words}: CPU a copy, sending agent", ratio(*per_copy), _LIMIT)
+            yield Claim(f"{words}: CPU a copy, sending agent", ratio(*per_copy), _LIMIT)
 
 
-def _row(ladder: str, count: int, step: Step, found: dict[int, Step]) -> dict[str, object]:
+def _row(ladder: str, count: int, step: ScaleStep, found: dict[int, ScaleStep]) -> dict[str, object]:
     base = found[min(found)]
     return {
         ladder: count,
@@ -343,9 +348,7 @@ def _row(ladder: str, count: int, step: Step, found: dict[int, Step]) -> dict[st
     }
 
 
-def _table(ladder: str, found: dict[int, Step]) -> Table:
-    table = Table(title=_TITLES[ladder])
-    table.add_column(ladder, justify="right")
+def _table(ladder: str, found: dict[int, ScaleStep]) -> Table:
     heads = ["p50, µs", "to first", "p99", "lost", "p50 at the last", "direct p50", "to first"]
     heads += [
         "CPU agent 1, µs",
@@ -356,8 +359,7 @@ def _table(ladder: str, found: dict[int, Step]) -> Table:
         "CPU direct to first",
         "idle agent 1, %",
     ]
-    for head in heads:
-        table.add_column(head, justify="right")
+    table = table_of(_TITLES[ladder], (), heads)
     base = found[min(found)]
     for count, step in found.items():
         first = ratio(step.p50(), base.p50())

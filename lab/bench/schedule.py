@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from pandas import DataFrame
     from rich.console import Console
 
     from lab.bed.agents import Agent
     from lab.bed.bench import Bed
     from lab.bed.processes import Process
     from lab.bed.ros import Ros
-    from lab.experiments.model import Table
 
 LEAD_IN: Final = 0.2
 """Seconds of each round whose messages are thrown away: caches and the processor's clock come up."""
@@ -119,7 +119,7 @@ class Arrivals:
         return size * (len(inside) - 1) / (inside[-1] - inside[0]) * 1e9 if len(inside) > 1 else 0.0
 
 
-class Stream:
+class MeasuredStream:
     """A publisher and a receiver of one topic, and their rounds.
 
     Args:
@@ -187,7 +187,7 @@ class Stream:
         return arrivals
 
 
-def parse(came: Table, late: Sequence[int], lead: int) -> Arrivals:
+def parse(came: DataFrame, late: Sequence[int], lead: int) -> Arrivals:
     """Read what a sink noted and how late its source was (``flow``), without the first ``lead`` messages."""
     columns = [_numbers(came, name) for name in ("sequence", "due_ns", "came_ns")]
     counted = [at for at, sequence in enumerate(columns[0]) if sequence >= lead]
@@ -195,8 +195,8 @@ def parse(came: Table, late: Sequence[int], lead: int) -> Arrivals:
     return Arrivals(max(0, len(late) - lead), sequence, due, there, late[lead:], lead=lead)
 
 
-def _numbers(table: Table, name: str) -> Sequence[int]:
-    return array("Q", [value for value in table.column(name) if isinstance(value, int)])
+def _numbers(table: DataFrame, name: str) -> Sequence[int]:
+    return array("Q", table[name].tolist())
 
 
 @dataclass(slots=True)
@@ -219,7 +219,7 @@ class Way:
     agents: list[Agent] = field(default_factory=list)
     relayed: bool = False
 
-    def stream(self, bed: Bed, topic: str, *, queue: int = 100, fifo: int = 0) -> Stream:
+    def stream(self, bed: Bed, topic: str, *, queue: int = 100, fifo: int = 0) -> MeasuredStream:
         """Start both nodes of one topic, under SCHED_FIFO if ``fifo`` is a priority."""
         prefix = ["chrt", "-f", str(fifo)] if fifo else []
 
@@ -235,7 +235,7 @@ class Way:
                 between[f"relay {number}"] = node(shell, "velocity", "--cmd", begin, "--vel", end)
         target = node(self.there, "sink", "--topics", end)
         source = node(self.here, "source", "--topic", topic)
-        made = Stream(bed, source, target, end, between)
+        made = MeasuredStream(bed, source, target, end, between)
         made.wait_flowing()
         return made
 
@@ -301,7 +301,7 @@ def _policy(pid: int) -> str:
     return f"{names.get(policy, str(policy))} {os.sched_getparam(pid).sched_priority}"
 
 
-class Score:
+class LatencyScore:
     """One way under one condition, over all rounds."""
 
     def __init__(self) -> None:

@@ -10,10 +10,11 @@ from array import array
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
-from rich.table import Table
-
-from lab import results, samples, tables
+from lab import samples, tables
 from lab.bed.bench import TEST_NODES, Bed
+from lab.findings import Claim
+from lab.results import finish
+from lab.tables import table_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,7 +32,7 @@ _WARM_UP: Final = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ServicesPlan:
     """How much is measured.
 
     Args:
@@ -43,8 +44,8 @@ class Plan:
     rounds: int
 
 
-FULL: Final = Plan(dict(zip(_SIZES, (3000, 1500, 400), strict=True)), 10)
-QUICK: Final = Plan(dict(zip(_SIZES, (200, 100, 30), strict=True)), 2)
+FULL: Final = ServicesPlan(dict(zip(_SIZES, (3000, 1500, 400), strict=True)), 10)
+QUICK: Final = ServicesPlan(dict(zip(_SIZES, (200, 100, 30), strict=True)), 2)
 
 
 def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
@@ -63,7 +64,7 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
                         failed += bad
     result = _show(console, took)
     targets = [
-        tables.Target(
+        Claim(
             f"a call of {size} bytes ({how}), agents / direct, p50",
             tables.ratio(_p50(took["agents", how, size]), _p50(took["direct", how, size])),
             _TARGET,
@@ -71,10 +72,8 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
         for how in _HOWS
         for size in plan.calls
     ]
-    shown = tables.show_targets(console, targets)
-    document: dict[str, object] = {"calls": result, "targets": shown, "failed": failed}
-    console.print(f"written: {results.write('services', asdict(plan), document, json)}")
-    return document
+    document: dict[str, object] = {"calls": result, "failed": failed}
+    return finish(console, "services", asdict(plan), document, json, claims=targets)
 
 
 def _direct(bed: Bed) -> Process:
@@ -113,11 +112,9 @@ def _p50(times: list[float]) -> float | None:
 
 
 def _show(console: Console, took: dict[tuple[str, str, int], list[float]]) -> list[dict[str, object]]:
-    table = Table(title="a call of rmpa_test/Work, µs")
-    for head in ("way", "connection", "bytes each way"):
-        table.add_column(head)
-    for head in ("p50", "p99", "max", "calls"):
-        table.add_column(head, justify="right")
+    table = table_of(
+        "a call of rmpa_test/Work, µs", ("way", "connection", "bytes each way"), ("p50", "p99", "max", "calls")
+    )
     rows: list[dict[str, object]] = []
     for (name, how, size), times in sorted(took.items(), key=lambda item: (item[0][2], item[0][1], item[0][0])):
         summary = samples.summary(times)

@@ -10,10 +10,10 @@ import time
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Final
 
-from rich.table import Table
-
-from lab import results, samples
+from lab import samples
 from lab.bed.bench import TEST_NODES, Bed
+from lab.results import finish
+from lab.tables import table_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -35,10 +35,11 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
             message, ready = _once(publisher_last=direction.startswith("publisher"))
             rows[direction]["message"].append(message)
             rows[direction]["ready"].append(ready)
-    table = Table(title=f"from exec of the second agent, s (to reach: {_TARGET} to the first message)")
-    table.add_column("case")
-    for head in ("ready, median", "first message, median", "best", "worst", "runs"):
-        table.add_column(head, justify="right")
+    table = table_of(
+        f"from exec of the second agent, s (to reach: {_TARGET} to the first message)",
+        ("case",),
+        ("ready, median", "first message, median", "best", "worst", "runs"),
+    )
     for direction, row in rows.items():
         values = [statistics.median(row["ready"]), statistics.median(row["message"]), min(row["message"])]
         table.add_row(direction, *[f"{value:.3f}" for value in [*values, max(row["message"])]], str(runs))
@@ -47,8 +48,7 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
         direction: {"seconds": row, "summary": asdict(samples.summary(row["message"]))}
         for direction, row in rows.items()
     }
-    console.print(f"written: {results.write('startup', {'runs': runs}, result, json)}")
-    return result
+    return finish(console, "startup", {"runs": runs}, result, json)
 
 
 def _once(*, publisher_last: bool) -> tuple[float, float]:

@@ -13,20 +13,22 @@ from array import array
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
-from rich.table import Table
-
-from lab import plot, results, samples
+from lab import samples
 from lab.bed.agents import RMPA
 from lab.bed.bench import Bed
 from lab.bed.ros import NODES
 from lab.bench import schedule
-from lab.tables import Target, dash, ratio, show_targets, us, usage_table
+from lab.figures import shapes
+from lab.findings import Claim
+from lab.results import finish
+from lab.tables import dash, ratio, table_of, us, usage_table
 from lab.usage import Meter, Usage, add
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from rich.console import Console
+    from rich.table import Table
 
     from lab.bed.processes import Process
 
@@ -45,7 +47,7 @@ _FILL_DEADLINE: Final = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class StormPlan:
     """How much is measured.
 
     Args:
@@ -57,8 +59,8 @@ class Plan:
     rounds: int
 
 
-FULL: Final = Plan(4.0, 12)
-QUICK: Final = Plan(2.6, 4)
+FULL: Final = StormPlan(4.0, 12)
+QUICK: Final = StormPlan(2.6, 4)
 
 
 @dataclass(slots=True)
@@ -77,14 +79,14 @@ class Case:
 
     key: str
     title: str
-    stream: schedule.Stream
+    stream: schedule.MeasuredStream
     idle: str
     client: Process | None = None
     port: int = 0
     others: dict[str, Process] | None = None
 
 
-class Stormy(schedule.Score):
+class Stormy(schedule.LatencyScore):
     """A stream's rounds, and the calls."""
 
     def __init__(self) -> None:
@@ -134,18 +136,21 @@ def measure(quick: bool, console: Console, json: Path | None = None, *, realtime
     result: dict[str, object] = {
         "rows": [_row(case, scores) for case in cases],
         "scheduling": how,
-        "targets": show_targets(console, _targets(scores)),
         **host.finish(console),
     }
     settings = {**asdict(plan), "bytes": _SIZE, "hz": _RATE, "calls_per_s": _CALLS}
-    written = results.write(schedule.named("storm", realtime=realtime), settings, result, json)
-    image = written.with_suffix(".png")
     panels: dict[str, dict[str, array[float]]] = {}
     for case in cases:
         panels.setdefault(case.idle.partition("_")[0], {})[case.title] = scores[case.key].latencies
-    plot.tails(image, panels, "from due to there, µs")
-    console.print(f"written: {written} and {image.name}")
-    return result
+    return finish(
+        console,
+        schedule.named("storm", realtime=realtime),
+        settings,
+        result,
+        json,
+        claims=_targets(scores),
+        panels=shapes.tails(panels, "from due to there, µs"),
+    )
 
 
 def _cases(bed: Bed, *, realtime: bool) -> tuple[list[Case], str]:
@@ -199,14 +204,12 @@ def _take(case: Case, seconds: float, score: Stormy) -> None:
     score.add_calls(event, meter.read())
 
 
-def _targets(scores: Scores) -> list[Target]:
+def _targets(scores: Scores) -> list[Claim]:
     own, idle, apart = (scores[key] for key in ("agents_own", "agents_idle", "agents_apart"))
     return [
-        Target(
-            "p99.9 while its core is asked / idle, all rounds", ratio(own.summary.p999, idle.summary.p999), _LIMIT
-        ),
-        Target("the same, median of rounds", ratio(own.median_of_rounds(99.9), idle.median_of_rounds(99.9)), _LIMIT),
-        Target("p99.9, one process / core apart", ratio(own.summary.p999, apart.summary.p999), 1.0),
+        Claim("p99.9 while its core is asked / idle, all rounds", ratio(own.summary.p999, idle.summary.p999), _LIMIT),
+        Claim("the same, median of rounds", ratio(own.median_of_rounds(99.9), idle.median_of_rounds(99.9)), _LIMIT),
+        Claim("p99.9, one process / core apart", ratio(own.summary.p999, apart.summary.p999), 1.0),
     ]
 
 
@@ -225,10 +228,6 @@ def _row(case: Case, scores: Scores) -> dict[str, object]:
 
 
 def _table(cases: list[Case], scores: Scores) -> Table:
-    table = Table(
-        title=f"{_SIZE} B at {_RATE:.0f} Hz beside {_CALLS:.0f} calls/s, from due to there, µs; ratios of p99, p99.9"
-    )
-    table.add_column("case")
     heads = (
         "p50",
         "p99",
@@ -242,8 +241,11 @@ def _table(cases: list[Case], scores: Scores) -> Table:
         "failed",
         "call p50, ms",
     )
-    for head in heads:
-        table.add_column(head, justify="right")
+    table = table_of(
+        f"{_SIZE} B at {_RATE:.0f} Hz beside {_CALLS:.0f} calls/s, from due to there, µs; ratios of p99, p99.9",
+        ("case",),
+        heads,
+    )
     for case in cases:
         one, idle = scores[case.key], scores[case.idle].summary
         row, calls = one.summary, samples.summary(one.calls)

@@ -14,14 +14,15 @@ from array import array
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from rich.table import Table
-
-from lab import plot, results, samples
+from lab import samples
 from lab.bed.agents import RMPA
 from lab.bed.bench import Bed
 from lab.bed.ros import NODES
 from lab.bench import schedule
-from lab.tables import Target, dash, ratio, show_targets, us, usage_row
+from lab.figures import shapes
+from lab.findings import Claim
+from lab.results import finish
+from lab.tables import dash, ratio, table_of, us, usage_row
 from lab.usage import Meter, Usage, add
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rich.console import Console
+    from rich.table import Table
 
     from lab.bed.processes import Process
 
@@ -38,7 +40,7 @@ _HELLO: Final = 30.0
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class TasksPlan:
     """How much is measured.
 
     Args:
@@ -50,8 +52,8 @@ class Plan:
     rounds: int
 
 
-FULL: Final = Plan(5.0, 12)
-QUICK: Final = Plan(1.5, 4)
+FULL: Final = TasksPlan(5.0, 12)
+QUICK: Final = TasksPlan(1.5, 4)
 
 
 @dataclass(slots=True)
@@ -110,25 +112,28 @@ def measure(quick: bool, console: Console, json: Path | None = None, *, realtime
     ours, base = loops["resource"], loops["rospy"]
     console.print(_table(loops))
     targets = [
-        Target(f"period sd at {_RATE} Hz, a resource's task / rospy.Rate", ratio(ours.sd, base.sd), 1.0),
-        Target(f"lateness at {_RATE} Hz, a resource's task / rospy.Rate", ratio(ours.mean_late, base.mean_late), 1.0),
+        Claim(f"period sd at {_RATE} Hz, a resource's task / rospy.Rate", ratio(ours.sd, base.sd), 1.0),
+        Claim(f"lateness at {_RATE} Hz, a resource's task / rospy.Rate", ratio(ours.mean_late, base.mean_late), 1.0),
     ]
     result: dict[str, object] = {
         "rows": [_row(name, loop, loops) for name, loop in loops.items()],
-        "targets": show_targets(console, targets),
         **host.finish(console),
     }
-    written = results.write(schedule.named("tasks", realtime=realtime), {**asdict(plan), "hz": _RATE}, result, json)
-    image = written.with_suffix(".png")
     panels: dict[str, Mapping[str, Sequence[float]]] = {
         "lateness": {_TITLES[name]: loop.late for name, loop in loops.items()},
         "distance from the period": {
             _TITLES[name]: [abs(period - 1e6 / _RATE) for period in loop.periods] for name, loop in loops.items()
         },
     }
-    plot.shares(image, panels, "µs")
-    console.print(f"written: {written} and {image.name}")
-    return result
+    return finish(
+        console,
+        schedule.named("tasks", realtime=realtime),
+        {**asdict(plan), "hz": _RATE},
+        result,
+        json,
+        claims=targets,
+        panels=shapes.shares(panels, "µs"),
+    )
 
 
 def _start(bed: Bed) -> dict[str, Process]:
@@ -173,8 +178,6 @@ def _row(name: str, loop: Loop, loops: dict[str, Loop]) -> dict[str, object]:
 
 
 def _table(loops: dict[str, Loop]) -> Table:
-    table = Table(title=f"a loop at {_RATE} Hz, µs; sd and mean: median over turns")
-    table.add_column("loop")
     heads = (
         "period sd",
         "to rospy",
@@ -187,8 +190,7 @@ def _table(loops: dict[str, Loop]) -> Table:
         "CPU a run",
         "runs",
     )
-    for head in heads:
-        table.add_column(head, justify="right")
+    table = table_of(f"a loop at {_RATE} Hz, µs; sd and mean: median over turns", ("loop",), heads)
     base = loops["rospy"]
     for name, loop in loops.items():
         late = samples.summary(loop.late)

@@ -17,11 +17,12 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import psutil
-from rich.table import Table
 
-from lab import plot, results
 from lab.bed.bench import Bed
-from lab.tables import Target, dash, ratio, show_targets, size, usage_row, usage_table
+from lab.figures import shapes
+from lab.findings import Claim
+from lab.results import finish
+from lab.tables import dash, ratio, size, table_of, usage_row, usage_table
 from lab.usage import Meter, Usage
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rich.console import Console
+    from rich.table import Table
 
     from lab.bed.agents import Agent
     from lab.bed.ros import Ros
@@ -50,7 +52,7 @@ _QUIET: Final = 20.0
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ThroughputPlan:
     """How much is measured.
 
     Args:
@@ -64,8 +66,8 @@ class Plan:
     bisections: int
 
 
-FULL: Final = Plan(5.0, 3, 6)
-QUICK: Final = Plan(2.0, 1, 3)
+FULL: Final = ThroughputPlan(5.0, 3, 6)
+QUICK: Final = ThroughputPlan(2.0, 1, 3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +118,7 @@ def lost_between(first: Count, last: Count) -> float:
 
 
 @dataclass(slots=True)
-class Way:
+class FloodWay:
     """One way from publisher to receiver, freshly started.
 
     Args:
@@ -212,25 +214,25 @@ def _dropped(agent: Agent) -> int | None:
     return sum(found) if found else None
 
 
-def _direct(bed: Bed) -> Way:
+def _direct(bed: Bed) -> FloodWay:
     shell = bed.shell()
     shell.master()
-    return Way(shell, shell)
+    return FloodWay(shell, shell)
 
 
-def _direct_hosts(bed: Bed) -> Way:
-    return Way(*bed.classic())
+def _direct_hosts(bed: Bed) -> FloodWay:
+    return FloodWay(*bed.classic())
 
 
-def _agents(bed: Bed) -> Way:
+def _agents(bed: Bed) -> FloodWay:
     hosts = bed.lab.hosts("a", "b")
     agents = [bed.agent(host, name=host.name) for host in hosts]
     agents[0].wait_peer("b")
     here, there = (bed.shell(agent.host, agent.core_port) for agent in agents)
-    return Way(here, there, agents)
+    return FloodWay(here, there, agents)
 
 
-WAYS: Final[dict[str, tuple[str, Callable[[Bed], Way]]]] = {
+WAYS: Final[dict[str, tuple[str, Callable[[Bed], FloodWay]]]] = {
     "direct": ("roscpp direct", _direct),
     "direct_hosts": ("roscpp direct, two hosts", _direct_hosts),
     "agents": ("two agents, two hosts", _agents),
@@ -238,7 +240,7 @@ WAYS: Final[dict[str, tuple[str, Callable[[Bed], Way]]]] = {
 
 
 @dataclass(slots=True)
-class Score:
+class ThroughputScore:
     """One way at one size.
 
     Args:
@@ -260,13 +262,13 @@ class Score:
         return sorted(self.windows, key=lambda window: window.received)[len(self.windows) // 2]
 
 
-Scores = dict[tuple[str, int], Score]
+Scores = dict[tuple[str, int], ThroughputScore]
 
 
 def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str, object]:
     """Measure, print the tables, write the files; return the result."""
     plan = QUICK if quick else FULL
-    scores: Scores = {(key, bytes_each): Score() for bytes_each in _LIMITS for key in WAYS}
+    scores: Scores = {(key, bytes_each): ThroughputScore() for bytes_each in _LIMITS for key in WAYS}
     with _on_cores(_CORES) as cores:
         for turn in range(plan.rounds):
             console.print(f"round {turn + 1} of {plan.rounds}", style="dim")
@@ -288,15 +290,18 @@ def measure(quick: bool, console: Console, json: Path | None = None) -> dict[str
         console.print(usage_table(f"processes flat out, {size(bytes_each)}", rows, "message that arrived"))
     result: dict[str, object] = {
         "rows": [_row(key, bytes_each, scores) for key, bytes_each in scores],
-        "targets": show_targets(console, _targets(scores)),
     }
     if (others := max(score.middle.others for score in scores.values())) > _QUIET:
         console.print(f"other processes used up to {others:.0f} % of a core meanwhile: not to quote", style="yellow")
-    written = results.write("throughput", {**asdict(plan), "cores": cores, "queue": _QUEUE}, result, json)
-    image = written.with_suffix(".png")
-    plot.bars(image, _bars(scores), "times direct roscpp, flat out")
-    console.print(f"written: {written} and {image.name}")
-    return result
+    return finish(
+        console,
+        "throughput",
+        {**asdict(plan), "cores": cores, "queue": _QUEUE},
+        result,
+        json,
+        claims=_targets(scores),
+        panels=shapes.bars(_bars(scores), "times direct roscpp, flat out"),
+    )
 
 
 @contextmanager
@@ -311,9 +316,9 @@ def _on_cores(count: int) -> Iterator[list[int]]:
         os.sched_setaffinity(0, before)
 
 
-def _targets(scores: Scores) -> list[Target]:
+def _targets(scores: Scores) -> list[Claim]:
     return [
-        Target(
+        Claim(
             f"{size(bytes_each)}, messages/s through two agents to direct roscpp",
             ratio(scores["agents", bytes_each].received, scores["direct", bytes_each].received),
             limit,
@@ -350,12 +355,9 @@ def _row(key: str, bytes_each: int, scores: Scores) -> dict[str, object]:
 
 
 def _table(bytes_each: int, scores: Scores) -> Table:
-    table = Table(title=f"{size(bytes_each)}: counted at the far node")
-    table.add_column("way")
     heads = ["messages/s", "to direct", "MB/s", "sent/s", "lost, %", "without loss/s", "to direct"]
     heads += ["agents dropped", "others' CPU, %"]
-    for head in heads:
-        table.add_column(head, justify="right")
+    table = table_of(f"{size(bytes_each)}: counted at the far node", ("way",), heads)
     base = scores["direct", bytes_each]
     for key, (title, _) in WAYS.items():
         score = scores[key, bytes_each]

@@ -6,14 +6,15 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
-from lab.experiments.model import Plan
+from lab.bed.plan import Plan
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, StartError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from lab.experiments.model import Cell, Client, Size
+    from lab.bed.plan import Client, Size
+    from lab.experiments.model import Cell
 
     WhyNot = Callable[[Plan], str]
     """Says why a plan cannot be followed here, or an empty string."""

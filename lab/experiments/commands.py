@@ -21,11 +21,12 @@ from rmpa.core.errors import ConfigError, StartError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+    from lab.bed.plan import Client, Plan, Size
     from lab.experiments.asked import Bed
-    from lab.experiments.model import Claim, Client, Findings, Plan, Size
     from lab.experiments.report import Report
     from lab.experiments.runner import Job, Outcome
     from lab.experiments.store import Store
+    from lab.findings import Claim, Findings
 
 _PROGRAM: Final = ("python", "-m", "lab")
 _PARENT: Final = Path("rmpa-experiments")
@@ -223,7 +224,7 @@ def report(directory: Path, as_json: bool) -> None:
 def compare(a: Path, b: Path, as_json: bool) -> None:
     """Compare the runs in directories A and B: what was measured, and what differs in how."""
     from lab.experiments.report.compare import compare as comparison
-    from lab.experiments.report.words import number, quantity
+    from lab.words import number, quantity
 
     found = comparison(a, b)
     if as_json:
@@ -292,7 +293,7 @@ def _terminated() -> Iterator[None]:
 
 
 def _shown(plan: Plan) -> str:
-    from lab.experiments.report.words import link as words_of
+    from lab.words import link as words_of
 
     where = "hosts as network namespaces" if plan.bed == "namespaces" else "all on loopback"
     link = (
@@ -342,7 +343,7 @@ def _about(directory: Path, written: Report) -> dict[str, object]:
 
 
 def _print_report(written: Report) -> None:
-    from lab.experiments.report.words import measured, quantity, wanted
+    from lab.words import measured, quantity, wanted
 
     claims = list(_claims(written.findings))
     if claims:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from lab.bed.system import Kind
+    from lab.bed.plan import Kind
     from lab.experiments.model import Cell, Measured, Results, Value
 
 

@@ -12,17 +12,21 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, cast
 
 from lab import statistics
-from lab.arrivals import counted, counting_from, pairs, source_periods
 from lab.experiments import flow
 from lab.experiments.contenders import CLASSIC, DEFAULTS, RELAYS, RMPA, nodelay_of, relays_of, system_of, turn
-from lab.experiments.model import Cell, Claim, Figure, Findings, Grid, Measured, Panel, Series
+from lab.experiments.model import Cell, Measured
+from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
+from lab.frames import counting_from, pairs, source_periods
+from lab.words import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from lab.bed.system import Stage, System
+    from lab.bed.plan import Client, Plan
+    from lab.bed.stage import Stage
+    from lab.bed.system import System
     from lab.experiments.contenders import Contender
-    from lab.experiments.model import Client, Plan, Results, Value
+    from lab.experiments.model import Results, Value
 
 RATE: Final = 10.0
 """Hz, of commands and of the polling velocity node; the paper's."""
@@ -223,7 +227,7 @@ def phases(seed: int, count: int) -> list[float]:
 
 
 @dataclass(frozen=True, slots=True)
-class Round:
+class ControlRound:
     """What one round of one contender showed; seconds.
 
     Args:
@@ -249,11 +253,11 @@ class Round:
         return statistics.spread(getattr(self, quantity)).sd
 
 
-def evaluate(measured: Measured) -> Round:
+def evaluate(measured: Measured) -> ControlRound:
     """Read one round's tables."""
     pc, base, sent = (measured.tables[name] for name in ("pc", "base", "sent"))
     cmd, vel = pairs(pc, topic=CMD), pairs(pc, topic=VEL)
-    return Round(
+    return ControlRound(
         cmd=statistics.periods(cmd),
         vel=statistics.periods(vel),
         base=statistics.periods(pairs(base, topic=VEL)),
@@ -262,7 +266,7 @@ def evaluate(measured: Measured) -> Round:
     )
 
 
-def rounds(results: Results, contender: Contender, client: str, mode: str) -> dict[int, Round]:
+def rounds(results: Results, contender: Contender, client: str, mode: str) -> dict[int, ControlRound]:
     """What was measured of one contender, by the round's number."""
     found = contender.select(results, client=client, mode=mode)
     return {
@@ -270,7 +274,7 @@ def rounds(results: Results, contender: Contender, client: str, mode: str) -> di
     }
 
 
-Ways = dict["Contender", dict[int, Round]]
+Ways = dict["Contender", dict[int, ControlRound]]
 
 
 def _measured(results: Results) -> Iterator[tuple[str, str]]:
@@ -281,7 +285,7 @@ def _measured(results: Results) -> Iterator[tuple[str, str]]:
 
 
 def _paired(
-    ways: Ways, figure: Callable[[Round], float | None], base: Contender = CLASSIC
+    ways: Ways, figure: Callable[[ControlRound], float | None], base: Contender = CLASSIC
 ) -> tuple[list[float | None], list[float | None]]:
     """One figure of RMPA and of another contender, of the rounds that both have."""
     ours, theirs = ways[RMPA], ways[base]
@@ -325,7 +329,7 @@ def _grid(ways: Ways, client: str, mode: str) -> Grid:
         ("base", "Velocity Order, at the base"),
     ]:
         row = [title]
-        for figure in (Round.mean, Round.sd):
+        for figure in (ControlRound.mean, ControlRound.sd):
             row += [_of(ways[contender], figure, quantity) for contender in shown]
         rows.append((*row, _ratio_text(ways, quantity)))
         if mode == "polled" and quantity in _PAPER:
@@ -339,7 +343,7 @@ def _grid(ways: Ways, client: str, mode: str) -> Grid:
     )
 
 
-def _of(found: dict[int, Round], figure: Callable[[Round, str], float | None], quantity: str) -> str:
+def _of(found: dict[int, ControlRound], figure: Callable[[ControlRound, str], float | None], quantity: str) -> str:
     return counted(statistics.median(figure(one, quantity) for one in found.values()), _DIGITS, 1e3)
 
 
@@ -383,6 +387,6 @@ def _figure(ways: Ways, client: str, mode: str) -> Figure:
     )
 
 
-def _numbered(found: dict[int, Round], quantity: str) -> tuple[list[float], list[float]]:
+def _numbered(found: dict[int, ControlRound], quantity: str) -> tuple[list[float], list[float]]:
     values = [1e3 * value for number in sorted(found) for value in getattr(found[number], quantity)]
     return [float(number) for number in range(1, len(values) + 1)], values

@@ -17,14 +17,18 @@ from lab.bed.processes import Deadline, eventually
 from lab.experiments import flow
 from lab.experiments.contenders import system_of
 from lab.experiments.failure_findings import FLOWS, RATE, SCENARIOS, findings
-from lab.experiments.model import Cell, Findings, Measured, Plan, Results, Table
+from lab.experiments.model import Cell, Measured, Results
+from lab.frames import frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
+    from lab.bed.plan import Client, Plan
     from lab.bed.processes import Process
-    from lab.bed.system import Stage, System
-    from lab.experiments.model import Client, Value
+    from lab.bed.stage import Stage
+    from lab.bed.system import System
+    from lab.experiments.model import Value
+    from lab.findings import Findings
 
 HOSTS: Final = ("joystick", "velocity", "base", "pc")
 _SIZE: Final = 64
@@ -37,7 +41,7 @@ _BY_HAND_WITHIN: Final = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class Node:
+class PlacedNode:
     """One node of the robot.
 
     Args:
@@ -54,13 +58,15 @@ class Node:
 
 
 NODES: Final = (
-    Node("display", "pc", "sink", {"topics": "/cmd,/vel", "nodelay": True}),
-    Node("log", "velocity", "sink", {"topics": "/cmd", "nodelay": True}),
-    Node("wheels", "base", "sink", {"topics": "/vel", "nodelay": True}),
-    Node("lamp", "joystick", "sink", {"topics": "/state", "nodelay": True}),
-    Node("controller", "velocity", "velocity", {"cmd": "/cmd", "vel": "/vel", "mode": "event", "nodelay": True}),
-    Node("stick", "joystick", "source", {"topic": "/cmd"}),
-    Node("battery", "base", "source", {"topic": "/state"}),
+    PlacedNode("display", "pc", "sink", {"topics": "/cmd,/vel", "nodelay": True}),
+    PlacedNode("log", "velocity", "sink", {"topics": "/cmd", "nodelay": True}),
+    PlacedNode("wheels", "base", "sink", {"topics": "/vel", "nodelay": True}),
+    PlacedNode("lamp", "joystick", "sink", {"topics": "/state", "nodelay": True}),
+    PlacedNode(
+        "controller", "velocity", "velocity", {"cmd": "/cmd", "vel": "/vel", "mode": "event", "nodelay": True}
+    ),
+    PlacedNode("stick", "joystick", "source", {"topic": "/cmd"}),
+    PlacedNode("battery", "base", "source", {"topic": "/state"}),
 )
 _BY_NAME: Final = {node.name: node for node in NODES}
 _KEYS: Final = {one.key for one in FLOWS}
@@ -69,7 +75,7 @@ _LEADS: Final = (("stick", "log"), ("stick", "display"), ("stick", "wheels"), ("
 
 
 @dataclass(frozen=True, slots=True)
-class Times:
+class FailureTimes:
     """Seconds of a cell.
 
     Args:
@@ -85,11 +91,11 @@ class Times:
     after: float
 
 
-_FULL: Final = Times(2.0, 2.0, 3.0, 8.0)
-_SHORT: Final = Times(0.3, 0.5, 0.8, 2.0)
+_FULL: Final = FailureTimes(2.0, 2.0, 3.0, 8.0)
+_SHORT: Final = FailureTimes(0.3, 0.5, 0.8, 2.0)
 
 
-class Robot:
+class PaperRobot:
     """The nodes on their hosts, and what they noted.
 
     Args:
@@ -194,7 +200,7 @@ class Robot:
 
     # --- inside -------------------------------------------------------------------------------------------------
 
-    def _again(self, nodes: Iterable[Node], what: str, within: float) -> None:
+    def _again(self, nodes: Iterable[PlacedNode], what: str, within: float) -> None:
         nodes = list(nodes)
         for node in nodes:
             self._start(node)
@@ -202,13 +208,13 @@ class Robot:
             self._wait_up(nodes, within)
             self.note(what)
 
-    def _start(self, node: Node) -> None:
+    def _start(self, node: PlacedNode) -> None:
         self._born[node.name] = time.monotonic()
         self._running[node.name] = self.system.node(
             node.host, node.program, self._client, wait=False, name=node.name, **node.options
         )
 
-    def _wait_up(self, nodes: Iterable[Node], within: float) -> None:
+    def _wait_up(self, nodes: Iterable[PlacedNode], within: float) -> None:
         for node in nodes:
             self._running[node.name].wait_event("up", within)
 
@@ -218,30 +224,31 @@ class Robot:
             if node.program == "source":
                 flow.begin(self._running[node.name], self._scratch, size=_SIZE, rate=RATE, count=int(_FOR * RATE))
 
-    def _take(self, node: Node, process: Process) -> None:
+    def _take(self, node: PlacedNode, process: Process) -> None:
         keys = {one.topic: one.key for one in FLOWS if one.sink == node.name}
-        for topic, *row in flow.noted(process, _topics(node), self._scratch, settle=0.0).rows:
+        noted = flow.noted(process, _topics(node), self._scratch, settle=0.0)
+        for topic, *row in noted.itertuples(index=False, name=None):
             self.rows.append((keys[str(topic)], *row))
 
 
-def _topics(node: Node) -> list[str]:
+def _topics(node: PlacedNode) -> list[str]:
     return str(node.options["topics"]).split(",")
 
 
-def _master(robot: Robot, times: Times) -> None:
+def _master(robot: PaperRobot, times: FailureTimes) -> None:
     robot.kill("pc")
     time.sleep(times.node)
     robot.start_again("wheels", times.away)
     robot.switch_on("pc")
 
 
-def _host(robot: Robot, times: Times) -> None:
+def _host(robot: PaperRobot, times: FailureTimes) -> None:
     robot.kill("velocity")
     time.sleep(times.away)
     robot.switch_on("velocity")
 
 
-def _cable(robot: Robot, times: Times, longer: float = 0.0) -> None:
+def _cable(robot: PaperRobot, times: FailureTimes, longer: float = 0.0) -> None:
     robot.note("down")
     robot.system.cut("velocity")
     time.sleep(times.away + longer)
@@ -250,7 +257,7 @@ def _cable(robot: Robot, times: Times, longer: float = 0.0) -> None:
     robot.note("on up")
 
 
-_PLAYED: Final[Mapping[str, Callable[[Robot, Times], None]]] = {
+_PLAYED: Final[Mapping[str, Callable[[PaperRobot, FailureTimes], None]]] = {
     "master": _master,
     "host": _host,
     "cable": _cable,
@@ -302,7 +309,7 @@ class Failure:
         client: Client = cell.settings["client"]  # type: ignore[assignment]  # cells() put it there
         times = _SHORT if stage.plan.short else _FULL
         with stage.system(system_of(cell), HOSTS) as system:
-            robot = Robot(system, client, stage)
+            robot = PaperRobot(system, client, stage)
             robot.begin()
             time.sleep(times.before)
             down = time.monotonic()
@@ -312,8 +319,8 @@ class Failure:
             robot.note("end")
             by_hand = 0 if robot.back() else robot.by_hand(down)
         tables = {
-            "flows": Table(("flow", "sequence", "due_ns", "came_ns"), robot.rows),
-            "moments": Table(("what", "at_ns"), robot.moments),
+            "flows": frame(("flow", "sequence", "due_ns", "came_ns"), robot.rows),
+            "moments": frame(("what", "at_ns"), robot.moments),
         }
         return Measured(tables, {"by_hand": by_hand, "rate": RATE})
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from lab.experiments.model import Claim, Figure, Findings, Grid, Panel, Series
+from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
 from lab.statistics import flowing, outages
 
 if TYPE_CHECKING:
@@ -162,13 +162,13 @@ def _due(rows: Sequence[tuple[int, int, int]], begin: int, end: int) -> int:
 
 def _rows(measured: Measured) -> dict[Flow, list[tuple[int, int, int]]]:
     by_key: dict[str, list[tuple[int, int, int]]] = {flow.key: [] for flow in FLOWS}
-    for key, sequence, due, came in measured.tables["flows"].rows:
+    for key, sequence, due, came in measured.tables["flows"].itertuples(index=False, name=None):
         by_key[str(key)].append((_int(sequence), _int(due), _int(came)))
     return {flow: by_key[flow.key] for flow in FLOWS}
 
 
 def _moments(measured: Measured) -> dict[str, int]:
-    return {str(what): _int(at) for what, at in measured.tables["moments"].rows}
+    return {str(what): _int(at) for what, at in measured.tables["moments"].itertuples(index=False, name=None)}
 
 
 def _int(value: object) -> int:

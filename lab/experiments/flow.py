@@ -16,12 +16,13 @@ from __future__ import annotations
 
 import itertools
 import time
-from array import array
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+import pandas as pd
+
 from lab.bed.processes import DEADLINE, BedError, Deadline
-from lab.experiments.model import Table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,6 +34,7 @@ HEAD: Final = 16
 """Bytes at the least of a measured message."""
 SETTLE: Final = 0.3
 """Seconds without an arrival after which a round is over, unless the caller says otherwise."""
+_NOTES: Final = ("topic", "sequence", "due_ns", "came_ns")
 _NOTED: Final = 30.0
 _SLACK: Final = 30.0
 """Seconds beyond its plan that a source may take until it said ``sent``."""
@@ -70,7 +72,7 @@ def begin(source: Process, scratch: Path, *, size: int, rate: float, count: int)
     return Round(number, source, file, count / rate, mark)
 
 
-def sent(begun: Round) -> Table:
+def sent(begun: Round) -> pd.DataFrame:
     """Wait until all of a round is sent; return how late each message left: ``sequence``, ``late_ns``.
 
     Raises:
@@ -79,13 +81,14 @@ def sent(begun: Round) -> Table:
     begun.source.wait_event(
         "sent", begun.seconds + _SLACK, where=lambda event: event["round"] == begun.number, since=begun.mark
     )
-    late = array("Q")
-    late.frombytes(begun.file.read_bytes())
+    late = np.fromfile(begun.file, dtype="int64")
     begun.file.unlink()
-    return Table(("sequence", "late_ns"), list(enumerate(late)))
+    return pd.DataFrame({"sequence": np.arange(len(late)), "late_ns": late})
 
 
-def noted(sink: Process, topics: Sequence[str], scratch: Path, number: int = 0, *, settle: float = SETTLE) -> Table:
+def noted(
+    sink: Process, topics: Sequence[str], scratch: Path, number: int = 0, *, settle: float = SETTLE
+) -> pd.DataFrame:
     """Wait until nothing more comes; return what came of a round, in the order of arrival.
 
     Args:
@@ -106,13 +109,11 @@ def noted(sink: Process, topics: Sequence[str], scratch: Path, number: int = 0, 
     mark = sink.mark_events()
     sink.tell(f"{number} {file} {settle}")
     sink.wait_event("noted", _NOTED, since=mark)
-    flat = array("Q")
-    flat.frombytes(file.read_bytes())
+    came = pd.DataFrame(np.fromfile(file, dtype="int64").reshape(-1, 4), columns=[*_NOTES])
     file.unlink()
-    if any(topic >= len(topics) for topic in flat[::4]):
+    if (came["topic"] >= len(topics)).any():
         raise BedError(f"{sink.name} has more topics than {', '.join(topics)}")
-    rows = list(zip((topics[topic] for topic in flat[::4]), flat[1::4], flat[2::4], flat[3::4], strict=True))
-    return Table(("topic", "sequence", "due_ns", "came_ns"), rows)
+    return came.assign(topic=came["topic"].map(dict(enumerate(topics))).astype("str"))
 
 
 def wait_connected(source: Process, subscribers: int = 1, timeout: float = DEADLINE) -> None:
@@ -153,7 +154,7 @@ def wait_flowing(
     while True:
         begun = begin(source, scratch, size=size, rate=rate, count=count)
         sent(begun)
-        came = noted(sink, topics, scratch, begun.number, settle=0.1).column("topic")
+        came = noted(sink, topics, scratch, begun.number, settle=0.1)["topic"].tolist()
         missing = [topic for topic in topics if came.count(topic) < (least or count)]
         if not missing:
             return

@@ -7,19 +7,26 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from lab.arrivals import counted
+import pandas as pd
+
+from lab import frames
 from lab.experiments import flow
 from lab.experiments.contenders import system_of
-from lab.experiments.model import Cell, Claim, Figure, Findings, Grid, Measured, Panel, Plan, Results, Series, Table
+from lab.experiments.model import Cell, Measured, Results
+from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
+from lab.frames import counting_from
 from lab.samples import summary
 from lab.statistics import distribution, median
+from lab.words import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
+    from lab.bed.plan import Client, Plan
     from lab.bed.processes import Process
-    from lab.bed.system import Stage, System
-    from lab.experiments.model import Client, Value
+    from lab.bed.stage import Stage
+    from lab.bed.system import System
+    from lab.experiments.model import Value
 
 HOSTS: Final = ("joystick", "pc")
 _LINK: Final = "100mbit"
@@ -44,7 +51,7 @@ _UNITS: Final = {"": 1.0, "k": 1e3, "m": 1e6, "g": 1e9}
 
 
 @dataclass(frozen=True, slots=True)
-class Times:
+class ImageTimes:
     """Seconds of a cell.
 
     Args:
@@ -60,8 +67,8 @@ class Times:
     rounds: int
 
 
-_FULL: Final = Times(5.0, 2.0, 20.0, 2)
-_SHORT: Final = Times(0.3, 0.3, 1.0, 1)
+_FULL: Final = ImageTimes(5.0, 2.0, 20.0, 2)
+_SHORT: Final = ImageTimes(0.3, 0.3, 1.0, 1)
 
 
 class _Stream:
@@ -87,11 +94,10 @@ class _Stream:
         """Let it send for so long."""
         return flow.begin(self.source, self._scratch, size=size, rate=rate, count=max(2, round(rate * seconds)))
 
-    def end(self, begun: flow.Round) -> tuple[list[tuple[Value, ...]], int]:
-        """What came of a round, as (sequence, due, came), and how many were sent."""
-        sent = len(flow.sent(begun).rows)
-        came = flow.noted(self.sink, [self._topic], self._scratch, begun.number)
-        return [row[1:] for row in came.rows], sent
+    def end(self, begun: flow.Round) -> tuple[pd.DataFrame, int]:
+        """What came of a round (``sequence``, ``due_ns``, ``came_ns``), and how many were sent."""
+        sent = len(flow.sent(begun))
+        return flow.noted(self.sink, [self._topic], self._scratch, begun.number).drop(columns="topic"), sent
 
 
 _ABOUT: Final = f"""\
@@ -134,15 +140,10 @@ class Images:
             among, among_sent = commands.end(commands.begin(_SIZE, _RATE, _LEAD_IN + times.beside))
             pictures, pictures_sent = images.end(taken)
         lead = round(_RATE * _LEAD_IN)
-        rows: list[tuple[Value, ...]] = [
-            (beside, *row)
-            for beside, came in (("alone", alone), ("images", among))
-            for row in came
-            if _int(row[0]) >= lead
-        ]
+        counted_in = {"alone": counting_from(alone, lead), "images": counting_from(among, lead)}
         tables = {
-            "commands": Table(("beside", "sequence", "due_ns", "came_ns"), rows),
-            "images": Table(("sequence", "due_ns", "came_ns"), pictures),
+            "commands": pd.concat(counted_in, names=["beside"]).reset_index("beside").reset_index(drop=True),
+            "images": pictures,
         }
         facts: dict[str, Value] = {
             "link": link,
@@ -170,7 +171,7 @@ class Images:
         )
 
 
-def _times(plan: Plan) -> Times:
+def _times(plan: Plan) -> ImageTimes:
     return _SHORT if plan.short else _FULL
 
 
@@ -191,7 +192,7 @@ def bits(link: str) -> float | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Score:
+class ImageScore:
     """One system with one client, over all rounds.
 
     Args:
@@ -211,27 +212,25 @@ class Score:
     dropped: int
 
 
-def _score(rounds: Sequence[Measured]) -> Score:
+def _score(rounds: Sequence[Measured]) -> ImageScore:
     latencies: dict[str, list[float]] = {"alone": [], "images": []}
     lost = {"alone": 0, "images": 0}
     shares, speeds, late = [], [], []
     dropped = 0
     for one in rounds:
-        came: dict[str, dict[int, tuple[int, int]]] = {"alone": {}, "images": {}}
-        for beside, sequence, due, at in one.tables["commands"].rows:
-            came[str(beside)].setdefault(_int(sequence), (_int(due), _int(at)))
+        commands, pictures = one.tables["commands"].drop_duplicates(["beside", "sequence"]), one.tables["images"]
         for beside, fact in (("alone", "alone"), ("images", "beside")):
-            latencies[beside] += [(at - due) / 1000 for due, at in came[beside].values()]
-            lost[beside] += max(0, _int(one.facts[fact]) - len(came[beside]))
-        pictures = [(_int(due), _int(at)) for _, due, at in one.tables["images"].rows]
-        late += [(at - due) / 1e6 for due, at in pictures]
+            came = frames.latencies(commands, beside=beside)
+            latencies[beside] += [1000 * ms for ms in came]
+            lost[beside] += max(0, _int(one.facts[fact]) - len(came))
+        late += frames.latencies(pictures)
         dropped += max(0, _int(one.facts["images"]) - len(pictures))
-        dues = [due for due, _ in came["images"].values()]
-        if dues and (speed := bytes_per_second([at for _, at in pictures], min(dues), max(dues))):
+        dues = frames.where(commands, beside="images")["due_ns"].tolist()
+        if dues and (speed := bytes_per_second(pictures["came_ns"].tolist(), min(dues), max(dues))):
             speeds.append(speed / 1e6)
             if carried := bits(str(one.facts["link"])):
                 shares.append(8 * speed / carried)
-    return Score(latencies, lost, shares, speeds, late, dropped)
+    return ImageScore(latencies, lost, shares, speeds, late, dropped)
 
 
 def bytes_per_second(came: Sequence[int], begin: int, end: int) -> float:
@@ -244,7 +243,7 @@ def _int(value: object) -> int:
     return int(str(value))
 
 
-Scores = dict[tuple[str, str], Score]
+Scores = dict[tuple[str, str], ImageScore]
 
 
 def _figure(client: str, scores: Scores) -> Figure:
@@ -287,7 +286,7 @@ def _commands(scores: Scores) -> Grid:
     return Grid("Commands", heads, rows, note)
 
 
-def _later(score: Score, beside: str) -> str:
+def _later(score: ImageScore, beside: str) -> str:
     late = sum(value > _DEADLINE for value in score.latencies[beside]) + score.lost[beside]
     sent = len(score.latencies[beside]) + score.lost[beside]
     return f"{100 * late / sent:.2f} %" if sent else "-"

@@ -6,8 +6,9 @@ from typing import Literal
 
 import msgspec
 
-from lab.experiments.code import Code  # noqa: TC001 - msgspec reads these types when it decodes
-from lab.experiments.model import Plan, Value  # noqa: TC001 - likewise
+from lab.bed.plan import Plan  # noqa: TC001 - msgspec reads these types when it decodes
+from lab.experiments.code import Code  # noqa: TC001 - likewise
+from lab.experiments.model import Value  # noqa: TC001 - likewise
 
 FORMAT = 1
 """Of ``manifest.json``; another number is another layout."""
@@ -25,7 +26,7 @@ class CellRecord(msgspec.Struct, frozen=True, kw_only=True):
         seconds: That the last attempt took, with what is around it.
         attempts: How often it was tried.
         facts: Single values that were measured.
-        tables: What the columns of each of its CSV files hold (``table_file.kinds``), by the file's name.
+        tables: What the columns of each of its CSV files hold (``frames.kinds``), by the file's name.
         error: Why it failed, or why the attempt before did.
     """
 

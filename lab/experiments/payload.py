@@ -9,19 +9,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from lab import samples, statistics
-from lab.arrivals import counted, latencies, lost
+from lab import samples, statistics, words
 from lab.experiments.contenders import CLASSIC, RMPA, turn
-from lab.experiments.model import Cell, Claim, Figure, Findings, Grid, Panel, Series
-from lab.experiments.report import words
+from lab.experiments.model import Cell
 from lab.experiments.stream import LEAD, SETTLE, stream
+from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
+from lab.frames import latencies, lost
+from lab.words import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from lab.bed.system import Stage
+    from lab.bed.plan import Plan
+    from lab.bed.stage import Stage
     from lab.experiments.contenders import Contender
-    from lab.experiments.model import Measured, Plan, Results
+    from lab.experiments.model import Measured, Results
 
 _KB: Final = 1024
 SIZES: Final = {
@@ -154,10 +156,9 @@ class Ladder:
     def add(self, measured: Measured) -> None:
         """Take the tables of one cell."""
         arrivals, sent = measured.tables["arrivals"], measured.tables["sent"]
-        for size in dict.fromkeys(sent.column("size")):
-            if isinstance(size, int):
-                self.values.setdefault(size, []).extend(latencies(arrivals, size=size))
-                self.lost[size] = self.lost.get(size, 0) + lost(arrivals, sent, size=size)
+        for size in sent["size"].unique().tolist():
+            self.values.setdefault(size, []).extend(latencies(arrivals, size=size))
+            self.lost[size] = self.lost.get(size, 0) + lost(arrivals, sent, size=size)
 
     @property
     def medians(self) -> dict[int, float]:

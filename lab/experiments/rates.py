@@ -9,17 +9,20 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from lab import samples, statistics
-from lab.arrivals import counted, latencies, lost
 from lab.experiments.contenders import CLASSIC, DEFAULTS, RELAYS, RMPA, nodelay_of, relays_of, turn
-from lab.experiments.model import Cell, Claim, Figure, Findings, Grid, Panel, Series
+from lab.experiments.model import Cell
 from lab.experiments.stream import SETTLE, stream
+from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
+from lab.frames import latencies, lost
+from lab.words import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from lab.bed.system import Stage
+    from lab.bed.plan import Plan
+    from lab.bed.stage import Stage
     from lab.experiments.contenders import Contender
-    from lab.experiments.model import Measured, Plan, Results
+    from lab.experiments.model import Measured, Results
 
 PAPER: Final = (10, 20, 30, 40, 50)
 """Hz; the paper's."""
@@ -111,7 +114,7 @@ class Rates:
 EXPERIMENT: Final = Rates()
 
 
-class Step:
+class RateStep:
     """One contender at one rate, over all rounds.
 
     Args:
@@ -145,10 +148,10 @@ class Step:
 
 _QUARTILES_NEED: Final = 40
 """Ten beyond each."""
-Steps = dict[int, Step]
+Steps = dict[int, RateStep]
 
 
-def widening(steps: Mapping[int, Step]) -> float | None:
+def widening(steps: Mapping[int, RateStep]) -> float | None:
     """How many times as wide the distribution is at 1 kHz as at the paper's rates (the median of theirs)."""
     base = statistics.median(steps[rate].width for rate in PAPER if rate in steps)
     width = steps[1000].width if 1000 in steps else None
@@ -173,11 +176,10 @@ def _steps(results: Results, contender: Contender, client: str) -> Steps:
     steps: Steps = {}
     for _, measured in contender.select(results, client=client):
         arrivals, sent = measured.tables["arrivals"], measured.tables["sent"]
-        for rate in dict.fromkeys(sent.column("rate")):
-            if isinstance(rate, int):
-                step = steps.setdefault(rate, Step())
-                step.values += latencies(arrivals, rate=rate)
-                step.lost += lost(arrivals, sent, rate=rate)
+        for rate in sent["rate"].unique().tolist():
+            step = steps.setdefault(rate, RateStep())
+            step.values += latencies(arrivals, rate=rate)
+            step.lost += lost(arrivals, sent, rate=rate)
     return dict(sorted(steps.items()))
 
 

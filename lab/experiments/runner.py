@@ -8,16 +8,18 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
 from lab import machine
-from lab.experiments.model import Measured, Table
+from lab.experiments.model import Measured
 from lab.experiments.store import utc
+from lab.frames import frame
 from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from contextlib import AbstractContextManager
 
-    from lab.bed.system import Stage
-    from lab.experiments.model import Cell, Experiment, Plan
+    from lab.bed.plan import Plan
+    from lab.bed.stage import Stage
+    from lab.experiments.model import Cell, Experiment
     from lab.experiments.store import Store
 
 LATENESS: Final = "lateness"
@@ -130,7 +132,7 @@ def _measure(
     if LATENESS in came.tables:
         raise ValueError(f"{experiment.name} has a table {LATENESS!r}, which is the runner's")
     rows = [("before", round(late, 1)) for late in before] + [("after", round(late, 1)) for late in after]
-    return Measured({**came.tables, LATENESS: Table(("when", "late_us"), rows)}, came.facts)
+    return Measured({**came.tables, LATENESS: frame(("when", "late_us"), rows)}, came.facts)
 
 
 def _told(error: Exception) -> str:

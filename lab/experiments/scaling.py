@@ -7,20 +7,26 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from lab.arrivals import counted, counting_from, latencies, lost
 from lab.bed.processes import Deadline
 from lab.experiments import flow
 from lab.experiments.contenders import system_of
-from lab.experiments.model import Cell, Claim, Figure, Findings, Grid, Measured, Panel, Plan, Results, Series, Table
+from lab.experiments.model import Cell, Measured, Results
+from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
+from lab.frames import counting_from, frame, latencies, lost
 from lab.samples import summary
 from lab.usage import Meter, Usage
+from lab.words import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
+    from pandas import DataFrame
+
+    from lab.bed.plan import Client, Plan
     from lab.bed.processes import Process
-    from lab.bed.system import Stage, System
-    from lab.experiments.model import Client, Value
+    from lab.bed.stage import Stage
+    from lab.bed.system import System
+    from lab.experiments.model import Value
 
 FIRST: Final = "pc"
 """The module that sends; with classic ROS it has the master."""
@@ -44,7 +50,7 @@ _TRAFFIC: Final = ("tx_bytes", "rx_bytes", "tx_packets", "rx_packets")
 
 
 @dataclass(frozen=True, slots=True)
-class Times:
+class ScalingTimes:
     """How much is measured.
 
     Args:
@@ -66,8 +72,8 @@ class Times:
     probe: float
 
 
-_FULL: Final = Times((2, 4, 8, 16, 32), 2, 2.5, 1.5, 3.0, 5.0, 10.0)
-_SHORT: Final = Times((2, 3), 1, 0.1, 1.0, 0.2, 0.5, 0.5)
+_FULL: Final = ScalingTimes((2, 4, 8, 16, 32), 2, 2.5, 1.5, 3.0, 5.0, 10.0)
+_SHORT: Final = ScalingTimes((2, 3), 1, 0.1, 1.0, 0.2, 0.5, 0.5)
 
 _ABOUT: Final = """\
 2 to 32 modules, each in a network namespace, all on this machine's processors. The first one (*pc*) sends to all
@@ -126,12 +132,12 @@ class Scaling:
         lead = round(_PROBE_RATE * _LEAD_IN)
         usage = [("idle", idle), ("probe", busy)]
         tables = {
-            "joins": Table(("ready_s", "linked_s", "first_s"), joins),
-            "processes": Table(
+            "joins": frame(("ready_s", "linked_s", "first_s"), joins),
+            "processes": frame(
                 ("while", "process", "cpu_percent", "rss_bytes"),
                 [(phase, name, used.percent, used.rss) for phase, found in usage for name, used in found.items()],
             ),
-            "traffic": Table(("host", *(f"{name}_per_s" for name in _TRAFFIC)), crossed),
+            "traffic": frame(("host", *(f"{name}_per_s" for name in _TRAFFIC)), crossed),
             "arrivals": counting_from(came, lead),
             "sent": counting_from(sent, lead),
         }
@@ -148,7 +154,7 @@ class Scaling:
         return Findings((_figure(steps),), (_grid(steps),), tuple(_claims(steps)), tuple(_notes(steps)))
 
 
-def _times(plan: Plan) -> Times:
+def _times(plan: Plan) -> ScalingTimes:
     return _SHORT if plan.short else _FULL
 
 
@@ -170,7 +176,7 @@ def _greet(system: System, client: Client, stage: Stage) -> Process:
     return hello
 
 
-def _join(system: System, client: Client, stage: Stage, hello: Process, times: Times) -> tuple[Value, ...]:
+def _join(system: System, client: Client, stage: Stage, hello: Process, times: ScalingTimes) -> tuple[Value, ...]:
     """Switch the last module off and on; seconds from its start until it is ready, linked, and hears."""
     last = system.hosts[-1]
     system.kill(last)
@@ -211,7 +217,7 @@ def _number(value: object) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class ModulesStep:
     """One system with one number of modules.
 
     Args:
@@ -247,16 +253,16 @@ class Step:
         return summary(self.latency).p99
 
 
-def _step(measured: Measured) -> Step:
+def _step(measured: Measured) -> ModulesStep:
     """What one cell shows; classic ROS's master with its helpers counts as one."""
     used: dict[str, dict[str, float]] = {"idle": {}, "probe": {}}
-    for phase, name, percent, _ in measured.tables["processes"].rows:
+    for phase, name, percent, _ in measured.tables["processes"].itertuples(index=False, name=None):
         what, _, host = str(name).partition("@")
         who = host if what == "agent" else "nodes" if what.startswith("nodes") else "master"
         used[str(phase)][who] = used[str(phase)].get(who, 0.0) + _float(percent)
     nodes = used["probe"].pop("nodes", 0.0)
     joins = measured.tables["joins"]
-    return Step(
+    return ModulesStep(
         latencies(measured.tables["arrivals"]),
         lost(measured.tables["arrivals"], measured.tables["sent"]),
         list(used["idle"].values()),
@@ -264,22 +270,21 @@ def _step(measured: Measured) -> Step:
         nodes,
         _crossing(measured.tables["traffic"], "bytes"),
         _crossing(measured.tables["traffic"], "packets"),
-        [_float(value) for value in joins.column("linked_s") if value is not None],
-        [_float(value) for value in joins.column("first_s")],
+        [float(value) for value in joins["linked_s"].dropna()],
+        joins["first_s"].tolist(),
     )
 
 
-def _crossing(traffic: Table, unit: str) -> float:
+def _crossing(traffic: DataFrame, unit: str) -> float:
     """The mean over modules of what goes in and out in a second."""
-    ways = [traffic.column(f"{way}_{unit}_per_s") for way in ("tx", "rx")]
-    return sum(statistics.fmean(_float(value) for value in way) for way in ways)
+    return float(sum(traffic[f"{way}_{unit}_per_s"].mean() for way in ("tx", "rx")))
 
 
 def _float(value: object) -> float:
     return float(str(value))
 
 
-Steps = dict[tuple[str, int], Step]
+Steps = dict[tuple[str, int], ModulesStep]
 
 
 def _figure(steps: Steps) -> Figure:
@@ -314,7 +319,7 @@ def _figure(steps: Steps) -> Figure:
     )
 
 
-def _of(step: Step | None, name: str) -> float | None:
+def _of(step: ModulesStep | None, name: str) -> float | None:
     """One figure of a step by its name in the picture."""
     if step is None:
         return None
@@ -359,7 +364,7 @@ def _claims(steps: Steps) -> Iterable[Claim]:
         yield Claim(f"{many} modules: last start to all linked, median, RMPA", linked, _MESH_LIMIT, unit="s")
 
 
-def _ratio(step: Step | None, base: Step | None) -> float | None:
+def _ratio(step: ModulesStep | None, base: ModulesStep | None) -> float | None:
     """Of the medians; ``None`` where one of them rests on few messages."""
     ours, theirs = (one.p50 if one and len(one.latency) >= _ENOUGH else None for one in (step, base))
     return ours / theirs if ours is not None and theirs else None

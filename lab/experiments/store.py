@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, Self
 
 import msgspec
 
-from lab.experiments import table_file
+from lab import frames
 from lab.experiments.manifest import FORMAT, CellRecord, Manifest, Session
 from lab.experiments.model import Cell, Measured, Results
 from rmpa.core.errors import ConfigError, StartError
@@ -24,8 +24,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from pandas import DataFrame
+
+    from lab.bed.plan import Plan
     from lab.experiments.code import Code
-    from lab.experiments.model import Plan, Table
 
 _MANIFEST: Final = "manifest.json"
 _LOCK: Final = ".lock"
@@ -209,7 +211,7 @@ class Store:
         Raises:
             ValueError: A table cannot be kept as CSV.
         """
-        held = {name: table_file.kinds(table) for name, table in measured.tables.items()}
+        held = {name: frames.kinds(table) for name, table in measured.tables.items()}
         folder = self.directory / cell.experiment / cell.key
         folder.mkdir(parents=True, exist_ok=True)
         for name, table in measured.tables.items():
@@ -281,13 +283,13 @@ class Store:
             if record.experiment == experiment
         ]
 
-    def _tables(self, cell: Cell, record: CellRecord) -> dict[str, Table]:
+    def _tables(self, cell: Cell, record: CellRecord) -> dict[str, DataFrame]:
         tables = {}
         for name, held in record.tables.items():
             path = self.directory / cell.experiment / cell.key / f"{name}.csv"
             try:
                 with path.open(encoding="utf-8", newline="") as file:
-                    tables[name] = table_file.read(file, held)
+                    tables[name] = frames.read(file, held)
             except OSError as error:
                 raise ConfigError(str(path), f"cannot be read ({error.strerror})") from None
             except ValueError as error:
@@ -309,10 +311,10 @@ def _id(cell: Cell) -> str:
     return f"{cell.experiment}/{cell.key}"
 
 
-def _write_table(path: Path, table: Table) -> None:
+def _write_table(path: Path, table: DataFrame) -> None:
     unfinished = path.with_suffix(".unfinished")
     with unfinished.open("w", encoding="utf-8", newline="") as file:
-        table_file.write(file, table)
+        frames.write(file, table)
     unfinished.replace(path)
 
 

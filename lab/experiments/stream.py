@@ -5,17 +5,20 @@ from __future__ import annotations
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, cast
 
-from lab.arrivals import ARRIVALS, SENT, counting_from
+import pandas as pd
+
 from lab.experiments import flow
 from lab.experiments.contenders import nodelay_of, relays_of, system_of
-from lab.experiments.model import Measured, Table
+from lab.experiments.model import Measured
+from lab.frames import counting_from
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from lab.bed.plan import Client
     from lab.bed.processes import Process
-    from lab.bed.system import Stage
-    from lab.experiments.model import Cell, Client, Value
+    from lab.bed.stage import Stage
+    from lab.experiments.model import Cell, Value
 
 HOSTS: Final = ("joystick", "pc")
 TOPIC: Final = "/cmd"
@@ -26,7 +29,7 @@ SETTLE: Final = 0.2
 QUEUE: Final = 1000
 
 
-class Stream:
+class SteppedStream:
     """A source and a sink that are connected, and what came of their steps.
 
     Args:
@@ -39,8 +42,8 @@ class Stream:
 
     def __init__(self, stage: Stage, source: Process, sink: Process, topic: str, step: str) -> None:
         self._stage, self._source, self._sink, self._topic, self._step = stage, source, sink, topic, step
-        self._came: list[tuple[Value, ...]] = []
-        self._sent: list[tuple[Value, ...]] = []
+        self._came: list[pd.DataFrame] = []
+        self._sent: list[pd.DataFrame] = []
 
     def run(self, step: Value, *, size: int, rate: float, count: int) -> None:
         """Send one step; keep its last ``count`` messages."""
@@ -50,17 +53,19 @@ class Stream:
         came = counting_from(
             flow.noted(self._sink, [self._topic], self._stage.scratch, begun.number, settle=SETTLE), lead
         )
-        self._sent += [(step, *row) for row in sent.rows]
-        self._came += [(step, *row[1:]) for row in came.rows]
+        came = came.drop(columns="topic")
+        for table, steps in ((sent, self._sent), (came, self._came)):
+            table.insert(0, self._step, step)
+            steps.append(table)
 
     def measured(self) -> Measured:
         """All steps: tables ``arrivals`` and ``sent``."""
-        came, sent = Table((self._step, *ARRIVALS), self._came), Table((self._step, *SENT), self._sent)
-        return Measured({"arrivals": came, "sent": sent}, {"sent": len(self._sent), "came": len(self._came)})
+        came, sent = (pd.concat(steps, ignore_index=True) for steps in (self._came, self._sent))
+        return Measured({"arrivals": came, "sent": sent}, {"sent": len(sent), "came": len(came)})
 
 
 @contextmanager
-def stream(cell: Cell, stage: Stage, step: str, *, link: str | None = None) -> Iterator[Stream]:
+def stream(cell: Cell, stage: Stage, step: str, *, link: str | None = None) -> Iterator[SteppedStream]:
     """Set up a cell's system with a source and a sink; messages flow when it is given out."""
     client, nodelay = cast("Client", cell.settings["client"]), nodelay_of(cell)
     with stage.system(system_of(cell), HOSTS, link=link) as system:
@@ -73,4 +78,4 @@ def stream(cell: Cell, stage: Stage, step: str, *, link: str | None = None) -> I
         source = system.node("joystick", "source", client, topic=TOPIC, queue=QUEUE)
         flow.wait_connected(source)
         flow.wait_flowing(source, sink, [end], stage.scratch)
-        yield Stream(stage, source, sink, end, step)
+        yield SteppedStream(stage, source, sink, end, step)

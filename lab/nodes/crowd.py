@@ -31,7 +31,7 @@ class Keeping(SimpleXMLRPCRequestHandler):
     protocol_version = "HTTP/1.1"
 
 
-class SlaveApi(socketserver.ThreadingMixIn, SimpleXMLRPCServer):
+class CrowdSlaveApi(socketserver.ThreadingMixIn, SimpleXMLRPCServer):
     """What a master and subscribers may ask of a node."""
 
     daemon_threads = True
@@ -81,7 +81,7 @@ def main() -> None:
     given = options.parse_args()
     per_node = given.per_node
     publications = Publications((_HOST, 0), Silent)
-    slave = SlaveApi(publications.server_address[1])
+    slave = CrowdSlaveApi(publications.server_address[1])
     serve(publications)
     serve(slave)
     api = f"http://{_HOST}:{slave.server_address[1]}/"

@@ -19,7 +19,7 @@ output = resource.output("/rated/resource", "std_msgs/UInt8MultiArray")
 _DATA = bytes(64)
 
 
-class Notes:
+class RunNotes:
     """When each run was due, and when it began."""
 
     def __init__(self) -> None:
@@ -29,7 +29,7 @@ class Notes:
         self.full = threading.Event()
 
 
-notes = Notes()
+notes = RunNotes()
 
 
 def say(event: str) -> None:

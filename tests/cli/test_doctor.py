@@ -82,7 +82,7 @@ def test_what_would_mislead_nodes_fails(loopback: Place, variable: str, value: s
     assert loopback.run("doctor")[0] == 1
 
 
-def test_settings_that_cannot_be_are_told_and_the_rest_is_looked_at(loopback: Place) -> None:
+def test_invalid_settings_are_reported_and_the_rest_is_checked(loopback: Place) -> None:
     (loopback.path / "bad.toml").write_text('[discovery]\ninterfaces = ["lo"]\n[core]\nprot = 1\n')
     loopback.environ["RMPA_INTERFACES"] = "lo"
     answers = found(loopback, "--config", "bad.toml")

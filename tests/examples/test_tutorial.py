@@ -1,4 +1,4 @@
-"""The tutorial of Smart Resources, word for word: its files, its commands, and what they print."""
+"""The tutorial of Smart Resources, word for word: its files, its commands and their output."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_the_keeper_says_how_close_it_keeps() -> None:
 
 
 class Terminals:
-    """A machine's terminals, in the folder of the files; its ports are free ones, its state is nobody's."""
+    """A machine's terminals, in the folder of the files; its ports are free ones, its state is empty."""
 
     def __init__(self, home: str) -> None:
         kept = {key: value for key, value in os.environ.items() if not key.startswith(("ROS_", "RMPA_", "XDG_"))}
@@ -120,7 +120,7 @@ class Terminals:
 
 
 def plain(text: str) -> str:
-    """The text without what differs from time to time: numbers, how wide columns are, empty lines."""
+    """The text without its variable parts: numbers, how wide columns are, empty lines."""
     lines = [" ".join(line.split()) for line in NUMBER.sub("N", text).splitlines()]
     return "".join(f"{line}\n" for line in lines if line)
 

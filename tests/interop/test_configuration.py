@@ -54,7 +54,7 @@ def rmpa(module: Module, *words: str) -> str:
     return out
 
 
-def test_the_tools_of_dynamic_reconfigure_configure_it_from_another_module(pair: list[Module]) -> None:
+def test_dynamic_reconfigure_works_from_another_module(pair: list[Module]) -> None:
     robot, pc = pair
     client = pc.ros.rospy("configurer", name="far", commands=True)
     up = client.wait_event("up", LONG)

@@ -60,9 +60,9 @@ def test_an_experiment_measures_both_systems_and_reports(name: str, tmp_path: Pa
     assert {cell.settings["system"] for cell, _ in results.cells} == {"classic", "rmpa"}
     for cell, measured in results.cells:
         for table in _ROWS.get(name, tuple(measured.tables)):
-            assert measured.tables[table].rows, f"{cell.key}: nothing in {table}"
+            assert not measured.tables[table].empty, f"{cell.key}: nothing in {table}"
             assert (out / name / cell.key / f"{table}.csv").is_file()
-        assert measured.tables["lateness"].rows
+        assert not measured.tables["lateness"].empty
     manifest = json.loads((out / "manifest.json").read_text(encoding="utf-8"))
     assert manifest["plan"]["size"] == "short"
     assert {"kernel", "cores", "rmpa"} <= manifest["machine"].keys()

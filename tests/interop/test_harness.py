@@ -1,4 +1,4 @@
-"""The harness itself: nodes, shells and labs do what the other tests take for granted."""
+"""The harness itself: nodes, shells and labs behave as the other tests expect."""
 
 from __future__ import annotations
 

@@ -117,7 +117,7 @@ def test_forged_beacons_from_another_host(modules: ModuleFactory, lab: Lab) -> N
     siege.held()
 
 
-def test_a_peer_that_breaks_the_protocol_behind_a_good_handshake(modules: ModuleFactory, lab: Lab) -> None:
+def test_a_peer_that_breaks_the_protocol_is_dropped(modules: ModuleFactory, lab: Lab) -> None:
     siege = Siege(modules)
     evil = siege.a.ros.rospy("listener", topic="/evil", type="String")
     evil.wait_event("up")

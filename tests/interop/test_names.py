@@ -50,9 +50,7 @@ def fleet(lab: Lab, agent: AgentFactory, shell: ShellFactory, *names: str) -> li
 
 
 @pytest.mark.skipif(bool(lacks("actionlib")), reason=lacks("actionlib"))
-def test_one_computer_works_with_two_robots_that_are_all_alike(
-    lab: Lab, agent: AgentFactory, shell: ShellFactory
-) -> None:
+def test_one_computer_works_with_two_identical_robots(lab: Lab, agent: AgentFactory, shell: ShellFactory) -> None:
     pc, *robots = fleet(lab, agent, shell, "pc", "robot1", "robot2")
     hearing = {}
     for number, robot in enumerate(robots, 1):

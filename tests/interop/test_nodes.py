@@ -1,4 +1,4 @@
-"""Nodes that are killed, cannot be reached, or live behind somebody else's address, and what users see of it."""
+"""Nodes that are killed, cannot be reached, or have another node's address, and what users see of it."""
 
 from __future__ import annotations
 

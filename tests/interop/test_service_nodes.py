@@ -61,7 +61,7 @@ async def work(request: Any) -> Any:
 
 
 async def order(caller: Process, words: str) -> dict[str, Any]:
-    """Have a caller call; what came of it."""
+    """Make a caller call, and return the outcome."""
     since = caller.mark_events()
     caller.tell(words)
     return dict(await caller.expect_event("done", DEADLINE, since=since))

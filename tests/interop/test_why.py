@@ -1,4 +1,4 @@
-"""``rmpa why`` and ``rmpa doctor`` between real nodes on several hosts: what only those can bring about."""
+"""``rmpa why`` and ``rmpa doctor`` between real nodes on several hosts: the cases that need those."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def until(module: Module, begins: str, *words: str) -> str:
     return found[-1]
 
 
-def test_a_topic_from_its_publisher_to_its_reader_and_each_that_fails(modules: ModuleFactory) -> None:
+def test_why_names_each_stage_of_a_topic_that_fails(modules: ModuleFactory) -> None:
     a, b = modules("a", "b", config="[services]\nloggers = true\n")
     topic = f"{a.name}:/chatter"
     assert stop(b.agent, topic) == f"publisher: no node of {a.name} publishes /chatter"

@@ -13,9 +13,7 @@ from lab.statistics import (
     delays,
     distribution,
     flowing,
-    histogram,
     linear_fit,
-    losses,
     median,
     outages,
     periods,
@@ -100,19 +98,6 @@ def test_delay_is_from_a_command_to_its_own_velocity() -> None:
     assert delays(commands, velocities) == [(1, 1.0), (2, 2.0)]
 
 
-def test_losses_of_a_flow() -> None:
-    rows = [(0, 1), (1, 2), (5, 3), (4, 4), (5, 5), (4, 6), (9, 7), (12, 8)]
-    made = losses(rows, sent=10)
-    assert (made.sent, made.lost, made.doubled, made.unordered) == (10, 5, 2, 1)
-    assert made.missing == ((2, 3), (6, 8))
-
-
-def test_losses_of_a_flow_that_never_came_and_of_a_part_of_one() -> None:
-    assert losses([], sent=3).missing == ((0, 2),)
-    assert losses([(5, 1), (7, 2)], sent=3, first=5).missing == ((6, 6),)
-    assert losses([], sent=0).lost == 0
-
-
 def test_outages_between_messages() -> None:
     rows = [(0, 0), (1, SECOND // 10), (9, SECOND), (10, SECOND + SECOND // 10)]
     assert outages(rows, longest=0.5) == [Outage(SECOND // 10, SECOND, 7, back=True)]
@@ -188,9 +173,3 @@ def test_a_thinned_distribution_keeps_its_tail_and_stays_true(tail: bool) -> Non
     assert xs[-400:] == [float(i) for i in range(count - 400 - tail, count - tail)]
     for x, share in zip(xs, shares, strict=True):
         assert share == pytest.approx((count - 1 - x) / count if tail else (x + 1) / count)
-
-
-def test_histogram_counts_what_lies_between_its_bounds() -> None:
-    assert histogram([0.0, 0.4, 0.5, 1.0, 1.1, -0.1], 2, 0.0, 1.0) == [2, 2]
-    with pytest.raises(ValueError):
-        histogram([1.0], 3, 1.0, 1.0)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
+from lab import words
 from lab.experiments.registry import find_experiment
-from lab.experiments.report import words
 from lab.experiments.report.sections import gather
 from lab.experiments.store import Store
 
@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from lab.experiments.model import Claim, Experiment
+    from lab.experiments.model import Experiment
+    from lab.findings import Claim
 
 _NOT_OF_THE_MACHINE: Final = {"load", "commit", "rmpa"}
 """Facts that differ from one minute to the next, or are said with the code."""

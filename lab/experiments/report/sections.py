@@ -6,22 +6,23 @@ import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from lab.experiments.model import Findings
 from lab.experiments.registry import find_experiment
+from lab.findings import Findings
 from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from lab.experiments.model import Experiment, Figure, Results, Value
+    from lab.experiments.model import Experiment, Results, Value
     from lab.experiments.store import Store
+    from lab.findings import Figure
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Failure:
+class FailedCell:
     """A cell that could not be measured.
 
     Args:
@@ -56,7 +57,7 @@ class Section:
     findings: Findings
     cells: int
     waiting: int
-    failures: Sequence[Failure]
+    failures: Sequence[FailedCell]
     lateness: Sequence[float]
     images: Mapping[str, tuple[Path, Path]]
     problem: str = ""
@@ -79,7 +80,7 @@ def gather(
     Returns:
         A section with a ``problem`` where the samples cannot be read or make no sense: the others can still be told.
     """
-    failures = [Failure(record.settings, record.error) for record in store.failed(name)]
+    failures = [FailedCell(record.settings, record.error) for record in store.failed(name)]
     title, about, cells = store.manifest.titles.get(name, name), "", 0
     late: list[float] = []
     images: dict[str, tuple[Path, Path]] = {}
@@ -106,4 +107,4 @@ def gather(
 def lateness(results: Results) -> list[float]:
     """How late the host woke up beside the cells of an experiment, µs."""
     tables = [measured.tables["lateness"] for _, measured in results.cells if "lateness" in measured.tables]
-    return [float(value) for table in tables for value in table.column("late_us") if isinstance(value, int | float)]
+    return [late for table in tables for late in table["late_us"].tolist()]

@@ -6,16 +6,18 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from lab.experiments.registry import find_experiment
-from lab.experiments.report import figures, html, page
+from lab.experiments.report import page
 from lab.experiments.report.sections import gather
 from lab.experiments.store import Store
+from lab.figures import drawing
 from rmpa.core.errors import StartError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from lab.experiments.model import Experiment, Figure, Findings
+    from lab.experiments.model import Experiment
+    from lab.findings import Figure, Findings
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,18 +61,14 @@ def write_report(directory: Path, find: Callable[[str], Experiment] = find_exper
 
 
 def _write(store: Store, folder: Path, images: Path, find: Callable[[str], Experiment]) -> Report:
-    remedy = figures.missing()
-
     def draw(figure: Figure, lateness: Sequence[float]) -> tuple[Path, Path]:
-        return figures.draw(figure, lateness, images)
+        return drawing.draw(figure, lateness, images)
 
-    sections = [gather(store, name, None if remedy else draw, find) for name in store.names]
+    sections = [gather(store, name, draw, find) for name in store.names]
     drawn = tuple(path for section in sections for pair in section.images.values() for path in pair)
     for old in {*images.glob("*.png"), *images.glob("*.svg")} - set(drawn):
         old.unlink()
-    left_out = [f"figures (matplotlib is not installed: {remedy})"] if remedy else []
-    left_out += [f"findings of {section.name} ({section.problem})" for section in sections if section.problem]
-    missing = "; ".join(left_out)
+    missing = "; ".join(f"findings of {section.name} ({section.problem})" for section in sections if section.problem)
     text = page.markdown(store.manifest, sections, folder, missing)
     report = Report(
         folder / "report.html",
@@ -80,5 +78,5 @@ def _write(store: Store, folder: Path, images: Path, find: Callable[[str], Exper
         missing,
     )
     report.markdown.write_text(text, encoding="utf-8")
-    report.html.write_text(html.page(text, page.TITLE, folder), encoding="utf-8")
+    report.html.write_text(page.page(text, page.TITLE, folder), encoding="utf-8")
     return report

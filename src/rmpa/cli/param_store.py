@@ -73,11 +73,11 @@ def open_store(peer: str | None, options: GraphOptions) -> ParamStore:
         RmpaError: There is no such agent.
     """
     if peer is None:
-        return MasterStore(options.master())
+        return _MasterStore(options.master())
     if options.master_uri is not None:
         raise ConfigError("--peer", "a peer is asked through this machine's agent, not at a master", "leave one out")
     agent = choose_agent(os.environ, options.agent)
-    return PeerStore(ControlClient(agent.path, limits.CONTROL_HANDLER_TIMEOUT), peer)
+    return _PeerStore(ControlClient(agent.path, limits.CONTROL_HANDLER_TIMEOUT), peer)
 
 
 def read_key(text: str, environ: Mapping[str, str], *, root: bool = False) -> str:
@@ -133,30 +133,26 @@ def _with_namespaces(name: str) -> list[str]:
 
 
 @dataclass
-class MasterStore:
+class _MasterStore:
     """The parameters of a ROS master, an agent's core or any other."""
 
     master: Master
 
     @property
     def title(self) -> str:
-        """Its address."""
         return self.master.uri
 
     def get(self, key: str) -> XmlRpcValue:
-        """A value, or a namespace."""
         reply = self._call("getParam", key)
         if reply.code != 1:
             raise absent(key, self.names(), self.title)
         return reply.value
 
     def names(self) -> list[str]:
-        """The names of all parameters, in order."""
         value = self._call("getParamNames").value
         return sorted(str(name) for name in value) if isinstance(value, list) else []
 
     def set(self, key: str, value: XmlRpcValue) -> int:
-        """Set a parameter, or each member of a namespace."""
         from rmpa.ros.wire.xmlrpc import serialize_response
 
         parameters = check(key, value)
@@ -168,7 +164,6 @@ class MasterStore:
         return len(parameters)
 
     def delete(self, key: str) -> None:
-        """Delete a parameter or namespace."""
         reply = self._call("deleteParam", key)
         if reply.code != 1:
             raise absent(key, self.names(), self.title)
@@ -183,7 +178,7 @@ class MasterStore:
 
 
 @dataclass
-class PeerStore:
+class _PeerStore:
     """The parameters of a peer's module, through both agents."""
 
     client: ControlClient
@@ -191,20 +186,16 @@ class PeerStore:
 
     @property
     def title(self) -> str:
-        """The peer's name."""
         return self.peer
 
     def get(self, key: str) -> XmlRpcValue:
-        """A value, or a namespace."""
         return self._value(transfer.GET, {"key": key})
 
     def names(self) -> list[str]:
-        """The names of all parameters that this module may read, in order."""
         value = self._value(transfer.NAMES, {})
         return sorted(str(name) for name in value) if isinstance(value, list) else []
 
     def set(self, key: str, value: XmlRpcValue) -> int:
-        """Set a parameter, or each member of a namespace."""
         from rmpa.ros.wire.xmlrpc import serialize_response
 
         check(key, value)
@@ -215,7 +206,6 @@ class PeerStore:
         return int(self._drive(transfer.writing(key, text, secrets.randbits(31))))
 
     def delete(self, key: str) -> None:
-        """Delete a parameter or namespace."""
         self._ask((transfer.DELETE, {"key": key}))
 
     def _value(self, what: str, args: dict[str, Any]) -> XmlRpcValue:

@@ -27,7 +27,7 @@ Examples:
 @json_option
 @agent_option
 def reload(check: bool, as_json: bool, agent: str | None) -> int:
-    """Let the agent read its rmpa.toml again, without an effect on what stays as it is.
+    """Make the agent read its rmpa.toml again; what the changes do not touch is not interrupted.
 
     Exit code 2 if the settings cannot be used; then nothing has changed.
     """

@@ -33,7 +33,7 @@ _EVERY: Final = 1.0
 """Seconds between two lines, as rostopic has it."""
 
 
-class Figures:
+class _Figures:
     """The figures of one command over a sliding window of messages.
 
     Args:
@@ -71,16 +71,14 @@ class Figures:
         raise NotImplementedError
 
 
-class Rate(Figures):
-    """Messages a second."""
+class _Rate(_Figures):
+    """Messages a second, in the format of ``rostopic hz``; Hz and seconds."""
 
     def own(self) -> dict[str, float]:
-        """Hz and seconds."""
         p = self.flow.periods()
         return {"rate": self.flow.rate(), "min": p.minimum, "max": p.maximum, "sd": p.sd, "window": p.count + 1}
 
     def text(self) -> str:
-        """As ``rostopic hz``."""
         v = self.own()
         if v["window"] < 2:
             return "one message, no rate yet"
@@ -88,40 +86,35 @@ class Rate(Figures):
         return f"average rate: {v['rate']:.3f}\n\t{spread}"
 
     def remote(self, route: RouteInfo) -> str:
-        """Its rate and periods."""
         return f"at the agent, from {origin(route)}: {rate_text(route)}"
 
 
-class Bandwidth(Figures):
-    """Bytes a second."""
+class _Bandwidth(_Figures):
+    """Bytes a second, in the format of ``rostopic bw``."""
 
     def __init__(self, window: int) -> None:
         super().__init__(window)
         self._sizes = SampleRing(window)
 
     def add(self, received: Received, now: float) -> None:
-        """One message."""
         super().add(received, now)
         self._sizes.add(len(received.raw))
 
     def own(self) -> dict[str, float]:
-        """Bytes, and bytes a second."""
         s = self._sizes.summary()
         rate = self.flow.bandwidth()
         return {"bandwidth": rate, "mean": s.mean, "min": s.minimum, "max": s.maximum, "window": s.count}
 
     def text(self) -> str:
-        """As ``rostopic bw``."""
         v = self.own()
         spread = f"mean: {size(v['mean'])} min: {size(v['min'])} max: {size(v['max'])} window: {v['window']}"
         return f"average: {size(v['bandwidth'])}/s\n\t{spread}"
 
     def remote(self, route: RouteInfo) -> str:
-        """Its bytes."""
         return f"at the agent, from {origin(route)}: {bandwidth_text(route)}"
 
 
-class Delay(Figures):
+class _Delay(_Figures):
     """Age on arrival, in seconds.
 
     By the header's stamp, exact only as far as both machines' clocks agree; and for a remote source by the agent,
@@ -165,7 +158,6 @@ class Delay(Figures):
         return {"source": "link", "error": latency.error, **spread, "window": latency.count, "routes": routes}
 
     def own(self) -> dict[str, float]:
-        """Seconds, by the header's stamp."""
         s: SampleSummary = self._delays.summary()
         return {"delay": s.mean, "min": s.minimum, "max": s.maximum, "sd": s.sd, "window": s.count}
 
@@ -178,7 +170,6 @@ class Delay(Figures):
         return f"average delay: {v['delay']:.4f}\n\t{spread}\n\tby the header's stamp and this machine's clock"
 
     def remote(self, route: RouteInfo) -> str:
-        """Its latency between the agents."""
         return f"by the link's clock, from {origin(route)}: {latency_text(route.latency)}"
 
 
@@ -186,7 +177,7 @@ def _has_header(kind: MessageType) -> bool:
     return any(field.name == "header" and field.type == "std_msgs/Header" for field in kind.fields)
 
 
-async def _show(figures: Figures, master: Master, wanted: GraphName, *, as_json: bool) -> None:
+async def _show(figures: _Figures, master: Master, wanted: GraphName, *, as_json: bool) -> None:
     if not figures.fresh():
         if not as_json:
             click.echo("no new messages")
@@ -198,7 +189,7 @@ async def _show(figures: Figures, master: Master, wanted: GraphName, *, as_json:
         click.echo("\n\t".join([figures.text(), *(figures.remote(route) for route in routes)]))
 
 
-def _watch(topic: str, make: Callable[[Master], Figures], count: int | None, options: GraphOptions) -> None:
+def _watch(topic: str, make: Callable[[Master], _Figures], count: int | None, options: GraphOptions) -> None:
     wanted = read_name(topic)
     master, as_json = options.master(), options.as_json
     figures = make(master)
@@ -252,7 +243,7 @@ def hz(topic: str, window: int, count: int | None, options: GraphOptions) -> Non
     The first figures are measured by this command, as rostopic does. For each remote source the agent's own follow:
     the arrivals of the last minute over the mesh.
     """
-    _watch(topic, lambda _: Rate(window), count, options)
+    _watch(topic, lambda _: _Rate(window), count, options)
 
 
 @click.command(epilog="\b\nExamples:\n  rmpa topic bw /camera/image_raw -w 30\n  rmpa topic bw base:/map --json\n")
@@ -263,7 +254,7 @@ def bw(topic: str, window: int, count: int | None, options: GraphOptions) -> Non
     The first figures are measured by this command, as rostopic does. For each remote source the agent's own follow:
     the arrivals of the last minute over the mesh.
     """
-    _watch(topic, lambda _: Bandwidth(window), count, options)
+    _watch(topic, lambda _: _Bandwidth(window), count, options)
 
 
 @click.command(
@@ -282,4 +273,4 @@ def delay(topic: str, window: int, count: int | None, options: GraphOptions) -> 
     agree. Then, for each remote source, by the link's clock: from the publisher's agent to this one. That needs
     neither a header nor clocks that agree, and the true value lies within the ± that is shown.
     """
-    _watch(topic, lambda master: Delay(window, by_link=master.agent is not None), count, options)
+    _watch(topic, lambda master: _Delay(window, by_link=master.agent is not None), count, options)

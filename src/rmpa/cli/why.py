@@ -44,9 +44,9 @@ Examples:
 def why(name: str, service: bool, as_json: bool, agent: str | None) -> int:
     """Say why a topic of a peer does not arrive here, or a service cannot be called, and what to do.
 
-    Both agents are asked, stage by stage from the publisher to the reader; what flows is looked at for a second, and
+    Both agents are asked, stage by stage from the publisher to the reader; messages are watched for a second, and
     a service's server is probed.
-    PEER is a name or a GUID. Without PEER every module that publishes the topic is looked at, and for one of this
+    PEER is a name or a GUID. Without PEER every module that publishes the topic is checked, and for one of this
     module's own topics every peer says how it arrives there.
     """
     wanted = read_name(name)

@@ -13,20 +13,18 @@ import psutil
 import pytest
 
 from lab.bed import namespaces, ros
+from lab.bed.plan import Kind, Plan
 from lab.bed.processes import Deadline, eventually, run
 from lab.bed.stage import make_stage, why_not
-from lab.bed.system import Kind
 from lab.experiments import flow
-from lab.experiments.model import Plan
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from lab.bed.plan import Client
     from lab.bed.processes import Process
-    from lab.bed.robot import Robot
-    from lab.bed.stage import PlannedStage
-    from lab.bed.system import Stage, System
-    from lab.experiments.model import Client
+    from lab.bed.stage import Stage
+    from lab.bed.system import System
 
 pytestmark = pytest.mark.timeout(180)
 HOSTS = ["joystick", "velocity", "pc"]
@@ -43,12 +41,12 @@ of_both_kinds = pytest.mark.parametrize("kind", KINDS)
 
 
 @contextmanager
-def _system(plan: Plan, kind: Kind) -> Iterator[tuple[PlannedStage, Robot]]:
+def _system(plan: Plan, kind: Kind) -> Iterator[tuple[Stage, System]]:
     with make_stage(plan) as stage, stage.system(kind, HOSTS) as robot:
         yield stage, robot
 
 
-def _nodes(robot: Robot, stage: PlannedStage) -> tuple[Process, Process]:
+def _nodes(robot: System, stage: Stage) -> tuple[Process, Process]:
     """A source on joystick, a velocity node on its host and a sink on pc, through which messages come."""
     client: Client = stage.plan.clients[0]
     sink = robot.node("pc", "sink", client, nodelay=True)
@@ -75,14 +73,13 @@ def _children() -> set[int]:
 def test_messages_flow_and_nothing_is_left_behind(plan: Plan, kind: Kind) -> None:
     before = _children()
     with _system(plan, kind) as (stage, robot):
-        as_asked_for: tuple[Stage, System] = (stage, robot)  # mypy holds both against the protocols
-        assert as_asked_for[1].kind == kind
+        assert robot.kind == kind
         assert robot.hosts == tuple(HOSTS)
         assert robot.master == ("pc" if kind == "classic" else "")
         source, sink = _nodes(robot, stage)
         begun = flow.begin(source, stage.scratch, size=64, rate=100, count=20)
-        assert len(flow.sent(begun).rows) == 20
-        assert len(flow.noted(sink, TOPICS, stage.scratch, begun.number).rows) == 40
+        assert len(flow.sent(begun)) == 20
+        assert len(flow.noted(sink, TOPICS, stage.scratch, begun.number)) == 40
         eventually(lambda: set(robot.pids()) == _running(plan, kind), what="all that the system itself runs")
         assert all(psutil.pid_exists(pid) for pid in robot.pids().values())
         scratch = stage.scratch
@@ -104,7 +101,7 @@ def test_killed_host_ends_all_at_once_and_comes_back(plan: Plan, kind: Kind) -> 
         assert not [name for name in robot.pids() if name.endswith("@velocity")]
         begun = flow.begin(source, stage.scratch, size=64, rate=100, count=10)
         flow.sent(begun)
-        came = flow.noted(sink, TOPICS, stage.scratch, begun.number).column("topic")
+        came = flow.noted(sink, TOPICS, stage.scratch, begun.number)["topic"].tolist()
         assert (came.count("/cmd"), came.count("/vel")) == (10, 0)
         before = time.monotonic()
         assert before <= robot.start("velocity") <= time.monotonic()
@@ -133,7 +130,7 @@ def test_classic_without_its_master_takes_no_new_node_until_it_is_back(plan: Pla
             flow.wait_flowing(fresh, sink, ["/cmd"], stage.scratch)
 
 
-def _all(robot: Robot, host: str) -> list[Process]:
+def _all(robot: System, host: str) -> list[Process]:
     return [*robot._shells[host].processes, *robot._own(host)]
 
 
@@ -182,7 +179,7 @@ class TestCables:
             robot.cut("joystick")
             begun = flow.begin(source, stage.scratch, size=64, rate=100, count=10)
             flow.sent(begun)
-            assert not flow.noted(sink, TOPICS, stage.scratch, begun.number).rows
+            assert flow.noted(sink, TOPICS, stage.scratch, begun.number).empty
             robot.restore("joystick")
             flow.wait_flowing(source, sink, TOPICS, stage.scratch, timeout=60.0)
 
@@ -255,7 +252,7 @@ class TestCables:
             assert time.monotonic() - began < 30
 
 
-def _connections(robot: Robot, address: str) -> set[str]:
+def _connections(robot: System, address: str) -> set[str]:
     """The established connections of joystick to an address, as ``ss`` names them."""
     here = robot._place.host("joystick")
     shown = run(here.command(["ss", "-Htn", "state", "established", "dst", address]))

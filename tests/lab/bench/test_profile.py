@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from lab.bench.profile import Profile, _parts, _short, parse_perf, parse_stacks, parse_strace
+from lab.bench.profile import AgentProfile, _parts, _short, parse_perf, parse_stacks, parse_strace
 
 PERF = """
     59.39%  [kernel.kallsyms]                        [k] finish_task_switch.isra.0                  -      -
@@ -49,8 +49,8 @@ def test_stacks_without_what_only_waits() -> None:
 
 
 def test_the_cost_is_divided_as_the_samples_are() -> None:
-    profile = Profile(objects={"kernel": 60.0, "python": 39.5, "vdso": 0.5})
-    assert _parts({"agent 1": profile, "agent 2": Profile()}, {"agent 1": 50.0}) == {
+    profile = AgentProfile(objects={"kernel": 60.0, "python": 39.5, "vdso": 0.5})
+    assert _parts({"agent 1": profile, "agent 2": AgentProfile()}, {"agent 1": 50.0}) == {
         "agent 1": {"kernel": 30.0, "python": 19.75}
     }
 

@@ -14,7 +14,7 @@ from xmlrpc.server import SimpleXMLRPCServer
 import pytest
 
 from lab.bed.ros import NODES
-from lab.bench.scale import Step, _of_copy, _panels, _targets, copies, per_message
+from lab.bench.scale import ScaleStep, _of_copy, _panels, _targets, copies, per_message
 from lab.usage import Usage
 
 if TYPE_CHECKING:
@@ -27,8 +27,8 @@ def test_the_idle_cost_is_taken_off_for_as_long_as_the_stream_ran() -> None:
     assert per_message(Usage(0.42, 2.0, 0), Usage(0.0, 0.0, 0), 10_000) == pytest.approx(42.0)
 
 
-def step(latency: float, one: float, two: float) -> Step:
-    made = Step(array("d", [latency] * 10), control=array("d", [1.0] * 10))
+def step(latency: float, one: float, two: float) -> ScaleStep:
+    made = ScaleStep(array("d", [latency] * 10), control=array("d", [1.0] * 10))
     made.note("agent 1", one)
     made.note("agent 2", two)
     made.note("direct", 5.0)

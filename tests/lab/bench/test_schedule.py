@@ -9,10 +9,10 @@ import pytest
 
 from lab.bed.bench import Bed
 from lab.bench import schedule
-from lab.bench.crosstraffic import Loaded, shape
+from lab.bench.crosstraffic import LoadedScore, shape
 from lab.bench.period import Evenness, paired
-from lab.bench.schedule import Arrivals, Score, Way, parse
-from lab.experiments.model import Table
+from lab.bench.schedule import Arrivals, LatencyScore, Way, parse
+from lab.frames import frame
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,7 +30,7 @@ def made(came: dict[int, float], *, sent: int = 10, late: Sequence[int] = ()) ->
 
 def test_the_lead_in_is_left_out_of_everything() -> None:
     rows = [("/t", 0, 100, 190), ("/t", 1, 200, 230), ("/t", 2, 300, 350), ("/t", 3, 400, 470)]
-    arrivals = parse(Table(COLUMNS, rows), [5, 6, 7, 8], 2)
+    arrivals = parse(frame(COLUMNS, rows), [5, 6, 7, 8], 2)
     assert (arrivals.sent, list(arrivals.sequence), list(arrivals.late)) == (2, [2, 3], [7, 8])
     assert arrivals.latencies() == [0.05, 0.07]
     assert arrivals.from_send() == pytest.approx([0.043, 0.062])
@@ -57,7 +57,7 @@ def test_lost_and_doubled_are_counted() -> None:
 
 
 def test_nothing_that_came_is_nothing() -> None:
-    arrivals = parse(Table(COLUMNS, []), [0, 0, 0], 1)
+    arrivals = parse(frame(COLUMNS, []), [0, 0, 0], 1)
     assert (arrivals.lost, arrivals.periods(), arrivals.step, arrivals.bytes_per_second(64, 0, 99)) == (
         2,
         [],
@@ -73,13 +73,13 @@ def test_throughput_counts_what_came_between_two_moments() -> None:
 
 
 def test_a_message_that_never_came_is_past_every_deadline() -> None:
-    score = Score()
+    score = LatencyScore()
     score.add(made({0: 0.5, 1: 2.0, 2: 0.5}, sent=4))
     assert score.later_than(1000.0) == 0.5
 
 
 def test_one_bad_round_does_not_move_the_median_of_rounds() -> None:
-    score = Score()
+    score = LatencyScore()
     for late in (0.3, 0.2, 900.0):
         score.add(made({0: 0.1, 1: late}))
     assert score.median_of_rounds(99.9) == 300.0
@@ -94,7 +94,7 @@ def test_deviations_are_compared_round_by_round() -> None:
 
 
 def test_images_count_while_commands_were_due() -> None:
-    score = Loaded()
+    score = LoadedScore()
     score.add_images(made(dict.fromkeys(range(10), 0.0)), made(dict.fromkeys(range(2, 8), 0.0)))
     assert score.share == pytest.approx(8 * 1024 * 1024 * 100 / 100e6)
 

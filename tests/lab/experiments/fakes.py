@@ -7,13 +7,16 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
+from lab.bed.plan import Plan
 from lab.experiments.code import Code
-from lab.experiments.model import Cell, Claim, Findings, Measured, Plan, Table
+from lab.experiments.model import Cell, Measured
+from lab.findings import Claim, Findings
+from lab.frames import frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from lab.bed.system import Stage
+    from lab.bed.stage import Stage
     from lab.experiments.model import Results
 
 PLAN = Plan(size="short", bed="loopback", clients=("own",), link="")
@@ -50,10 +53,10 @@ class FakeExperiment:
         self.tried[cell.key] += 1
         self.before(cell, self.tried[cell.key])
         rate = int(cell.settings["rate"] or 0)
-        return Measured({"rates": Table(("topic", "rate"), [("/cmd", rate), ("/vel", rate)])}, {"lost": 0})
+        return Measured({"rates": frame(("topic", "rate"), [("/cmd", rate), ("/vel", rate)])}, {"lost": 0})
 
     def findings(self, results: Results) -> Findings:
-        rates = [float(str(value)) for _, one in results.cells for value in one.tables["rates"].column("rate")]
+        rates = [float(str(value)) for _, one in results.cells for value in one.tables["rates"]["rate"].tolist()]
         return Findings(claims=(Claim("highest rate", max(rates, default=None), 20.0, unit="Hz"),))
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from lab.bed.plan import Plan
 from lab.experiments.asked import Asked, choose, parse_only, select
-from lab.experiments.model import Cell, Plan
+from lab.experiments.model import Cell
 from rmpa.core.errors import ConfigError, StartError
 
 CELLS = [

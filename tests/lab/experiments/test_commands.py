@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import json
 import signal
@@ -21,7 +20,6 @@ from lab.experiments.estimate import Estimate
 from lab.experiments.model import Cell
 from lab.experiments.progress import Bars, Lines
 from lab.experiments.registry import EXPERIMENTS
-from lab.experiments.report import figures
 from lab.experiments.store import Store
 from tests.lab.experiments import fakes
 from tests.lab.experiments.fakes import FakeExperiment
@@ -29,7 +27,7 @@ from tests.lab.experiments.fakes import FakeExperiment
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from lab.experiments.model import Plan
+    from lab.bed.plan import Plan
 
 DEADLINE = 60.0
 ROOT = Path(__file__).parents[3]
@@ -272,25 +270,6 @@ def test_who_may_write_nothing_is_told(
     code, _, err = lab(capsys, "run", "--out", "file/run")
     assert code == 1
     assert err.splitlines()[-1].startswith("lab: file/run: cannot be written to")
-
-
-def test_without_matplotlib_the_report_has_no_figures_and_says_what_installs_them(
-    fake: FakeExperiment, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    found = importlib.util.find_spec
-
-    def hidden(name: str, package: str | None = None) -> object:
-        return None if name == "matplotlib" else found(name, package)
-
-    monkeypatch.setattr(figures, "find_spec", hidden)
-    code, out, err = lab(capsys, "run", "--short", "--out", "mine")
-    assert code == 0
-    assert "highest rate" in out
-    assert (
-        err.splitlines()[-1] == "! left out: figures (matplotlib is not installed: pip install 'rmpa[experiments]')"
-    )
-    assert "pip install 'rmpa[experiments]'" in Path("mine/report/report.md").read_text()
 
 
 CELLS = [Cell("rates", {"system": "rmpa", "rate": rate}, seconds=10.0) for rate in (10, 20)]

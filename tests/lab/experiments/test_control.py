@@ -7,14 +7,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.bed.plan import Plan
 from lab.experiments.contenders import CLASSIC, DEFAULTS, RMPA
 from lab.experiments.control import CMD, EXPERIMENT, VEL, evaluate, phases, rounds
-from lab.experiments.model import Cell, Measured, Plan, Results, Table
+from lab.experiments.model import Cell, Measured, Results
+from lab.frames import frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from lab.experiments.model import Claim
+    from lab.findings import Claim
 
 MS = 1_000_000
 PERIOD = 100 * MS
@@ -32,8 +34,8 @@ def made(cmd_ms: float, vel_ms: float, delay_ms: float, *, hop_ms: float = 0.25,
         cmd.append((CMD, number, due, came))
         vel.append((VEL, number, due, due + round((hop_ms + delay_ms + odd * vel_ms) * MS)))
         base.append((VEL, number, due, vel[-1][3] + MS))
-    sent = Table(("sequence", "late_ns"), [(number, 0) for number in range(count)])
-    return Measured({"pc": Table(COLUMNS, cmd + vel), "base": Table(COLUMNS, base), "sent": sent})
+    sent = frame(("sequence", "late_ns"), [(number, 0) for number in range(count)])
+    return Measured({"pc": frame(COLUMNS, cmd + vel), "base": frame(COLUMNS, base), "sent": sent})
 
 
 def sd(late_ms: float) -> float:

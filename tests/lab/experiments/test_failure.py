@@ -6,9 +6,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.bed.plan import Plan
 from lab.experiments.failure import EXPERIMENT, NODES
 from lab.experiments.failure_findings import FLOWS, RATE, SCENARIOS, Fate, fates
-from lab.experiments.model import Cell, Claim, Findings, Measured, Plan, Results, Table, Value
+from lab.experiments.model import Cell, Measured, Results, Value
+from lab.findings import Claim, Findings
+from lab.frames import frame
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,8 +35,8 @@ def run(*without: tuple[str, range]) -> list[tuple[Value, ...]]:
 def measured(rows: Sequence[tuple[Value, ...]], restarted: int = 0, **moments: int) -> Measured:
     told = {"down": DOWN, "end": END, **{name.replace("_", " "): at for name, at in moments.items()}}
     tables = {
-        "flows": Table(("flow", "sequence", "due_ns", "came_ns"), rows),
-        "moments": Table(("what", "at_ns"), list(told.items())),
+        "flows": frame(("flow", "sequence", "due_ns", "came_ns"), rows),
+        "moments": frame(("what", "at_ns"), list(told.items())),
     }
     return Measured(tables, {"by_hand": restarted, "rate": RATE})
 

@@ -62,8 +62,8 @@ def test_round_is_asked_for_and_its_lateness_read(node: Callable[[str], Process]
     source = node(SOURCE)
     begun = flow.begin(source, tmp_path, size=64, rate=50.0, count=3)
     sent = flow.sent(begun)
-    assert sent.columns == ("sequence", "late_ns")
-    assert list(sent.rows) == [(0, 0), (1, 1000), (2, 2000)]
+    assert list(sent.columns) == ["sequence", "late_ns"]
+    assert list(sent.itertuples(index=False, name=None)) == [(0, 0), (1, 1000), (2, 2000)]
     assert source.events("sent")[0]["asked"] == ["64", "50.0"]
     assert begun.seconds == pytest.approx(0.06)
     assert not list(tmp_path.iterdir())
@@ -81,14 +81,18 @@ def test_rounds_have_numbers_of_their_own_and_are_not_mixed_up(
     sources = [node(SOURCE) for _ in range(2)]
     begun = [flow.begin(source, tmp_path, size=64, rate=100.0, count=2 + at) for at, source in enumerate(sources * 2)]
     assert len({one.number for one in begun}) == 4
-    assert [len(flow.sent(one).rows) for one in reversed(begun)] == [5, 4, 3, 2]
+    assert [len(flow.sent(one)) for one in reversed(begun)] == [5, 4, 3, 2]
 
 
 def test_what_came_is_read_by_topic(node: Callable[[str], Process], tmp_path: Path) -> None:
     sink = node(SINK)
     came = flow.noted(sink, ["/cmd", "/vel"], tmp_path, 7, settle=0.25)
-    assert came.columns == ("topic", "sequence", "due_ns", "came_ns")
-    assert list(came.rows) == [("/cmd", 0, 100, 150), ("/vel", 0, 100, 180), ("/cmd", 1, 200, 260)]
+    assert list(came.columns) == ["topic", "sequence", "due_ns", "came_ns"]
+    assert list(came.itertuples(index=False, name=None)) == [
+        ("/cmd", 0, 100, 150),
+        ("/vel", 0, 100, 180),
+        ("/cmd", 1, 200, 260),
+    ]
     assert sink.events("noted") == [{"event": "noted", "round": 7, "count": 3, "settle": 0.25}]
     assert not list(tmp_path.iterdir())
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from lab.bed.plan import Plan
 from lab.experiments.images import EXPERIMENT, bits, bytes_per_second
-from lab.experiments.model import Cell, Claim, Findings, Measured, Plan, Results, Table
+from lab.experiments.model import Cell, Measured, Results
+from lab.findings import Claim, Findings
+from lab.frames import frame
 
 MB = 1024 * 1024
 PERIOD = 10_000_000
@@ -22,8 +25,8 @@ def measured(beside_ms: list[float], *, link: str = "100mbit", image_ms: float =
     count = int(len(beside_ms) * 10 / image_ms)
     pictures = [(n, int(n * image_ms * 1e6), int((n + 2) * image_ms * 1e6)) for n in range(count)]
     tables = {
-        "commands": Table(("beside", "sequence", "due_ns", "came_ns"), commands),
-        "images": Table(("sequence", "due_ns", "came_ns"), pictures),
+        "commands": frame(("beside", "sequence", "due_ns", "came_ns"), commands),
+        "images": frame(("sequence", "due_ns", "came_ns"), pictures),
     }
     return Measured(tables, {"link": link, "alone": 500, "beside": len(beside_ms) + 3, "images": count + 7})
 
@@ -94,9 +97,9 @@ def test_the_tables_count_what_never_came() -> None:
 
 def test_a_message_that_came_twice_counts_once() -> None:
     told = measured([0.5] * 1000)
-    rows = list(told.tables["commands"].rows)
+    rows = list(told.tables["commands"].itertuples(index=False, name=None))
     doubled = Measured(
-        {**told.tables, "commands": Table(told.tables["commands"].columns, [*rows, rows[-1]])}, told.facts
+        {**told.tables, "commands": frame(told.tables["commands"].columns, [*rows, rows[-1]])}, told.facts
     )
     beside = findings((cell("rmpa"), doubled)).grids[0].rows[3]
     assert beside[8] == "1000"

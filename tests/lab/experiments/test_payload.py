@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.experiments.model import Cell, Measured, Plan, Results, Table
+from lab.bed.plan import Plan
+from lab.experiments.model import Cell, Measured, Results
 from lab.experiments.payload import EXPERIMENT, SIZES, UNSHAPED, bits_per_second, name, steps
+from lab.frames import frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -22,8 +24,8 @@ def made(latency_us: Callable[[int, int], float], count: int = 20) -> Measured:
     sent = [(size, n, 0) for size in SIZES["full"] for n in range(count)]
     return Measured(
         {
-            "arrivals": Table(("size", "sequence", "due_ns", "came_ns"), came),
-            "sent": Table(("size", "sequence", "late_ns"), sent),
+            "arrivals": frame(("size", "sequence", "due_ns", "came_ns"), came),
+            "sent": frame(("size", "sequence", "late_ns"), sent),
         }
     )
 

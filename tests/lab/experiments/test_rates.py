@@ -6,13 +6,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.experiments.model import Cell, Measured, Plan, Results, Table
+from lab.bed.plan import Plan
+from lab.experiments.model import Cell, Measured, Results
 from lab.experiments.rates import EXPERIMENT, PAPER
+from lab.frames import frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from lab.experiments.model import Grid
+    from lab.findings import Grid
 
 FULL = Plan(clients=("roscpp",))
 US = 1000
@@ -26,8 +28,8 @@ def made(counts: Mapping[int, int], latency_us: Callable[[int, int], int]) -> Me
     sent = [(rate, n, 0) for rate, count in counts.items() for n in range(count)]
     return Measured(
         {
-            "arrivals": Table(("rate", "sequence", "due_ns", "came_ns"), came),
-            "sent": Table(("rate", "sequence", "late_ns"), sent),
+            "arrivals": frame(("rate", "sequence", "due_ns", "came_ns"), came),
+            "sent": frame(("rate", "sequence", "late_ns"), sent),
         }
     )
 
@@ -114,8 +116,8 @@ def test_what_never_came_is_counted() -> None:
     def measure(_: Cell) -> Measured:
         whole = made(LADDER, ramp(1))
         arrivals = whole.tables["arrivals"]
-        kept = [row for row in arrivals.rows if row[:2] != (10, 7)]
-        return Measured({**whole.tables, "arrivals": Table(arrivals.columns, kept)})
+        kept = [row for row in arrivals.itertuples(index=False, name=None) if row[:2] != (10, 7)]
+        return Measured({**whole.tables, "arrivals": frame(arrivals.columns, kept)})
 
     (grid,) = EXPERIMENT.findings(run(FULL, measure)).grids
     rows = rows_of(grid)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.experiments.model import Plan
+from lab.bed.plan import Plan
 from lab.experiments.registry import EXPERIMENTS, find_experiment
 from lab.experiments.store import Store
 from rmpa.core.errors import ConfigError

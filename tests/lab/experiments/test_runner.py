@@ -9,16 +9,17 @@ from typing import TYPE_CHECKING
 import pytest
 
 from lab.bed.processes import BedError
-from lab.experiments.model import Measured, Table
+from lab.experiments.model import Measured
 from lab.experiments.runner import ATTEMPTS, Outcome, run, to_measure
 from lab.experiments.store import Store
+from lab.frames import frame
 from tests.lab.experiments.fakes import CODE, MACHINE, PLAN, FakeExperiment, no_stage
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from lab.bed.system import Stage
+    from lab.bed.stage import Stage
     from lab.experiments.model import Cell
 
 
@@ -61,7 +62,7 @@ def test_all_cells_are_measured_in_their_order_and_kept(store: Store) -> None:
     ]
     again = Store.load(store.directory)
     assert again.names == ["one", "two"]
-    assert [measured.tables["rates"].rows[0] for _, measured in again.results("one").cells] == [
+    assert [tuple(measured.tables["rates"].loc[0]) for _, measured in again.results("one").cells] == [
         ("/cmd", 10),
         ("/cmd", 10),
         ("/cmd", 20),
@@ -73,9 +74,9 @@ def test_all_cells_are_measured_in_their_order_and_kept(store: Store) -> None:
 def test_how_late_the_machine_wakes_is_kept_with_each_cell(store: Store) -> None:
     measure(store, FakeExperiment())
     for _, measured in store.results("fake").cells:
-        assert measured.tables["lateness"] == Table(
-            ("when", "late_us"), [("before", 0.3), ("before", 12.3), ("after", 0.3), ("after", 12.3)]
-        )
+        late = measured.tables["lateness"]
+        assert late["when"].tolist() == ["before", "before", "after", "after"]
+        assert late["late_us"].tolist() == [0.3, 12.3, 0.3, 12.3]
 
 
 def test_a_cell_that_fails_once_is_repeated(store: Store) -> None:
@@ -149,7 +150,7 @@ def test_some_cells_now_and_the_others_later(store: Store) -> None:
 
 def test_a_table_of_the_runners_name_is_a_mistake(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     def clashing(_self: FakeExperiment, _cell: Cell, _stage: Stage) -> Measured:
-        return Measured({"lateness": Table(("x",), [])})
+        return Measured({"lateness": frame(("x",), [])})
 
     monkeypatch.setattr(FakeExperiment, "measure", clashing)
     outcome, _ = measure(store, FakeExperiment(rates=(10,)))

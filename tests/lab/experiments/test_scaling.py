@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from lab.experiments.model import Cell, Findings, Measured, Plan, Results, Table, Value
+from lab.bed.plan import Plan
+from lab.experiments.model import Cell, Measured, Results, Value
 from lab.experiments.scaling import EXPERIMENT
+from lab.findings import Findings
+from lab.frames import frame
 
 
 def cell(system: str, modules: int) -> Cell:
@@ -20,11 +23,11 @@ def measured(latency_ms: float, idle: list[float], linked: list[float | None], m
     columns = ("host", "tx_bytes_per_s", "rx_bytes_per_s", "tx_packets_per_s", "rx_packets_per_s")
     return Measured(
         {
-            "joins": Table(("ready_s", "linked_s", "first_s"), [(0.1, one, 0.5) for one in linked]),
-            "processes": Table(("while", "process", "cpu_percent", "rss_bytes"), processes),
-            "traffic": Table(columns, traffic),
-            "arrivals": Table(("sequence", "due_ns", "came_ns"), arrivals),
-            "sent": Table(("sequence", "late_ns"), [(n, 0) for n in range(messages + 2)]),
+            "joins": frame(("ready_s", "linked_s", "first_s"), [(0.1, one, 0.5) for one in linked]),
+            "processes": frame(("while", "process", "cpu_percent", "rss_bytes"), processes),
+            "traffic": frame(columns, traffic),
+            "arrivals": frame(("sequence", "due_ns", "came_ns"), arrivals),
+            "sent": frame(("sequence", "late_ns"), [(n, 0) for n in range(messages + 2)]),
         }
     )
 
@@ -66,7 +69,9 @@ def test_master_and_helpers_are_one() -> None:
     told = measured(0.2, [], [None])
     processes = told.tables["processes"]
     rows = [("idle", f"{name}@pc", percent, 1) for name, percent in (("roscore", 0.1), ("master", 0.4))]
-    both = Measured({**told.tables, "processes": Table(processes.columns, [*processes.rows, *rows])})
+    both = Measured(
+        {**told.tables, "processes": frame(processes.columns, [*processes.itertuples(index=False, name=None), *rows])}
+    )
     grid = EXPERIMENT.findings(Results(Plan(), [(cell("classic", 2), both)])).grids[0]
     row = dict(zip(grid.columns, grid.rows[0], strict=True))
     assert (row["idle: % of a core, mean"], row["most"], row["all"]) == ("0.5", "0.5", "0.5")

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 
 import msgspec
 import pytest
+from pandas.testing import assert_frame_equal
 
-from lab.experiments.model import Cell, Measured, Table
+from lab.experiments.model import Cell, Measured
 from lab.experiments.store import Store, is_run_directory
+from lab.frames import frame
 from rmpa.core.errors import ConfigError, StartError
 from tests.lab.experiments.fakes import CODE, MACHINE, PLAN, FakeExperiment
 
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
 
 CELLS = FakeExperiment().cells(PLAN)
 MEASURED = Measured(
-    {"samples": Table(("topic", "due_ns"), [("/cmd", 1), ("/vel", 2)])},
+    {"samples": frame(("topic", "due_ns"), [("/cmd", 1), ("/vel", 2)])},
     {"lost": 3, "worst": 0.5, "fine": True, "why": None},
 )
 
@@ -42,7 +44,9 @@ def test_what_was_kept_is_read_again(store: Store) -> None:
     assert again.manifest.code == CODE
     results = again.results("fake")
     assert [cell for cell, _ in results.cells] == [CELLS[0], CELLS[2]]  # in the order in which they were planned
-    assert all(measured == MEASURED for _, measured in results.cells)
+    for _, measured in results.cells:
+        assert measured.facts == MEASURED.facts
+        assert_frame_equal(measured.tables["samples"], MEASURED.tables["samples"])
     assert [(one.settings, one.error, one.attempts) for one in again.failed("fake")] == [
         (CELLS[1].settings, "BedError: no", 2)
     ]
@@ -74,7 +78,7 @@ def test_a_cell_counts_once_the_manifest_says_so(store: Store, monkeypatch: pyte
 
 def test_a_table_that_csv_cannot_hold_leaves_the_cell_undone(store: Store) -> None:
     with pytest.raises(ValueError, match="column a holds int, str"):
-        store.keep(CELLS[0], Measured({"x": Table(("a",), [(1,), ("b",)])}))
+        store.keep(CELLS[0], Measured({"x": frame(("a",), [(1,), ("b",)])}))
     assert not store.is_done(CELLS[0])
 
 

@@ -5,28 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from lab.bed.plan import Plan
 from lab.experiments.code import Code
-from lab.experiments.model import (
-    Cell,
-    Claim,
-    Figure,
-    Findings,
-    Grid,
-    Measured,
-    Panel,
-    Plan,
-    Results,
-    Series,
-    Table,
-)
+from lab.experiments.model import Cell, Measured, Results
 from lab.experiments.store import Store
+from lab.findings import Claim, Figure, Findings, Grid, Panel, Series
+from lab.frames import frame
 from rmpa.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from lab.bed.system import Stage
+    from lab.bed.stage import Stage
 
 MACHINE = {"cpu": "Some | CPU", "cores": 2, "kernel": "6.1", "load": [0.5, 0.2, 0.1]}
 
@@ -70,7 +61,7 @@ class Latencies:
 
 
 def _latencies(measured: Measured) -> list[float]:
-    return [float(str(value)) for value in measured.tables["arrivals"].column("late_ms")]
+    return [float(str(value)) for value in measured.tables["arrivals"]["late_ms"].tolist()]
 
 
 @dataclass
@@ -106,8 +97,8 @@ def make_run(
             if cell.settings["system"] not in names:
                 continue
             top = largest if cell.settings["system"] == "rmpa" else 1.5
-            table = Table(("sequence", "late_ms"), [(0, 1.0), (1, top), (2, 1.25)])
-            late = Table(("when", "late_us"), [("before", 60.0), ("after", 75.5)] * 10)
+            table = frame(("sequence", "late_ms"), [(0, 1.0), (1, top), (2, 1.25)])
+            late = frame(("when", "late_us"), [("before", 60.0), ("after", 75.5)] * 10)
             store.keep(cell, Measured({"arrivals": table, "lateness": late}), seconds=3.0)
         if fail:
             store.note_failure(cells[0], "no answer <script>", attempts=2)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import msgspec
 import pytest
 
-from lab.experiments.model import Plan
+from lab.bed.plan import Plan
 from lab.experiments.report.compare import ComparedClaim, Difference, compare
 from rmpa.core.errors import ConfigError
 from tests.lab.experiments.report.runs import MACHINE, Known, Latencies, make_run

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from lab.experiments.model import Plan
-from lab.experiments.report import figures, write_report
+from lab.bed.plan import Plan
+from lab.experiments.report import write_report
 from rmpa.core.errors import ConfigError
 from tests.lab.experiments.report.runs import Known, Latencies, make_run
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 
 def test_the_page_has_claims_figures_tables_and_the_manifest(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
     written = write_report(make_run(tmp_path / "run"), Known())
     page = written.markdown.read_text(encoding="utf-8")
     assert "Of 3 claims: 1 reached, 1 not reached, 1 with too few samples to say." in page
@@ -67,7 +66,6 @@ class _Page(HTMLParser):
 
 
 def test_html_is_one_file_whose_links_lead_somewhere(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
     written = write_report(make_run(tmp_path / "run", fail=True), Known())
     page = _Page(written.html.read_text(encoding="utf-8"))
     (source,) = page.sources
@@ -82,7 +80,6 @@ def test_html_is_one_file_whose_links_lead_somewhere(tmp_path: Path) -> None:
 
 
 def test_the_same_samples_give_the_same_bytes(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
     run = make_run(tmp_path / "run")
 
     def contents() -> dict[str, bytes]:
@@ -93,7 +90,6 @@ def test_the_same_samples_give_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_figures_of_an_earlier_report_go(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
     run = make_run(tmp_path / "run")
     old = run / "report" / "figures" / "old.svg"
     old.parent.mkdir(parents=True)
@@ -121,21 +117,7 @@ def test_the_page_says_what_could_not_be_measured(tmp_path: Path) -> None:
     assert "> **Incomplete**: 1 cell not measured yet." in page
 
 
-def test_without_matplotlib_there_is_all_but_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(figures, "find_spec", lambda _: None)
-    written = write_report(make_run(tmp_path / "run"), Known())
-    assert written.figures == ()
-    assert "pip install 'rmpa[experiments]'" in written.missing
-    page = written.markdown.read_text(encoding="utf-8")
-    assert "✗ **not reached**" in page
-    assert "> **Left out**: figures (matplotlib is not installed: pip install 'rmpa[experiments]')" in page
-    assert "![" not in page
-
-
-def test_findings_that_fail_do_not_take_the_others_away(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(figures, "find_spec", lambda _: None)
+def test_findings_that_fail_do_not_take_the_others_away(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     written = write_report(make_run(tmp_path / "run"), Known({"rates": Latencies(broken=True)}))
     assert "findings of rates (ZeroDivisionError: made so)" in written.missing
     assert "> **No findings**: ZeroDivisionError: made so" in written.markdown.read_text(encoding="utf-8")

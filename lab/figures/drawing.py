@@ -1,16 +1,15 @@
 """Figures as files: panels in rows, the legend below, and beside them how late the host woke up meanwhile.
 
-matplotlib (the extra ``experiments``) is loaded when something is drawn. The same data gives the same bytes.
+matplotlib is loaded when something is drawn. The same data gives the same bytes.
 """
 
 from __future__ import annotations
 
 import textwrap
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final
 
-from lab.experiments.report import panels
-from lab.experiments.report.colours import looks
+from lab.figures import panels
+from lab.figures.colours import looks
 from lab.samples import percentile
 
 if TYPE_CHECKING:
@@ -23,8 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.gridspec import GridSpec
     from matplotlib.legend import Legend
 
-    from lab.experiments.model import Figure, Panel
-    from lab.experiments.report.panels import Drawn
+    from lab.figures.panels import Drawn
+    from lab.findings import Figure, Panel
 
 _WIDTH: Final = 9.6
 """Inches; shown 830 pixels wide, as on a project's page, a letter of 9 points is 11 pixels high."""
@@ -49,11 +48,6 @@ _STYLE: Final[dict[Any, Any]] = {  # keys of matplotlib's own type, which differ
     "path.simplify": True,
     "hatch.linewidth": 0.6,
 }
-
-
-def missing() -> str:
-    """Return what must be installed before anything can be drawn; empty if nothing."""
-    return "" if find_spec("matplotlib") else "pip install 'rmpa[experiments]'"
 
 
 def draw(figure: Figure, lateness: Sequence[float], directory: Path) -> tuple[Path, Path]:

@@ -12,18 +12,19 @@ from rich.console import Console
 from lab.bed.bench import Bed
 from lab.bed.processes import Deadline, Process
 from lab.bed.ros import NODES
-from lab.bench import peers
-from lab.bench.peers import FIELD, Entry, Score
+from lab.bench import contenders
+from lab.bench.contenders import ENTRIES, PEERS, Entry
+from lab.bench.roundtrips import TripScore, rows, start_all
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     import pytest
 
-    from lab.bench.contenders import Contender
+    from lab.bench.contenders import RoundTripPath
 
 
-def unstartable(_bed: Bed) -> Contender:
+def unstartable(_bed: Bed) -> RoundTripPath:
     raise Deadline("it said nothing")
 
 
@@ -39,29 +40,28 @@ def test_the_first_reason_is_told() -> None:
 
 
 def test_what_does_not_start_is_left_out_and_the_rest_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        peers, "FIELD", {"dead": Entry(unstartable), "missing": Entry(unstartable, "no_such_library")}
-    )
+    monkeypatch.setitem(contenders.ENTRIES, "dead", Entry(unstartable))
+    monkeypatch.setitem(contenders.ENTRIES, "missing", Entry(unstartable, "no_such_library"))
     left_out: dict[str, str] = {}
     with Bed() as bed:
-        assert peers._start(bed, left_out, Console(file=io.StringIO())) == []
+        assert start_all(bed, ["dead", "missing"], left_out, Console(file=io.StringIO())) == []
     assert left_out.keys() == {"dead", "missing"}
     assert "it said nothing" in left_out["dead"]
 
 
 def test_each_is_compared_with_roscpp_and_ours_with_it() -> None:
     scores = {
-        (key, 64): Score(array("Q", [2000 * us] * 10))
+        (key, 64): TripScore(array("Q", [2000 * us] * 10))
         for key, us in (("roscpp_nodelay", 50), ("agents_hosts", 80), ("zenoh", 40))
     }
     titles = {"roscpp_nodelay": "roscpp", "zenoh": "zenoh"}
-    rows = {row["contender"]: (row["to_roscpp"], row["agents_to_it"]) for row in peers._rows(scores, titles)}
-    assert rows == {"roscpp_nodelay": (1.0, 1.6), "zenoh": (0.8, 2.0)}
+    found = {row["contender"]: (row["to_roscpp"], row["agents_to_it"]) for row in rows(scores, titles)}
+    assert found == {"roscpp_nodelay": (1.0, 1.6), "zenoh": (0.8, 2.0)}
 
 
 def test_everybody_of_the_issue_takes_part() -> None:
     wanted = {"floor_c", "floor_python", "roscpp_nodelay", "roscpp_nagle", "rospy_nodelay", "rospy_nagle"}
-    assert FIELD.keys() >= wanted | {"zenoh", "cyclonedds", "pyzmq", "agents_hosts"}
+    assert {*ENTRIES} >= {*PEERS} >= wanted | {"zenoh", "cyclonedds", "pyzmq", "agents_hosts"}
 
 
 def test_a_ping_answers_lines_with_samples_and_losses(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from lab.experiments.model import Series
+    from lab.findings import Series
 
 _SYSTEMS: Final = {"classic": "#D55E00", "rmpa": "#0072B2"}
 _OTHERS: Final = ("#009E73", "#CC79A7", "#56B4E9", "#E69F00")
@@ -48,7 +48,7 @@ def looks(series: Iterable[Series]) -> dict[str, Look]:
         else:
             colour = _OTHERS[turn % len(_OTHERS)]
         markers = _MARKERS.get(one.system, _OTHER_MARKERS)
-        found[one.label] = Look(colour, _LINES[turn % len(_LINES)], markers[turn % len(markers)])
+        found[one.label] = Look(colour, _LINES[(turn + turn // 4) % len(_LINES)], markers[turn % len(markers)])
     return found
 
 

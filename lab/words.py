@@ -6,7 +6,9 @@ import re
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from lab.experiments.model import Claim
+    from collections.abc import Iterable, Sequence
+
+    from lab.findings import Claim
 
 _VERDICTS: Final = {True: "✓ reached", False: "✗ **not reached**", None: "? too few samples to say"}
 _OUTSIDE_SLUGS: Final = re.compile(r"[^\w\- ]")
@@ -19,6 +21,11 @@ def number(value: float | None, digits: int = 3) -> str:
     if value == 0 or 1e-4 <= abs(value) < 10 ** (digits - 1):
         return f"{value:.{digits}g}"
     return f"{value:,.0f}" if 1 <= abs(value) < 1e9 else f"{value:.{digits - 1}e}"
+
+
+def counted(value: float | None, digits: int = 3, factor: float = 1.0) -> str:
+    """A figure for a table, in another unit if a factor is given; a dash for what is not known."""
+    return number(None if value is None else value * factor, digits)
 
 
 def quantity(value: float | None, unit: str = "", digits: int = 3) -> str:
@@ -73,14 +80,15 @@ def plain(text: object) -> str:
     return re.sub(r"([\\`*_\[\]<>|#])", r"\\\1", line)
 
 
-def table_row(cells: list[str]) -> str:
+def table_row(cells: Sequence[str]) -> str:
     """A row of a Markdown table."""
     kept = [re.sub(r"(?<!\\)\|", r"\\|", " ".join(cell.split())) for cell in cells]
     return f"| {' | '.join(kept)} |"
 
 
-def table(columns: list[str], rows: list[list[str]]) -> str:
+def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A Markdown table; the first column is to the left, others too if they hold anything but figures."""
+    rows = list(rows)
     figures = [at > 0 and all(_is_figure(row[at]) for row in rows) for at in range(len(columns))]
     rule = "|" + "|".join("---:" if right else "---" for right in figures) + "|"
     return "\n".join([table_row(columns), rule, *map(table_row, rows)])

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from lab.experiments.model import Claim
-from lab.experiments.report import words
+from lab import words
+from lab.findings import Claim
 
 
 @pytest.mark.parametrize(

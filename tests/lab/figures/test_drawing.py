@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from lab.experiments.model import Figure, Panel, Series
-from lab.experiments.report.colours import looks, shade
+from lab.figures.colours import looks, shade
+from lab.findings import Figure, Panel, Series
 
 pytest.importorskip("matplotlib")
 from matplotlib.figure import Figure as Canvas
 
-from lab.experiments.report import panels
-from lab.experiments.report.figures import draw
-from lab.experiments.report.panels import Drawn, settle, thinned
+from lab.figures import panels
+from lab.figures.drawing import draw
+from lab.figures.panels import Drawn, settle, thinned
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
