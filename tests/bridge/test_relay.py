@@ -279,11 +279,11 @@ def test_the_way_is_told_and_what_came_round_is_not_shown() -> None:
     ways = RelayPaths()
     ways.instance = instance(9)
     ways.linked(1, LinkedPeer("r", instance(2), Guid(2)))
-    assert not ways.learn(1, origin(9, 2))
+    assert not ways.add(1, origin(9, 2))
     assert ways.why_not(1, origin(9, 2)) == "it is ours, and came back by a relay"
-    assert not ways.learn(1, origin(1, 9, 2))
+    assert not ways.add(1, origin(1, 9, 2))
     assert ways.why_not(1, origin(1, 9, 2)) == "we passed it on ourselves"
-    assert ways.learn(1, origin(1, 2))
+    assert ways.add(1, origin(1, 2))
     assert not ways.why_not(1, origin(1, 2))
-    assert ways.forget(1, origin(1, 2))
+    assert ways.remove(1, origin(1, 2))
     assert list(ways) == []

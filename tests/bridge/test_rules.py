@@ -91,7 +91,7 @@ def learn(imports: Imports, *names: str, peer: int = 1, node: str = "/n") -> lis
 
 
 def changed(imports: Imports, side: Side) -> list[Action]:
-    return [a for actions in imports.rules(side.policy, side.contracts, side.names, 0.0) for a in actions]
+    return [a for actions in imports.apply_rules(side.policy, side.contracts, side.names, 0.0) for a in actions]
 
 
 # --- outbound -------------------------------------------------------------------------------------------------------
@@ -172,14 +172,14 @@ def test_new_rules_end_and_begin_what_they_are_about_and_nothing_else() -> None:
         exports.described(Source(topic, "/n"), ABOUT)
     rule = PeerRule("robot*", "", (), (Remap("/b", "/bee"),), PolicySettings(deny=("/c",)))
     new = Side(rule)
-    actions = exports.rules(new.policy, new.contracts, new.names) + say(exports, "/a", "/b", "/c")
+    actions = exports.apply_rules(new.policy, new.contracts, new.names) + say(exports, "/a", "/b", "/c")
     assert [(a.peer, a.source.topic) for a in actions if isinstance(a, RemoveRoute)] == [(1, "/b"), (1, "/c")]
     assert [a.peer for a in actions if isinstance(a, Send)] == [1, 1, 1]
     assert sorted(offered(actions)) == [("+", "/bee"), ("-", "/b"), ("-", "/c")]
     assert not any(isinstance(action, Disconnect) for action in actions)
     assert exports.flowing(Source("/a", "/n")) == (1, 2)
     back = Side()
-    actions = exports.rules(back.policy, back.contracts, back.names) + say(exports, "/a", "/b", "/c")
+    actions = exports.apply_rules(back.policy, back.contracts, back.names) + say(exports, "/a", "/b", "/c")
     assert sorted(offered(actions)) == [("+", "/b"), ("+", "/c"), ("-", "/bee")]
 
 
@@ -188,7 +188,7 @@ def test_the_policy_for_all_can_change_too() -> None:
     exports.link_up(1, "base")
     say(exports, "/a", "/b")
     new = Side(policy=PolicySettings(deny=("/b",)))
-    assert exports.rules(new.policy, new.contracts, new.names) == []
+    assert exports.apply_rules(new.policy, new.contracts, new.names) == []
     assert offered(say(exports, "/a", "/b")) == [("-", "/b")]
 
 
@@ -201,7 +201,7 @@ def test_a_route_whose_contract_changes_here_is_closed_so_that_its_peer_asks_aga
         exports.opened(1, OpenRoute(route, topic, "/n", asked))
         exports.described(Source(topic, "/n"), ABOUT)
     new = Side(contracts=(ContractRule(("/b",), (), {"depth": 7}),))
-    actions = exports.rules(new.policy, new.contracts, new.names)
+    actions = exports.apply_rules(new.policy, new.contracts, new.names)
     assert actions == [
         RemoveRoute(Source("/b", "/n"), 1, 2),
         Disconnect(Source("/b", "/n")),
@@ -209,7 +209,7 @@ def test_a_route_whose_contract_changes_here_is_closed_so_that_its_peer_asks_aga
     ]
     exports.opened(1, OpenRoute(3, "/b", "/n", asked))
     assert exports.contract(Source("/b", "/n"), 1) == replace(asked, depth=7)
-    assert exports.rules(new.policy, new.contracts, new.names) == []
+    assert exports.apply_rules(new.policy, new.contracts, new.names) == []
 
 
 # --- inbound --------------------------------------------------------------------------------------------------------
@@ -383,11 +383,11 @@ class World:
         self.rules[side] = rules
         new = Side(*rules)
         if side == 0:
-            self.act(self.exports.rules(new.policy, new.contracts, new.names))
+            self.act(self.exports.apply_rules(new.policy, new.contracts, new.names))
             for topic in TOPICS:
                 self.graph(topic)
         else:
-            for actions in self.imports.rules(new.policy, new.contracts, new.names, self.now):
+            for actions in self.imports.apply_rules(new.policy, new.contracts, new.names, self.now):
                 self.act(actions)
 
     def deliver(self) -> bool:

@@ -23,7 +23,7 @@ ADVERTISEMENT_MAX: Final = 1 * MIB
 """One advertisement, which is read in one piece: ours are 200 KB with the longest names, and 5 KB with usual ones."""
 ADVERTISED_WAITING_BYTES: Final = 4 * MIB
 """Advertisements of all peers that wait to be read: some 40,000 topics. Beyond it they are read at once."""
-LEARNT_AT_ONCE: Final = 16
+APPLIED_AT_ONCE: Final = 16
 """Sources of an advertisement that are dealt with at once, some 100 microseconds; then data goes first."""
 RESCANNED_AT_ONCE: Final = 16
 """Topics of the local graph that are looked at in one turn of the loop, after a change or to reconcile."""

@@ -163,7 +163,7 @@ class RelayPaths:
                     del self._origins[instance]
         return changed
 
-    def learn(self, peer: int, origin: Origin) -> bool:
+    def add(self, peer: int, origin: Origin) -> bool:
         """A peer offers one more source of a module; whether that is now reached another way."""
         if self._ours(origin) or peer not in self._linked:
             return False
@@ -174,7 +174,7 @@ class RelayPaths:
         known.ways[peer] = [count + 1, len(origin.path)]
         return self._best(origin.instance) != before
 
-    def forget(self, peer: int, origin: Origin) -> bool:
+    def remove(self, peer: int, origin: Origin) -> bool:
         """A peer offers one source of a module less; whether that is now reached another way."""
         known = self._origins.get(origin.instance)
         if known is None or self._ours(origin) or peer not in known.ways:

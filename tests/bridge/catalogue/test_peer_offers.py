@@ -22,7 +22,7 @@ def changes(
 
 
 def test_long_advertisements_are_split_and_removals_go_first() -> None:
-    many = tuple(f"/{number:03}" for number in range(limits.LEARNT_AT_ONCE + 1))
+    many = tuple(f"/{number:03}" for number in range(limits.APPLIED_AT_ONCE + 1))
     assert changes(offers(), *many, removed=("/gone",)) == [
         Change(removed=("/gone",)),
         Change(added=many[:-1]),

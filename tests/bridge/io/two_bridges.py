@@ -44,7 +44,7 @@ SMALL_LIMITS: Final = MappingProxyType(
         "ACK_MESSAGES": 4,
         "ACK_BYTES": 1500,
         "ADVERTISED_AT_ONCE": 2,
-        "LEARNT_AT_ONCE": 2,
+        "APPLIED_AT_ONCE": 2,
     }
 )
 """What makes a message of some hundred bytes a large one, and a few of them many."""

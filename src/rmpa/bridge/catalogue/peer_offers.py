@@ -74,7 +74,7 @@ class PeerOffers(Generic[WireT, EntryT, OfferT]):
         if self.doubtful and not more:
             removed += tuple(sorted(self.doubtful))  # type: ignore[type-var] # names are in order
             self.doubtful = set()
-        step = limits.LEARNT_AT_ONCE
+        step = limits.APPLIED_AT_ONCE
         for begin in range(0, len(removed), step):
             yield Change(removed=removed[begin : begin + step])
         for begin in range(0, len(added), step):

@@ -203,7 +203,7 @@ class ServiceExports:
             self._seen[service] = server
         return self._judge(service)
 
-    def obey(self, rules: ServiceRules, most: LimitSettings = _DEFAULT_LIMITS) -> Iterator[list[ExportAction]]:
+    def apply_rules(self, rules: ServiceRules, most: LimitSettings = _DEFAULT_LIMITS) -> Iterator[list[ExportAction]]:
         """Other rules hold from now on; what they do not touch goes on.
 
         Returns:

@@ -295,7 +295,7 @@ class ServiceImports:
             actions += self._remove(peer, wire, f"its server at {known.name} has gone")
         for offer in change.added:
             actions += self._offer(peer, known, offer)
-        admitted = islice(self._admit(peer), limits.LEARNT_AT_ONCE)
+        admitted = islice(self._admit(peer), limits.APPLIED_AT_ONCE)
         return actions + [action for one in admitted for action in one]
 
     def advertised(self, peer: int, message: AdvertiseServices) -> list[ImportAction]:
@@ -322,7 +322,7 @@ class ServiceImports:
             return [Warn("services.too_many", known.name, text)]
         name = self._rules.local_name(offer.origin.name if offer.origin else known.name, offer.service)
         remote = known.entries[offer.service] = RemoteService(offer.service, offer.node, name, origin=offer.origin)
-        if offer.origin is not None and self.ways.learn(peer, offer.origin):
+        if offer.origin is not None and self.ways.add(peer, offer.origin):
             actions += self._choose_of({offer.origin.instance})
         if not is_crossing_name(name):
             remote.hidden = f"the rules of names make {name!r} of it"
@@ -342,7 +342,7 @@ class ServiceImports:
         known.nodes.leave(remote.node, remote.name)
         # Our words may have crossed: what we asked for last is open over there, for another server perhaps.
         actions = self._release(peer, remote, reason)
-        another_way = remote.origin is not None and self.ways.forget(peer, remote.origin)
+        another_way = remote.origin is not None and self.ways.remove(peer, remote.origin)
         if remote.shown:
             remote.shown = False
             actions.append(Withdraw(peer, remote.name, remote.node, reason))
@@ -377,7 +377,7 @@ class ServiceImports:
             self._local[service] = node
         return self._choose(service) if service in self._claims else []
 
-    def obey(self, rules: ServiceRules, most: LimitSettings = _DEFAULT_LIMITS) -> Iterator[list[ImportAction]]:
+    def apply_rules(self, rules: ServiceRules, most: LimitSettings = _DEFAULT_LIMITS) -> Iterator[list[ImportAction]]:
         """Other rules hold from now on; what they do not touch goes on.
 
         Returns:

@@ -178,9 +178,9 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
             self._on_told()
         if self._advertisements:
             self._apply_next()
-        if self._freeing and not tuple(islice(self._freeing[0], limits.LEARNT_AT_ONCE)):
+        if self._freeing and not tuple(islice(self._freeing[0], limits.APPLIED_AT_ONCE)):
             self._freeing.popleft()
-        rejudged = tuple(islice(self._rejudging, limits.LEARNT_AT_ONCE))
+        rejudged = tuple(islice(self._rejudging, limits.APPLIED_AT_ONCE))
         # In one: actions of data that is handled in between belong behind all of these.
         self.act([action for actions in rejudged for action in actions])
         if self._changed or self._advertisements or self._freeing or rejudged or (told and self._exports.untold):

@@ -226,7 +226,7 @@ class Exports:
         """Whether a peer has not been told everything once since its link is up."""
         return self._catalogue.beginning(peer)
 
-    def rules(
+    def apply_rules(
         self, policy: Policy, contracts: Contracts, names: Names, most: LimitSettings = _DEFAULT_LIMITS
     ) -> list[Action]:
         """Other rules hold from now on; what they leave as it is goes on untouched.

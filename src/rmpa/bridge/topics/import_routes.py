@@ -175,7 +175,7 @@ class ImportRoutes:
     def handle_timer(self, now: float) -> list[Action]:
         """Do what is due, or a part of it: then ``next_timer`` is due again at once."""
         actions: list[Action] = []
-        for _ in range(limits.LEARNT_AT_ONCE):
+        for _ in range(limits.APPLIED_AT_ONCE):
             if (due := self.next_timer()) is None or due > now:
                 break
             _, _, peer, source = heappop(self._timers)

@@ -176,7 +176,7 @@ class Imports:
             for offer in list(known.surplus):
                 yield peer, self._names_of(known, offer.origin).local_name(offer.topic, offer.type), offer
 
-    def rules(
+    def apply_rules(
         self, policy: Policy, contracts: Contracts, names: Names, now: float, most: LimitSettings = _DEFAULT_LIMITS
     ) -> Iterator[list[Action]]:
         """Other rules hold from now on; what they leave as it is goes on untouched.
@@ -197,7 +197,7 @@ class Imports:
     def _admit(self, peer: int, now: float) -> Iterator[list[Action]]:
         """Take in what was beyond ``limits.topics`` while there is room, one after the other."""
         while (known := self._peers.get(peer)) and (offer := known.admitted(self._most.topics)):
-            yield self._learn(peer, offer, now)
+            yield self._add(peer, offer, now)
 
     def _rejudge(self, peer: int, source: Source, now: float) -> list[Action]:
         entry = self.get(peer, source)
@@ -331,8 +331,8 @@ class Imports:
                 known.surplus.discard(source)
             actions += self._forget(peer, source)
         for offer in change.added:
-            actions += self._learn(peer, offer, now)
-        admitted = islice(self._admit(peer, now), limits.LEARNT_AT_ONCE)
+            actions += self._add(peer, offer, now)
+        admitted = islice(self._admit(peer, now), limits.APPLIED_AT_ONCE)
         return actions + [action for one in admitted for action in one]
 
     def advertised(self, peer: int, message: Advertise, now: float = 0.0) -> list[Action]:
@@ -369,7 +369,7 @@ class Imports:
             Send(peer, Mismatch(source.topic, source.node, subscriber, text)),
         ]
 
-    def _learn(self, peer: int, offer: TopicOffer, now: float) -> list[Action]:
+    def _add(self, peer: int, offer: TopicOffer, now: float) -> list[Action]:
         known = self._peers[peer].entries
         source = offer.source
         actions: list[Action] = []
@@ -390,7 +390,7 @@ class Imports:
         self._peers[peer].topics.setdefault(topic, {})[source] = None
         if offer.origin is not None:
             self._peers[peer].relayed.setdefault(offer.origin.instance, {})[source] = None
-            if self.ways.learn(peer, offer.origin):
+            if self.ways.add(peer, offer.origin):
                 actions += self._ways_changed({offer.origin.instance})
         actions += self._show_or_hide(peer, source, entry)
         if entry.crowded:
@@ -521,7 +521,7 @@ class Imports:
             del known.relayed[instance][source]
             if not known.relayed[instance]:
                 del known.relayed[instance]
-            if self.ways.forget(peer, entry.origin):
+            if self.ways.remove(peer, entry.origin):
                 actions += self._ways_changed({instance})
         return actions
 

@@ -136,7 +136,7 @@ class ParamServer:
         for number, (name, one) in enumerate(parameters):
             await self._core.set(name, one, PEERS)
             yield_to_data()
-            if number % limits.LEARNT_AT_ONCE == 0:
+            if number % limits.APPLIED_AT_ONCE == 0:
                 await asyncio.sleep(0)
         _log.info("< %s sets %d parameters at %s", session.link.name, len(parameters), key)
         return {"count": len(parameters)}

@@ -173,12 +173,14 @@ class Services(Part):
         """Other settings hold from now on."""
         policy, names = Policy(settings.policy, settings.peers, settings.time), Names(settings.peers)
         self._most = settings.limits
-        self.obey(ServiceRules(settings.services, policy, names))
+        self.apply_rules(ServiceRules(settings.services, policy, names))
 
-    def obey(self, rules: ServiceRules) -> None:
+    def apply_rules(self, rules: ServiceRules) -> None:
         """Other rules hold from now on; what they do not touch goes on."""
         self.rules = rules
-        self._driver.rejudge(chain(self.exports.obey(rules, self._most), self.imports.obey(rules, self._most)))
+        self._driver.rejudge(
+            chain(self.exports.apply_rules(rules, self._most), self.imports.apply_rules(rules, self._most))
+        )
         for shown in yielding_to_data(list(self._shown.values()), every=16):
             timeout, endpoint = rules.timeout(shown.service), shown.endpoint
             if endpoint is not None and endpoint.timeout != timeout:

@@ -187,8 +187,8 @@ class Topics(Part):
         policy, contracts = Policy(settings.policy, settings.peers, settings.time), Contracts(settings.contracts)
         self.names = Names(settings.peers)
         most, now = settings.limits, asyncio.get_running_loop().time()
-        self._act(self.exports.rules(policy, contracts, self.names, most))
-        self._driver.rejudge(self.imports.rules(policy, contracts, self.names, now, most))
+        self._act(self.exports.apply_rules(policy, contracts, self.names, most))
+        self._driver.rejudge(self.imports.apply_rules(policy, contracts, self.names, now, most))
         self._look_at_all()
 
     def remembered(self, identity: Identity) -> int | None:
