@@ -386,7 +386,7 @@ def test_our_own_services_beyond_the_limit_are_offered_when_there_is_room() -> N
     made.graph("/add", None)
     assert dict(made.offered) == {"/mul": mul}
     assert made.beyond.hidden == 0
-    told = [action.message for action in made.tell() if isinstance(action, Send)]
+    told = [action.message for action in made.advertise() if isinstance(action, Send)]
     assert told == [AdvertiseServices(added=(ServiceOffer("/mul", "/multiplier"),))]
     made.graph("/add", add)
     assert apply_rules(made, rules()) == []

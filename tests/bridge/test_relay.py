@@ -174,10 +174,10 @@ class Map:
     def settle(self) -> None:
         for _ in range(20_000):
             for here, module in self.modules.items():
-                while module.exports.untold:
-                    self.act(here, module.exports.tell())
-                while module.service_exports.untold:
-                    self.act(here, module.service_exports.tell())
+                while module.exports.pending:
+                    self.act(here, module.exports.advertise())
+                while module.service_exports.pending:
+                    self.act(here, module.service_exports.advertise())
             full = [wire for wire, waiting in self.wires.items() if waiting]
             if not full:
                 return

@@ -81,8 +81,8 @@ def say(exports: Exports, *names: str, node: str = "/n") -> list[Action]:
     actions: list[Action] = []
     for topic in (*exports.topics, *names):
         actions += exports.graph(topic, {node: LocalSource(TYPE, "http://127.0.0.1:4000/")} if topic in names else {})
-    while exports.untold:
-        actions += exports.tell()
+    while exports.pending:
+        actions += exports.advertise()
     return actions
 
 
@@ -127,8 +127,8 @@ def test_peers_with_rules_are_told_in_turn_and_all_others_at_once() -> None:
         exports.link_up(number, name)
     exports.graph("/a", {"/n": LocalSource(TYPE, "http://127.0.0.1:4000/")})
     told = []
-    while exports.untold:
-        told.append([action.peer for action in exports.tell() if isinstance(action, Send)])
+    while exports.pending:
+        told.append([action.peer for action in exports.advertise() if isinstance(action, Send)])
     assert told == [[1, 3, 4], [2]]
 
 
@@ -412,8 +412,8 @@ class World:
 
     def settle(self) -> None:
         for _ in range(200):
-            while self.deliver() or self.exports.untold:
-                self.act(self.exports.tell())
+            while self.deliver() or self.exports.pending:
+                self.act(self.exports.advertise())
             for source in list(self.connected):
                 self.act(self.exports.described(source, ABOUT))
             if not self.to_importer and not self.to_exporter:
@@ -429,7 +429,7 @@ class World:
             for _ in range(number):
                 self.deliver()
         elif what == "tell":
-            self.act(self.exports.tell())
+            self.act(self.exports.advertise())
         elif what == "describe":
             for source in list(self.connected):
                 self.act(self.exports.described(source, ABOUT))

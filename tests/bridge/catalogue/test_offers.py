@@ -32,10 +32,10 @@ def test_a_new_peer_is_told_everything_in_portions() -> None:
     changed(made, **{f"e{number:03}": 1 for number in range(limits.ADVERTISED_AT_ONCE + 2)})
     first = made.link_up(1, "far", "", judged=False)
     assert (len(first.added), first.more, first.complete) == (limits.ADVERTISED_AT_ONCE, True, False)
-    assert (made.untold, made.beginning(1)) == (True, True)
+    assert (made.pending, made.beginning(1)) == (True, True)
     [(peer, rest)] = made.portions(lambda _: True)
     assert (peer, len(rest.added), rest.more, rest.complete, rest.is_news) == (1, 2, False, True, True)
-    assert (made.untold, made.beginning(1)) == (False, False)
+    assert (made.pending, made.beginning(1)) == (False, False)
 
 
 def test_a_peer_that_is_not_ready_is_told_later() -> None:

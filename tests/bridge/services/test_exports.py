@@ -35,8 +35,8 @@ ROUTE = limits.SERVICE_ROUTES + 1
 
 def told(exports: ServiceExports, peer: int = 1) -> list[AdvertiseServices]:
     found = []
-    while exports.untold:
-        sent = [action.message for action in exports.tell() if isinstance(action, Send) and action.peer == peer]
+    while exports.pending:
+        sent = [action.message for action in exports.advertise() if isinstance(action, Send) and action.peer == peer]
         found += [message for message in sent if isinstance(message, AdvertiseServices)]
     return found
 

@@ -175,7 +175,7 @@ class World:
                 self.act(self.exports.refused(probe.service, "no answer"))
 
     def deliver(self, _service: str = "") -> bool:
-        self.act(self.exports.tell())
+        self.act(self.exports.advertise())
         if self.to_caller:
             self._to_caller(decode(self.to_caller.popleft()))
         elif self.to_server:

@@ -25,7 +25,7 @@ ABOUT = Description("a/B", "5a9ea5f83505693b71e785041e67a8bb", "", False)
 
 def driver(do: Callable[[Action], None]) -> GraphDriver[Action, Advertise]:
     refusals = SimpleNamespace(refuse=lambda *_: None)
-    plan = SimpleNamespace(untold=False, tell=lambda _: (), next_timer=lambda: None, handle_timer=lambda _: ())
+    plan = SimpleNamespace(pending=False, advertise=lambda _: (), next_timer=lambda: None, handle_timer=lambda _: ())
     return GraphDriver(
         cast("Any", SimpleNamespace(get=lambda _: None)),
         cast("Any", refusals),

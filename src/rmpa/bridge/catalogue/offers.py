@@ -181,7 +181,7 @@ class OfferCatalogue(Generic[KeyT, LocalT, OfferT, WireT]):
         known.news.update(dict.fromkeys(self._offered))
 
     @property
-    def untold(self) -> bool:
+    def pending(self) -> bool:
         """Whether there is something to tell."""
         return any(known.news for known in self._peers.values())
 

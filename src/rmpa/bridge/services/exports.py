@@ -187,14 +187,14 @@ class ServiceExports:
         )
 
     @property
-    def untold(self) -> bool:
-        """Whether there is something to ``tell``."""
-        return self._catalogue.untold
+    def pending(self) -> bool:
+        """Whether there is something to ``advertise``."""
+        return self._catalogue.pending
 
     # --- the local graph ---------------------------------------------------------------------------------------
 
     def graph(self, service: str, server: LocalService | None) -> list[ExportAction]:
-        """Set the server that a service has in the local graph now, proxies left out; peers are told by ``tell``."""
+        """Set the server that a service has now, proxies left out; peers are told by ``advertise``."""
         if self._seen.get(service) == server:
             return []
         if server is None:
@@ -252,7 +252,7 @@ class ServiceExports:
     # --- telling -----------------------------------------------------------------------------------------------
 
     def link_up(self, peer: int, name: str, instance: str = "") -> list[ExportAction]:
-        """A link is up: ``tell`` begins with all we have, but for what came from that very run of the peer."""
+        """A link is up: ``advertise`` begins with all we have, but for what came from that very run of the peer."""
         self._peers[peer] = _Callers()
         first = self._catalogue.link_up(peer, name, instance, judged=False)
         return [Send(peer, AdvertiseServices(tuple(first.added), tuple(first.removed), full=True, more=first.more))]
@@ -264,8 +264,8 @@ class ServiceExports:
         sessions = gone.sessions.items() if gone is not None else ()
         return [EndRoute(peer, route, s.requests) for route, s in sessions if s.requests]
 
-    def tell(self, ready: Callable[[int], bool] = lambda _: True) -> list[ExportAction]:
-        """One message for each peer that has not heard everything and is ready; call again while ``untold``."""
+    def advertise(self, ready: Callable[[int], bool] = lambda _: True) -> list[ExportAction]:
+        """One message for each peer that has not heard everything and is ready; call again while ``pending``."""
         return [
             Send(peer, AdvertiseServices(tuple(portion.added), tuple(portion.removed), more=portion.more))
             for peer, portion in self._catalogue.portions(ready)

@@ -31,11 +31,11 @@ class ExportPlan(Protocol[_ActionT_co]):
     """Decides what peers are told of the local graph."""
 
     @property
-    def untold(self) -> bool:
-        """Whether there is something to ``tell``."""
+    def pending(self) -> bool:
+        """Whether there is something to ``advertise``."""
         ...
 
-    def tell(self, ready: Callable[[int], bool]) -> Sequence[_ActionT_co]:
+    def advertise(self, ready: Callable[[int], bool]) -> Sequence[_ActionT_co]:
         """At most one message for each peer that is ready."""
         ...
 
@@ -172,7 +172,7 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
     def _scan(self) -> None:
         self._scan_handle = None
         self._look_at(self._next_names())
-        told = self._exports.tell(self._may_tell)
+        told = self._exports.advertise(self._may_tell)
         self.act(told)
         if told:
             self._on_told()
@@ -183,9 +183,9 @@ class GraphDriver(Generic[ActionT, AdvertisementT]):
         rejudged = tuple(islice(self._rejudging, limits.APPLIED_AT_ONCE))
         # In one: actions of data that is handled in between belong behind all of these.
         self.act([action for actions in rejudged for action in actions])
-        if self._changed or self._advertisements or self._freeing or rejudged or (told and self._exports.untold):
+        if self._changed or self._advertisements or self._freeing or rejudged or (told and self._exports.pending):
             self.schedule()
-        elif self._exports.untold:
+        elif self._exports.pending:
             self._schedule_later()
         else:
             self._on_idle()

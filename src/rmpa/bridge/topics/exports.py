@@ -218,9 +218,9 @@ class Exports:
         return self._topics.keys()
 
     @property
-    def untold(self) -> bool:
-        """Whether there is something to ``tell``."""
-        return self._catalogue.untold
+    def pending(self) -> bool:
+        """Whether there is something to ``advertise``."""
+        return self._catalogue.pending
 
     def beginning(self, peer: int) -> bool:
         """Whether a peer has not been told everything once since its link is up."""
@@ -231,7 +231,7 @@ class Exports:
     ) -> list[Action]:
         """Other rules hold from now on; what they leave as it is goes on untouched.
 
-        The topics are judged by them when ``graph`` tells of each next, and the peers hear of it by ``tell``.
+        The topics are judged by them when ``graph`` tells of each next, and the peers hear of it by ``advertise``.
         """
         self._policy, self._contracts, self._names, self._most = policy, contracts, names, most
         self._rules += 1
@@ -249,7 +249,7 @@ class Exports:
         return actions
 
     def graph(self, topic: str, publishers: Mapping[str, LocalSource]) -> list[Action]:
-        """Set a topic's publishers in the local graph now, by node, proxies left out; peers are told by ``tell``."""
+        """Set a topic's publishers now, by node, proxies left out; peers are told by ``advertise``."""
         before = self._topics.get(topic, _NOTHING)
         if before.seen == publishers and (before.rules == self._rules or not publishers):
             return []
@@ -297,8 +297,8 @@ class Exports:
             actions += self._came(*waiting)
         return actions
 
-    def tell(self, ready: Callable[[int], bool] = lambda _: True) -> list[Action]:
-        """One message for each peer that has not heard everything and is ready; call again while ``untold``."""
+    def advertise(self, ready: Callable[[int], bool] = lambda _: True) -> list[Action]:
+        """One message for each peer that has not heard everything and is ready; call again while ``pending``."""
         return [
             action
             for peer, portion in self._catalogue.portions(ready)
@@ -334,7 +334,7 @@ class Exports:
         return TopicOffer(wire, source.node, local.type, local.origin)
 
     def link_up(self, peer: int, name: str = "", instance: str = "") -> list[Action]:
-        """A link is up: begin to tell all we have; ``tell`` goes on with it.
+        """A link is up: begin to tell all we have; ``advertise`` goes on with it.
 
         Args:
             peer: The peer's number.

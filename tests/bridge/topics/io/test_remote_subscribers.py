@@ -101,7 +101,7 @@ class World:
     def publish(self, source: Source, type_name: str, route: int) -> None:
         """A source of ours that the peer has open."""
         self.exports.graph(source.topic, {source.node: LocalSource(type_name, URI)})
-        self.exports.tell()
+        self.exports.advertise()
         self.exports.opened(1, OpenRoute(route, source.topic, source.node))
         self.exports.described(source, Description(type_name, MD5, "", False))
 
