@@ -299,7 +299,7 @@ class World:
             assert not bridge.exports._flows
             assert not bridge.outbound.flows
             assert not bridge.outbound._connections
-            assert not bridge.outbound._legs
+            assert not bridge.outbound._senders
             assert not bridge.outbound._parked
             for attached in side.attached:
                 topics = bridge.topics.of(attached)

@@ -202,7 +202,7 @@ class Bridge:
             raise RemoteProtocolError(f"a message of kind {type(message).__name__} that nobody here takes")
 
     def _sender(self, peer: int, route: int) -> RouteSender | None:
-        return self.topics.outbound.leg(peer, route)
+        return self.topics.outbound.sender(peer, route)
 
     # --- the local graph's side --------------------------------------------------------------------------------
 
