@@ -1,4 +1,4 @@
-"""What follows from samples, as data: figures, tables and claims; ``lab.figures`` draws the figures."""
+"""Findings as data: figures, tables and claims. ``lab.figures`` draws the figures."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ class Claim:
 
     @property
     def reached(self) -> bool | None:
-        """Whether it holds; ``None`` if nobody knows."""
+        """Whether it holds; ``None`` without a value."""
         if self.value is None:
             return None
         return self.value >= self.limit if self.at_least else self.value <= self.limit

@@ -143,7 +143,7 @@ def outages(rows: Iterable[tuple[int, int]], longest: float, span: tuple[int, in
     Returns:
         In order. ``lost`` counts numbers left out between the message before and the one after; where the numbering
         begins again (its source was restarted), the numbers before the first one of the new numbering. Before the
-        first and after the last message it is 0: nobody knows what was sent there.
+        first and after the last message it is 0: what was sent there is not known.
     """
     arrivals = sorted((came, number) for number, came in rows)
     found: list[Outage] = []

@@ -39,7 +39,7 @@ def wanted(claim: Claim) -> str:
 
 
 def measured(claim: Claim) -> str:
-    """What came out, with so many digits that it does not look like the limit unless it is."""
+    """A claim's value, with enough digits to differ visibly from its limit unless both are equal."""
     for digits in (3, 4, 5):
         shown = quantity(claim.value, claim.unit, digits)
         if claim.value == claim.limit or shown != quantity(claim.limit, claim.unit, digits):

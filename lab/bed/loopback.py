@@ -51,5 +51,5 @@ class Loopback:
         """Do nothing."""
 
     def traffic(self, name: str) -> Mapping[str, int]:  # noqa: ARG002 - the same for all
-        """Nothing: nobody counts loopback's by host."""
+        """Zeros: loopback's traffic is not counted by host."""
         return _NOTHING

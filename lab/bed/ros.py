@@ -61,7 +61,7 @@ def lacks(package: str) -> str:
 
 
 def free_port(address: str = "127.0.0.1", kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    """A port that nobody uses at this moment (on the real machine; a namespace's ports are all free)."""
+    """A port that is free at this moment (on the real machine; a namespace's ports are all free)."""
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind((address, 0))
         port: int = probe.getsockname()[1]
@@ -87,7 +87,7 @@ class Ros:
     Args:
         host: Where; default: the real machine, where a port should be given.
         home: Existing directory for logs and ROS's own files.
-        port: The port of the master that its programs talk to, whoever runs it.
+        port: The port of the master that its programs talk to; any program may run it.
     """
 
     nodes: ClassVar[Path] = NODES

@@ -23,10 +23,13 @@ from lab.figures import shapes
 from lab.findings import Claim
 from lab.results import finish
 from lab.tables import dash, table_of, us
-from rmpa.resource.decide.adaptation import AdaptationSettings, Apply, Reacted
-from rmpa.resource.declare.resource import Resource, at_most
+from rmpa.resource.decide.actions import Apply, Reacted
+from rmpa.resource.declare.adaptation_settings import AdaptationSettings
+from rmpa.resource.declare.qos_request import at_most
+from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.client import ResourceClient
-from rmpa.resource.run.member import Member
+from rmpa.resource.run.resource_node import ResourceNode
+from rmpa.resource.run.runtime import RuntimePart
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
 from rmpa.ros.node.topics import Received
@@ -38,7 +41,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from rmpa.resource.decide.adaptation import Action
+    from rmpa.resource.decide.actions import Action
 
 _BATCH: Final = 1000
 """Messages between two looks at the clock of the processor."""
@@ -128,7 +131,7 @@ async def _bookkeeping(batches: int) -> dict[str, float]:
     resource.profile(offers={"rate": "10 Hz"}, name="only")(lambda: None)
     core = RosCore(port=0)
     await core.start()
-    member = Member(resource, core.uri)
+    member = ResourceNode(resource, core.uri)
     await member.start()
     raw = output.type.serialize(output.type.make({"header": {"stamp": time.time()}, "range": 1.0}))
     received = Received(raw, {"callerid": "/somebody"}, time.time_ns(), item.type)
@@ -194,19 +197,20 @@ async def _reactions(plan: BookkeepingPlan) -> tuple[list[float], list[float]]:
     await core.start()
     # The profile that was left may be taken again at the next disturbance.
     settings = AdaptationSettings(cool_down=plan.window / 2, cool_down_max=plan.window / 2)
-    member = Member(resource, core.uri, window=plan.window, settings=settings)
+    member = ResourceNode(resource, core.uri, window=plan.window, settings=settings)
     await member.start()
     reacted: asyncio.Queue[float] = asyncio.Queue()
     applying = 0.0
 
-    def listen(action: Action) -> None:
-        nonlocal applying
-        if isinstance(action, Apply):
-            applying = time.perf_counter()
-        if isinstance(action, Reacted):
-            reacted.put_nowait(action.reaction - (time.perf_counter() - applying))
+    class Listener(RuntimePart):
+        def acted(self, action: Action) -> None:
+            nonlocal applying
+            if isinstance(action, Apply):
+                applying = time.perf_counter()
+            if isinstance(action, Reacted):
+                reacted.put_nowait(action.reaction - (time.perf_counter() - applying))
 
-    member.adapter.listeners.append(listen)
+    member.runtime.parts.append(Listener())
     waits, reported = [], []
     async with Node("client", master_uri=core.uri) as node, ResourceClient(node, "disturbed") as client:
         await client.require(accuracy=at_most("5 cm", hard=True), timeout=_DEADLINE)

@@ -75,7 +75,9 @@ MEASUREMENTS: Final[dict[str, Measurement]] = {
         realtime=partial(storm.measure, realtime=True),
     ),
     "scale": Measurement("what more peers and more topics cost one stream", scale.measure),
-    "peers": Measurement("who else carries bytes, in the same run", roundtrips.peers, needs=()),  # likewise
+    "peers": Measurement(
+        "other middleware (Zenoh, DDS, ZeroMQ) in the same run", roundtrips.peers, needs=()
+    ),  # likewise
     "profile": Measurement("what a relayed message costs an agent, and where that goes", profile.measure),
     "throughput": Measurement("how much goes through", throughput.measure),
     "startup": Measurement("how soon the first message arrives", startup.measure),

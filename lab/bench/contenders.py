@@ -38,7 +38,7 @@ class RoundTripPath:
         title: Its name in tables.
         ping: The process that takes "SIZE COUNT FILE" lines.
         processes: Every process on the path, by name.
-        still: Those that may be stopped while others are measured (nobody watches whether they live).
+        still: Those that may be stopped (SIGSTOP) while others are measured: no other process supervises them.
     """
 
     key: str

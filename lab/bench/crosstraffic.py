@@ -6,8 +6,7 @@ acknowledgements take their time too.
 
 from __future__ import annotations
 
-import subprocess
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Final
 
 from lab.bed.bench import Bed
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from lab.bed.namespaces import Host
 
 _LINK: Final = 100e6
 """Bits a second, as tbf counts them: with Ethernet's headers."""
@@ -38,21 +36,8 @@ _DEADLINE: Final = 1000.0
 """µs."""
 
 
-@dataclass(frozen=True, slots=True)
-class CrosstrafficPlan:
-    """How much is measured.
-
-    Args:
-        seconds: Of each round of commands.
-        rounds: Turns of each way, unloaded and loaded.
-    """
-
-    seconds: float
-    rounds: int
-
-
-FULL: Final = CrosstrafficPlan(20.0, 5)
-QUICK: Final = CrosstrafficPlan(8.0, 2)
+FULL: Final = schedule.Rounds(20.0, 5)
+QUICK: Final = schedule.Rounds(8.0, 2)
 
 
 class LoadedScore(schedule.LatencyScore):
@@ -115,7 +100,7 @@ def measure(quick: bool, console: Console, json: Path | None = None, *, realtime
     )
 
 
-def _take(plan: CrosstrafficPlan, console: Console, *, realtime: bool) -> tuple[Scores, dict[str, str], str]:
+def _take(plan: schedule.Rounds, console: Console, *, realtime: bool) -> tuple[Scores, dict[str, str], str]:
     """The scores, the ways' titles by key, and how all that ran was scheduled."""
     scores: Scores = {}
     with Bed() as bed:
@@ -123,8 +108,8 @@ def _take(plan: CrosstrafficPlan, console: Console, *, realtime: bool) -> tuple[
         console.print(how, style="dim")
         streams = {}
         for way in ways:
-            shape(way.here.host)
-            shape(way.there.host)
+            for shell in (way.here, way.there):
+                shell.host.shape(f"{_LINK / 1e6:.0f}mbit", bands=True)  # as on a real card
             # The images' nodes are the less urgent ones of the user's, too.
             images = way.stream(bed, "/image", queue=_IMAGE_QUEUE, fifo=fifo and fifo - 1)
             streams[way.key] = way.stream(bed, "/command", fifo=fifo), images
@@ -143,18 +128,6 @@ def _targets(scores: Scores) -> list[Claim]:
         Claim("p99 beside images / unloaded", ratio(ours.summary.p99, idle.summary.p99), 3.0),
         Claim("images, share of the link", ours.share, 0.9, at_least=True),
     ]
-
-
-def shape(host: Host) -> None:
-    """Limit what a host sends by a token bucket whose packets wait in pfifo_fast's three bands, as on a real card.
-
-    The bucket's own queue would be one for all.
-    """
-    device = host.cables[0].interface
-    bucket = f"root handle 1: tbf rate {_LINK / 1e6:.0f}mbit burst 32kb latency 50ms"
-    for qdisc in (bucket, "parent 1:1 handle 10: pfifo_fast"):
-        command = ["tc", "-n", host.namespace, "qdisc", "replace", "dev", device, *qdisc.split()]
-        subprocess.run(command, check=True, capture_output=True, timeout=20)
 
 
 def _round(

@@ -192,7 +192,7 @@ def meshed(agents: Sequence[Agent]) -> float:
 
 
 def _wait_without(agents: Sequence[Agent], name: str) -> None:
-    """Wait until nobody has a link to a peer any more."""
+    """Wait until no agent has a link to a peer any more."""
     for agent in agents:
         while (found := _snapshot(agent)) is None or any(p.name == name and p.link for p in found.peers):
             time.sleep(_LOOK)

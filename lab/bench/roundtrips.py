@@ -101,7 +101,7 @@ def _measure(
         taking_part = start_all(bed, keys, left_out, console)
         for turn in range(plan.rounds):
             console.print(f"round {turn + 1} of {plan.rounds}", style="dim")
-            first = turn % max(1, len(taking_part))  # nobody is always behind the same neighbour
+            first = turn % max(1, len(taking_part))  # so that none always follows the same one
             for size, trips in plan.trips.items():
                 for one in [*taking_part[first:], *taking_part[:first]]:
                     try:

@@ -1,7 +1,7 @@
 """What more peers and more topics cost one stream: 2 to 16 peers, 10 to 1,000 topics in the graph.
 
 One 64 B stream runs between two agents. The other peers are only linked (``peers``), or each has a subscriber of the
-stream (``subscribers``: one copy for each); or the first module's graph fills with topics nobody asks for
+stream (``subscribers``: one copy for each); or the first module's graph fills with topics that have no subscriber
 (``topics``). Processor time a message is what an agent used while the stream ran, less what it used before with the
 same configuration and a quiet stream. A direct roscpp connection beside each figure says what the machine did.
 """

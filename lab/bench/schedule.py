@@ -53,9 +53,22 @@ _AGENT_PRIORITY: Final = 50
 """What ``--realtime`` asks for by default."""
 
 
+@dataclass(frozen=True, slots=True)
+class Rounds:
+    """How much is measured.
+
+    Args:
+        seconds: Of each round; short, so that a bad spell of the machine meets all that take turns.
+        rounds: Turns of each.
+    """
+
+    seconds: float
+    rounds: int
+
+
 @dataclass(slots=True)
 class Arrivals:
-    """What came of one round, without its lead-in.
+    """The arrivals of one round, without its lead-in.
 
     Args:
         sent: Messages that were given to roscpp.
@@ -360,7 +373,7 @@ def named(measurement: str, *, realtime: bool) -> str:
 
 
 def turns(ways: Sequence[Way], rounds: int, console: Console) -> Iterator[list[Way]]:
-    """The order of each round: another one starts it, so that nobody is always behind the same neighbour."""
+    """The order of each round; each starts with another way, so that none always follows the same one."""
     for turn in range(rounds):
         console.print(f"round {turn + 1} of {rounds}", style="dim")
         first = turn % len(ways)

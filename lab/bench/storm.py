@@ -1,8 +1,8 @@
 """Does control work delay data? A relayed stream at 1 kHz while tools and nodes ask a master 200 times a second.
 
-The same calls go to nobody, to the core inside the agent, and to an ``rmpa core`` in a process of its own on the same
+The same calls go nowhere, to the core inside the agent, and to an ``rmpa core`` in a process of its own on the same
 host: that is one process against control in its own. Beside it direct roscpp, idle and while its rosmaster is asked,
-which tells what the calls cost everybody on so few processors.
+which shows what the calls cost any program on so few processors.
 """
 
 from __future__ import annotations
@@ -46,21 +46,8 @@ _SEPARATE_PORT: Final = 11399
 _FILL_DEADLINE: Final = 60.0
 
 
-@dataclass(frozen=True, slots=True)
-class StormPlan:
-    """How much is measured.
-
-    Args:
-        seconds: Of each round; short, so that a bad spell of the machine meets all cases.
-        rounds: Turns of each case.
-    """
-
-    seconds: float
-    rounds: int
-
-
-FULL: Final = StormPlan(4.0, 12)
-QUICK: Final = StormPlan(2.6, 4)
+FULL: Final = schedule.Rounds(4.0, 12)
+QUICK: Final = schedule.Rounds(2.6, 4)
 
 
 @dataclass(slots=True)

@@ -39,21 +39,8 @@ _RATE: Final = 100
 _HELLO: Final = 30.0
 
 
-@dataclass(frozen=True, slots=True)
-class TasksPlan:
-    """How much is measured.
-
-    Args:
-        seconds: Of each turn.
-        rounds: Turns of each.
-    """
-
-    seconds: float
-    rounds: int
-
-
-FULL: Final = TasksPlan(5.0, 12)
-QUICK: Final = TasksPlan(1.5, 4)
+FULL: Final = schedule.Rounds(5.0, 12)
+QUICK: Final = schedule.Rounds(1.5, 4)
 
 
 @dataclass(slots=True)

@@ -48,7 +48,7 @@ _SETTLE: Final = 1.0
 """Seconds from the first message to the begin of a window: queues are as full as they get."""
 _FIRST_DEADLINE: Final = 30.0
 _QUIET: Final = 20.0
-"""Percent of a core that the rest of the machine may use, and soft interrupts in nobody's name."""
+"""Percent of a core that the rest of the machine may use, soft interrupts included, which count for no process."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ class Count:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """What came in one window.
+    """The messages of one window.
 
     Args:
         received: Messages a second that the receiver counted.

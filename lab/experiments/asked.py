@@ -1,4 +1,4 @@
-"""From what somebody asks for to what is measured: the plan, and the cells of it."""
+"""From the command line's options to the plan of a run and its cells."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def choose(asked: Asked, why_not: WhyNot, before: Plan | None = None) -> tuple[P
     """Decide on a plan.
 
     Args:
-        asked: What somebody wants.
+        asked: The options.
         why_not: Tells what is missing here.
         before: The plan of the run that is to go on; what was not asked is as it was then.
 

@@ -1,4 +1,4 @@
-"""Who is measured beside whom, and in which order: classic ROS at its best, as it comes, and RMPA."""
+"""The systems that are compared, and their order in a round: classic ROS at its best, as it comes, and RMPA."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ RMPA: Final = Contender("RMPA", "rmpa")
 
 
 def turn(order: Sequence[Contender], number: int) -> list[Contender]:
-    """The order of one round: another one begins each, so that nobody is always behind the same neighbour."""
+    """The order of one round; each round starts with another system, so that none always follows the same one."""
     first = number % len(order)
     return [*order[first:], *order[:first]]
 

@@ -34,7 +34,7 @@ HOSTS: Final = ("joystick", "velocity", "base", "pc")
 CMD: Final = "/cmd"
 VEL: Final = "/vel"
 _FLOWS: Final = {CMD: ("joystick", "velocity", "pc"), VEL: ("velocity", "base", "pc")}
-"""Who publishes, and who subscribes."""
+"""For each topic the publishing host, and the subscribing ones."""
 MODES: Final = ("polled", "event")
 """The paper's velocity node, which looks for a command at 10 Hz, and one that takes each as it comes."""
 _NODES: Final = {"polled": "polled velocity node", "event": "event-driven velocity node"}
@@ -152,7 +152,7 @@ class Control:
                 "velocity", "velocity", client, cmd=cmd, vel=VEL, mode=mode, rate=RATE, nodelay=nodelay
             )
             source = system.node("joystick", "source", client, topic=CMD, phase=phase)
-            # An agent or a relay is the one local subscriber, whoever is behind it.
+            # An agent or a relay is the one local subscriber, however many are behind it.
             subscribers = 1 if relayed or system.kind == "rmpa" else 2
             flow.wait_connected(source, subscribers)
             flow.wait_connected(velocity, subscribers)

@@ -1,4 +1,4 @@
-"""What follows from the samples of experiment 4: what became of each flow, the timeline, and what is claimed."""
+"""Findings of experiment 4: losses and outages of each flow, the timeline, and the claims."""
 
 from __future__ import annotations
 
@@ -88,8 +88,8 @@ _WORDS: Final = {
 
 
 @dataclass(frozen=True, slots=True)
-class Fate:
-    """What became of one flow between the failure and the end of the observation.
+class FlowLosses:
+    """Losses and outage of one flow between the failure and the end of the observation.
 
     Args:
         flow: Which.
@@ -117,14 +117,16 @@ class Fate:
     by_hand: bool | None = None
 
 
-def fates(cell: Cell, measured: Measured) -> list[Fate]:
-    """What became of each flow in one cell."""
+def outcomes(cell: Cell, measured: Measured) -> list[FlowLosses]:
+    """Losses and outages of each flow in one cell."""
     scenario = SCENARIOS[str(cell.settings["scenario"])]
     moments = _moments(measured)
-    return [_fate(flow, scenario, rows, moments) for flow, rows in _rows(measured).items()]
+    return [_outcome(flow, scenario, rows, moments) for flow, rows in _rows(measured).items()]
 
 
-def _fate(flow: Flow, scenario: Scenario, rows: Sequence[tuple[int, int, int]], moments: Mapping[str, int]) -> Fate:
+def _outcome(
+    flow: Flow, scenario: Scenario, rows: Sequence[tuple[int, int, int]], moments: Mapping[str, int]
+) -> FlowLosses:
     """Rows are (sequence, due, came)."""
     down, end = moments["down"], moments["end"]
     counted = _ns(_ON_THE_WAY)
@@ -136,7 +138,7 @@ def _fate(flow: Flow, scenario: Scenario, rows: Sequence[tuple[int, int, int]], 
     back = not (still and not still[-1].back)
     again = ran if still and back and scenario.touches(flow) else None
     hand = moments.get("by hand")
-    return Fate(
+    return FlowLosses(
         flow,
         scenario.touches(flow),
         due,
@@ -184,7 +186,7 @@ def _ns(seconds: float) -> int:
 
 def findings(results: Results) -> Findings:
     """The timelines, the table and the claims."""
-    told = [(cell, measured, fates(cell, measured)) for cell, measured in results.cells]
+    told = [(cell, measured, outcomes(cell, measured)) for cell, measured in results.cells]
     if not told:
         return Findings()
     return Findings(
@@ -235,22 +237,22 @@ def _timeline(system: str, client: str, measured: Measured) -> Panel:
 _NAMES: Final = {"classic": "classic", "rmpa": "RMPA"}
 
 
-def _grid(told: Sequence[tuple[Cell, list[Fate]]]) -> Grid:
+def _grid(told: Sequence[tuple[Cell, list[FlowLosses]]]) -> Grid:
     heads = ("what happens", "nodes", "flow", "system", "due", "lost", "late", "longest outage, s", "runs again")
     rows = [
         (
             SCENARIOS[str(cell.settings["scenario"])].title,
             str(cell.settings["client"]),
-            fate.flow.title + (" *" if fate.touched else ""),
+            outcome.flow.title + (" *" if outcome.touched else ""),
             _NAMES[str(cell.settings["system"])],
-            str(fate.due),
-            str(fate.lost),
-            str(fate.late),
-            f"{fate.outage:.2f}" if fate.outage else "-",
-            _again(fate),
+            str(outcome.due),
+            str(outcome.lost),
+            str(outcome.late),
+            f"{outcome.outage:.2f}" if outcome.outage else "-",
+            _again(outcome),
         )
         for cell, found in told
-        for fate in found
+        for outcome in found
     ]
     note = (
         "* needs the host that fails, or the node that crashes. Runs again: seconds from the start of what was"
@@ -260,17 +262,17 @@ def _grid(told: Sequence[tuple[Cell, list[Fate]]]) -> Grid:
     return Grid("What became of each flow", heads, rows, note)
 
 
-def _again(fate: Fate) -> str:
-    if not fate.back:
-        return "never; by hand" if fate.by_hand else "never" if fate.by_hand is None else "never, nor by hand"
-    if fate.after_start is None:
-        return "ran on" if not fate.outage else "yes"
-    up = "" if fate.after_up is None else f" ({fate.after_up:.2f})"
-    return f"{fate.after_start:.2f}{up}"
+def _again(outcome: FlowLosses) -> str:
+    if not outcome.back:
+        return "never; by hand" if outcome.by_hand else "never" if outcome.by_hand is None else "never, nor by hand"
+    if outcome.after_start is None:
+        return "ran on" if not outcome.outage else "yes"
+    up = "" if outcome.after_up is None else f" ({outcome.after_up:.2f})"
+    return f"{outcome.after_start:.2f}{up}"
 
 
-def _claims(told: Sequence[tuple[Cell, list[Fate]]]) -> Iterable[Claim]:
-    def of(system: str, *scenarios: str) -> list[list[Fate]]:
+def _claims(told: Sequence[tuple[Cell, list[FlowLosses]]]) -> Iterable[Claim]:
+    def of(system: str, *scenarios: str) -> list[list[FlowLosses]]:
         return [
             found
             for cell, found in told
@@ -279,34 +281,42 @@ def _claims(told: Sequence[tuple[Cell, list[Fate]]]) -> Iterable[Claim]:
 
     stock = [(cell, found) for cell, found in told if cell.settings["client"] != "own"]
     classic = [
-        sum(not fate.back for fate in found)
+        sum(not outcome.back for outcome in found)
         for cell, found in stock
         if (cell.settings["system"], cell.settings["scenario"]) == ("classic", "master")
     ]
     text = "classic, the master's host killed and on again: flows that do not come back by themselves"
     yield Claim(text, min(classic, default=None), 1, at_least=True)
     ours = of("rmpa")
-    never = [sum(not fate.back for fate in found) for found in ours]
+    never = [sum(not outcome.back for outcome in found) for found in ours]
     yield Claim("RMPA, any failure: flows that do not come back by themselves", max(never, default=None), 0)
-    lost = [sum(fate.lost for fate in found if not fate.touched) for found in ours]
+    lost = [sum(outcome.lost for outcome in found if not outcome.touched) for found in ours]
     yield Claim("RMPA, any failure: messages lost on flows of other hosts", max(lost, default=None), 0)
-    ups = [fate.after_up for found in of("rmpa", "master", "host") for fate in found if fate.after_up is not None]
+    ups = [
+        outcome.after_up
+        for found in of("rmpa", "master", "host")
+        for outcome in found
+        if outcome.after_up is not None
+    ]
     text = "RMPA: flows run again, from when the agent is ready and the node up, worst"
     yield Claim(text, max(ups, default=None), _AGAIN_WITHIN, unit="s")
     cables = [
-        fate.after_up for found in of("rmpa", "cable", "cable-long") for fate in found if fate.after_up is not None
+        outcome.after_up
+        for found in of("rmpa", "cable", "cable-long")
+        for outcome in found
+        if outcome.after_up is not None
     ]
     if cables:
         text = "RMPA: flows run again, from when the cable is in again, worst"
         yield Claim(text, max(cables), _AGAIN_WITHIN, unit="s")
 
 
-def _notes(told: Sequence[tuple[Cell, Measured, list[Fate]]]) -> Iterable[str]:
-    ours = [(cell, fate) for cell, _, found in told for fate in found if cell.settings["system"] == "rmpa"]
+def _notes(told: Sequence[tuple[Cell, Measured, list[FlowLosses]]]) -> Iterable[str]:
+    ours = [(cell, outcome) for cell, _, found in told for outcome in found if cell.settings["system"] == "rmpa"]
     starts = [
-        fate.after_start
-        for cell, fate in ours
-        if fate.after_start is not None and cell.settings["scenario"] in {"master", "host"}
+        outcome.after_start
+        for cell, outcome in ours
+        if outcome.after_start is not None and cell.settings["scenario"] in {"master", "host"}
     ]
     if starts:
         yield (
@@ -316,7 +326,7 @@ def _notes(told: Sequence[tuple[Cell, Measured, list[Fate]]]) -> Iterable[str]:
         )
     for cell, measured, found in told:
         if (by_hand := measured.facts.get("by_hand")) and cell.settings["system"] == "classic":
-            never = sum(not fate.back for fate in found)
+            never = sum(not outcome.back for outcome in found)
             yield (
                 f"Classic, {cell.settings['client']}, {SCENARIOS[str(cell.settings['scenario'])].title}:"
                 " connections that existed went on without the master. A node that is started while it is away"

@@ -50,7 +50,7 @@ class Round:
 
     Args:
         number: In each of its messages, and no other round's in this process.
-        source: Who sends.
+        source: The node that sends.
         file: Where it writes how late it was.
         seconds: How long it takes.
         mark: The source's events before it.

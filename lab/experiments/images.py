@@ -95,7 +95,7 @@ class _Stream:
         return flow.begin(self.source, self._scratch, size=size, rate=rate, count=max(2, round(rate * seconds)))
 
     def end(self, begun: flow.Round) -> tuple[pd.DataFrame, int]:
-        """What came of a round (``sequence``, ``due_ns``, ``came_ns``), and how many were sent."""
+        """The arrivals of a round (``sequence``, ``due_ns``, ``came_ns``), and the number of messages sent."""
         sent = len(flow.sent(begun))
         return flow.noted(self.sink, [self._topic], self._scratch, begun.number).drop(columns="topic"), sent
 
@@ -234,7 +234,7 @@ def _score(rounds: Sequence[Measured]) -> ImageScore:
 
 
 def bytes_per_second(came: Sequence[int], begin: int, end: int) -> float:
-    """What came of images between two moments of the clock, ns; 0 if it was fewer than two."""
+    """Bytes a second of the images that came between two moments of the clock (ns); 0 if fewer than two came."""
     inside = sorted(at for at in came if begin <= at <= end)
     return _IMAGE * (len(inside) - 1) / (inside[-1] - inside[0]) * 1e9 if len(inside) > 1 else 0.0
 

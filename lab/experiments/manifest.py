@@ -1,4 +1,4 @@
-"""What a run directory says of itself: who measured what, on what, when, and what came of each cell."""
+"""``manifest.json`` of a run directory: plan, code, machine, sessions, and the outcome of each cell."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What an experiment is made of: cells that are measured one by one, their samples, and what follows from them.
+"""An experiment as data: cells that are measured one by one, and their samples.
 
-All of it is data. Who measures (``control``, ``rates``, …) knows nothing of files or pictures; ``store`` keeps what
-was measured, ``report`` draws and writes what was found.
+The experiments (``control``, ``rates``, …) know nothing of files or pictures: ``store`` keeps the samples, ``report``
+draws and writes the findings (``lab.findings``).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What came of one cell.
+    """The measured samples of one cell.
 
     Args:
         tables: Raw samples by name (``lab.frames``); each becomes a CSV file.

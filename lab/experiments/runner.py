@@ -31,7 +31,7 @@ ATTEMPTS: Final = 2
 
 
 class Watcher(Protocol):
-    """Whoever is told how it goes."""
+    """Is notified of a run's progress."""
 
     def cell_begins(self, cell: Cell, attempt: int) -> None:
         """A cell is tried for the first or the second time."""
@@ -48,7 +48,7 @@ class Watcher(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of a run.
+    """The outcome of a run.
 
     Args:
         measured: Cells that were measured now.

@@ -33,7 +33,7 @@ FIRST: Final = "pc"
 _HELLO, _PROBE = "/hello", "/probe"
 _SIZE: Final = 64
 _HELLO_RATE: Final = 50.0
-"""Hz: how soon somebody hears it is known to 20 ms."""
+"""Hz: the time of the first message is known to 20 ms."""
 _PROBE_RATE: Final = 100.0
 _LEAD_IN: Final = 0.5
 """Seconds of the probe flow that are thrown away."""

@@ -130,10 +130,10 @@ class Store:
 
     @contextlib.contextmanager
     def session(self, argv: Sequence[str]) -> Iterator[None]:
-        """Note one call of the program around what it measures; nobody else may measure into the directory.
+        """Record one call of the program around what it measures; the directory is locked meanwhile.
 
         Raises:
-            StartError: Somebody does, or it cannot be written to.
+            StartError: Another process measures into it, or it cannot be written to.
         """
         try:
             lock = os.open(self.directory / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
@@ -273,7 +273,7 @@ class Store:
         return [record for _, record in self._records(experiment) if record.state == "failed"]
 
     def waiting(self, experiment: str) -> list[CellRecord]:
-        """The cells of an experiment that nobody has tried to measure yet."""
+        """The cells of an experiment that have not been tried yet."""
         return [record for _, record in self._records(experiment) if record.state == "planned"]
 
     def _records(self, experiment: str) -> list[tuple[Cell, CellRecord]]:

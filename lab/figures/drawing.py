@@ -149,7 +149,7 @@ def _same_x(upper: Panel, lower: Panel) -> bool:
 
 
 def _same_y(left: Panel, right: Panel) -> bool:
-    """Whether both may have one axis: the same quantity, and neither would be a line at the other's foot."""
+    """Whether both may share an axis: the same quantity, and values of a similar size."""
     if (left.ylabel, left.logy, left.names) != (right.ylabel, right.logy, right.names):
         return False
     tops = [max((y for series in panel.series for y in series.y), default=0.0) for panel in (left, right)]

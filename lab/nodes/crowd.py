@@ -9,7 +9,6 @@ Options: --per-node, --services. Events: up; registered with the count.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import socketserver
 import struct
@@ -17,6 +16,8 @@ import sys
 import threading
 import xmlrpc.client
 from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
+
+from node import say
 
 TYPE = "std_msgs/UInt8MultiArray"
 MD5 = "82373f1612381bb6ee473b5cd6f5d89c"
@@ -68,10 +69,6 @@ class Publications(socketserver.ThreadingTCPServer):
 
 def serve(server: socketserver.BaseServer) -> None:
     threading.Thread(target=server.serve_forever, args=(_LOOK_FOR_THE_END,), daemon=True).start()
-
-
-def say(event: str, **fields: object) -> None:
-    print("@ " + json.dumps({"event": event, **fields}), flush=True)
 
 
 def main() -> None:

@@ -1,16 +1,13 @@
 """The floor in Python: raw blocking TCP ping-pong over loopback; arguments and lines as of ``floor.cpp``."""
 
 import array
-import json
 import socket
 import struct
 import sys
 import time
 from pathlib import Path
 
-
-def say(event: str, **fields: object) -> None:
-    print("@ " + json.dumps({"event": event, **fields}), flush=True)
+from node import say
 
 
 def read_all(sock: socket.socket, view: memoryview) -> bool:

@@ -7,15 +7,12 @@ services: each with ``at``, the monotonic time in seconds when all of them were 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import time
 import xmlrpc.client
 from typing import Any
 
-
-def say(event: str, **fields: object) -> None:
-    print("@ " + json.dumps({"event": event, **fields}), flush=True)
+from node import say
 
 
 def main() -> None:

@@ -17,7 +17,7 @@
 
 namespace node {
 
-// CLOCK_MONOTONIC is one for all network namespaces, and nobody sets it.
+// CLOCK_MONOTONIC is the same in all network namespaces and is never set.
 inline uint64_t now_ns() {
   timespec now;
   clock_gettime(CLOCK_MONOTONIC, &now);

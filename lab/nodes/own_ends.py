@@ -1,4 +1,4 @@
-"""What our own nodes share: the layout of their one message type, who listens, and their life."""
+"""Shared by our own nodes: the layout of their one message type, counting subscribers, start and end."""
 
 from __future__ import annotations
 

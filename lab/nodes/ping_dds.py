@@ -11,7 +11,8 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
-from roundtrips import TIMEOUT, measure, say
+from node import say
+from roundtrips import TIMEOUT, measure
 
 os.environ["CYCLONEDDS_URI"] = """
 <CycloneDDS><Domain>

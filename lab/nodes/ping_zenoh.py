@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 import zenoh
 
-from roundtrips import measure, say
+from node import say
+from roundtrips import measure
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -69,7 +70,7 @@ def ping(endpoint: str, *, shared_memory: bool) -> None:
         return trip
 
     there.put(bytes(64))
-    while came.try_recv() is None:  # both sides have to learn first who listens
+    while came.try_recv() is None:  # both sides must first discover each other's subscriber
         time.sleep(0.1)
         there.put(bytes(64))
     time.sleep(0.2)

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 import zmq
 
-from roundtrips import TIMEOUT, measure, say
+from node import say
+from roundtrips import TIMEOUT, measure
 
 if TYPE_CHECKING:
     from collections.abc import Callable

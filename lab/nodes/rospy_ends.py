@@ -1,4 +1,4 @@
-"""What the rospy nodes share: who listens, and how to listen."""
+"""Shared by the rospy nodes: counting subscribers, and subscribing."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,7 +16,7 @@ class Counted(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no ty
     """Tells how many subscribers a topic has.
 
     Args:
-        subscribers: Who is told.
+        subscribers: Is notified of each change.
     """
 
     def __init__(self, subscribers: Subscribers) -> None:

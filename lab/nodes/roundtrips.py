@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import array
-import json
 import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from node import say
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 TIMEOUT = 1.0
 """Seconds after which a round trip is lost."""
-
-
-def say(event: str, **fields: object) -> None:
-    """Write one machine-readable line."""
-    print("@ " + json.dumps({"event": event, **fields}), flush=True)
 
 
 def measure(trips_of: Callable[[int], Callable[[], bool]], first: int = 64) -> None:

@@ -7,7 +7,6 @@ Events: up; filled; stormed with the calls made, those that failed, and the sort
 """
 
 import itertools
-import json
 import re
 import socket
 import sys
@@ -16,6 +15,8 @@ import time
 import xmlrpc.client
 from typing import Any
 from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
+
+from node import say
 
 NODES, TOPICS = 50, 3
 MIX = (
@@ -33,10 +34,6 @@ MIX = (
 """Ten calls, over and over; a subscriber that registers leaves five calls later."""
 _TIMEOUT = 10.0
 _GOOD = re.compile(rb"<array><data>\s*<value><(int|i4)>1</")
-
-
-def say(event: str, **fields: object) -> None:
-    print("@ " + json.dumps({"event": event, **fields}), flush=True)
 
 
 class Nodes:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.observe.doctor.io.checks import CHECKS
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -43,6 +45,7 @@ def test_every_check_answers(loopback: Place) -> None:
         "mtu",
         *("realtime", "files"),
     }
+    assert {check.name for check in CHECKS} <= checks
     assert answers["multicast", "lo"]["level"] == "ok"
     assert str(answers["settings", ""]["text"]).startswith("read from rmpa.toml: name ")
     assert {str(f["level"]) for f in answers.values()} <= {"ok", "warn", "skipped"}

@@ -46,8 +46,7 @@ def test_the_readme_has_a_resource_that_can_be_run(tmp_path: Path) -> None:
     (camera,) = load(path)
     assert camera.profiles.keys() == {"small", "full"}
     sent: list[int] = []
-    outlet = SimpleNamespace(publish=lambda values, _message: sent.append(len(values["data"])))
-    camera.outputs["frames"].outlet = outlet
+    camera.outputs["frames"].on_publish = lambda values, _message: sent.append(len(values["data"]))
     for name in camera.profiles:
         camera.profiles[name].apply()
         camera.tasks["shoot"].function()
@@ -62,8 +61,8 @@ def test_the_readme_has_a_resource_that_can_be_run(tmp_path: Path) -> None:
 def test_the_keeper_says_how_close_it_keeps() -> None:
     (keeper,) = load(FILES / "keeper.py")
     seen: list[tuple[str, object]] = []
-    keeper.declared_attributes["closeness"].observer = SimpleNamespace(observe=lambda *said: seen.append(said))
-    keeper.outputs["/cmd_vel"].outlet = SimpleNamespace(publish=lambda _values, _message: None)
+    keeper.declared_attributes["closeness"].on_observation = lambda *said: seen.append(said)
+    keeper.outputs["/cmd_vel"].on_publish = lambda _values, _message: None
     for distance in (2.0, 2.05, 1.95):
         keeper.tasks["control"].function(SimpleNamespace(range=distance))
     assert seen == [("closeness", pytest.approx(jump)) for jump in (0.0, 0.05, 0.1)]

@@ -44,7 +44,7 @@ class Section:
         about: What is measured, and how, in Markdown.
         findings: What follows.
         cells: How many were measured.
-        waiting: How many nobody has measured yet.
+        waiting: How many have not been tried yet.
         failures: Those that could not be measured.
         lateness: How late the host woke up before and after each cell, µs.
         images: The files of each figure by its name, PNG and SVG; empty where they could not be drawn.

@@ -14,10 +14,21 @@ from typing import TYPE_CHECKING, Final
 import click
 import msgspec
 
+from rmpa.observe.check import CheckLevel
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 _UNITS: Final = ("B", "kB", "MB", "GB", "TB")
+LEVEL_COLOURS: Final = {
+    CheckLevel.OK: "green",
+    CheckLevel.WARN: "yellow",
+    CheckLevel.FAIL: "red",
+    CheckLevel.SKIPPED: "cyan",
+    CheckLevel.UNKNOWN: "yellow",
+    CheckLevel.STALE: "yellow",
+}
+"""Of the results of ``rmpa doctor`` and ``rmpa why``, on a terminal."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from rmpa.cli.known_resources import remembered
 from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import Column, print_json, print_table, warn
 from rmpa.cli.resource_graph import with_resources
-from rmpa.cli.resource_history import remembered
 from rmpa.core.errors import UnreachableError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from rmpa.cli.known_resources import KnownResource
     from rmpa.cli.master import Master
     from rmpa.cli.resource_graph import ResourceGraph, SeenResource
-    from rmpa.cli.resource_history import KnownResource
 
 _COLOURS: Final = {"active": "green", "inactive": "yellow", "unconfigured": "yellow", "finalized": "red"}
 _TITLES: Final = ("RESOURCE", "STATE", "ROLE", "KIND", "PROFILE", "CONTEXT", "DESCRIPTION")

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import FrameType, TracebackType
 
-    from rmpa.resource.declare.resource import Parameter, Resource
+    from rmpa.resource.declare.parameters import Parameter
+    from rmpa.resource.declare.resource import Resource
 
 _log = logging.getLogger("rmpa.run")
 _STARTS: Final = 20.0
@@ -109,7 +110,7 @@ def prepared(path: Path, given: Sequence[str] = ()) -> list[Resource]:
     Raises:
         ConfigError: The file cannot be run, or a parameter cannot have its value.
     """
-    import rmpa.resource.run.member  # noqa: F401 - the first import takes long
+    import rmpa.resource.run.resource_node  # noqa: F401 - the first import takes long
 
     resources = load(path)
     for text in given:
@@ -304,7 +305,7 @@ def _core_of(name: str) -> str | None:
 
 def _state_dir(module: str, state: str | None) -> Path | None:
     """The directory in which the resources of a module store their state; ``None`` without a home directory."""
-    from rmpa.resource.run.store import module_dir, state_dir
+    from rmpa.runtime.state_dir import module_dir, state_dir
 
     directory = state_dir(os.environ, state)
     if directory is None:
@@ -314,7 +315,7 @@ def _state_dir(module: str, state: str | None) -> Path | None:
 
 
 async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None, stores: Path | None = None) -> int:
-    from rmpa.resource.run.member import run_all
+    from rmpa.resource.run.resource_node import run_all
     from rmpa.runtime.descriptors import raise_file_limit
 
     raise_file_limit()

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import click
 
 from rmpa.cli.graph import read_name
 from rmpa.cli.options import agent_option, json_option
-from rmpa.cli.output import print_json, printable
+from rmpa.cli.output import LEVEL_COLOURS, print_json, printable
 from rmpa.observe import limits
+from rmpa.observe.check import FAIL, OK, WARN
 from rmpa.observe.io.control_client import ControlClient, choose_agent
-from rmpa.observe.why.diagnosis import Diagnosis, PathStage, StageResult
+from rmpa.observe.why.diagnosis import Diagnosis
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-_COLOURS: Final = {
-    StageResult.OK: "green",
-    StageResult.WARN: "yellow",
-    StageResult.FAIL: "red",
-    StageResult.UNKNOWN: "yellow",
-}
+    from rmpa.observe.check import Check, CheckLevel
+
 EPILOG = """\
 \b
 Exit codes: 0 it flows, on every way if there are several; 1 it does not, and the first stage that fails says why.
@@ -77,19 +74,19 @@ def _lines(diagnosis: Diagnosis) -> list[str]:
     lines += [_line(stage, width) for stage in diagnosis.stages]
     failed = diagnosis.failed
     if failed is None:
-        lines.append(_paint("it can be called" if diagnosis.kind == "service" else "it flows", StageResult.OK))
+        lines.append(_paint("it can be called" if diagnosis.kind == "service" else "it flows", OK))
     else:
-        lines.append(_paint(printable(f"it stops at: {failed.name}"), StageResult.FAIL))
+        lines.append(_paint(printable(f"it stops at: {failed.name}"), FAIL))
         if failed.remedy:
             lines.append(printable(f"what to do: {failed.remedy}"))
     return lines
 
 
-def _line(stage: PathStage, width: int) -> str:
-    mark = _paint(f"{stage.verdict.value:<7}", stage.verdict)
-    advice = f" ({stage.remedy})" if stage.remedy and stage.verdict is StageResult.WARN else ""
+def _line(stage: Check, width: int) -> str:
+    mark = _paint(f"{stage.level.value:<7}", stage.level)
+    advice = f" ({stage.remedy})" if stage.remedy and stage.level is WARN else ""
     return f"  {mark}  {printable(stage.name):<{width}}  {printable(stage.text + advice)}"
 
 
-def _paint(text: str, verdict: StageResult) -> str:
-    return click.style(text, fg=_COLOURS[verdict])
+def _paint(text: str, level: CheckLevel) -> str:
+    return click.style(text, fg=LEVEL_COLOURS[level])

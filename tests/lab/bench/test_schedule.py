@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import subprocess
 from typing import TYPE_CHECKING
 
 import pytest
 
 from lab.bed.bench import Bed
 from lab.bench import schedule
-from lab.bench.crosstraffic import LoadedScore, shape
+from lab.bench.crosstraffic import LoadedScore
 from lab.bench.period import Evenness, paired
 from lab.bench.schedule import Arrivals, LatencyScore, Way, parse
 from lab.frames import frame
@@ -114,17 +113,3 @@ def test_a_stream_keeps_its_schedule_and_its_numbers(relayed: bool) -> None:
             assert min(arrivals.from_send()) > 0
             assert list(arrivals.usage) == ["publisher", *(["relay 1", "relay 2"] if relayed else []), "receiver"]
             assert arrivals.total == 100 + round(200 * schedule.LEAD_IN)
-
-
-@pytest.mark.netns
-def test_a_shaped_cable_has_a_bucket_with_bands() -> None:
-    with Bed() as bed:
-        [host] = bed.lab.hosts("a")
-        shape(host)
-        shape(host)
-        shown = subprocess.run(
-            ["tc", "-n", host.namespace, "qdisc", "show", "dev", "eth0"], capture_output=True, text=True, check=True
-        ).stdout
-    assert "tbf 1: root" in shown
-    assert "rate 100Mbit" in shown
-    assert "pfifo_fast 10: parent 1:1" in shown

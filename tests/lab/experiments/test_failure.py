@@ -8,7 +8,7 @@ import pytest
 
 from lab.bed.plan import Plan
 from lab.experiments.failure import EXPERIMENT, NODES
-from lab.experiments.failure_findings import FLOWS, RATE, SCENARIOS, Fate, fates
+from lab.experiments.failure_findings import FLOWS, RATE, SCENARIOS, FlowLosses, outcomes
 from lab.experiments.model import Cell, Measured, Results, Value
 from lab.findings import Claim, Findings
 from lab.frames import frame
@@ -45,7 +45,7 @@ def cell(scenario: str, system: str = "rmpa", client: str = "roscpp") -> Cell:
     return Cell("failure", {"system": system, "client": client, "scenario": scenario, "round": 1})
 
 
-def fate_of(key: str, found: list[Fate]) -> Fate:
+def outcome_of(key: str, found: list[FlowLosses]) -> FlowLosses:
     return next(one for one in found if one.flow.key == key)
 
 
@@ -68,7 +68,7 @@ def test_both_systems_take_turns_and_without_cables_none_is_cut() -> None:
 
 
 def test_a_flow_that_nothing_happens_to_loses_nothing() -> None:
-    found = fates(cell("host"), measured(run(), on=300 * STEP, on_up=310 * STEP))
+    found = outcomes(cell("host"), measured(run(), on=300 * STEP, on_up=310 * STEP))
     assert [(one.due, one.lost, one.late, one.outage, one.back) for one in found] == [
         (len(COUNTED), 0, 0, 0.0, True)
     ] * 5
@@ -78,7 +78,7 @@ def test_a_flow_that_nothing_happens_to_loses_nothing() -> None:
 
 def test_what_was_due_while_a_host_was_away_is_lost_and_the_time_until_it_runs_is_told() -> None:
     rows = run(("cmd-velocity", range(100, 320)))
-    found = fate_of("cmd-velocity", fates(cell("host"), measured(rows, on=300 * STEP, on_up=315 * STEP)))
+    found = outcome_of("cmd-velocity", outcomes(cell("host"), measured(rows, on=300 * STEP, on_up=315 * STEP)))
     assert found.lost == 220
     assert found.back
     assert found.after_start == pytest.approx(20 / RATE + 0.001)
@@ -88,9 +88,9 @@ def test_what_was_due_while_a_host_was_away_is_lost_and_the_time_until_it_runs_i
 
 def test_messages_from_before_the_failure_and_from_the_last_moment_do_not_count() -> None:
     rows = run(("cmd-pc", range(100)), ("vel-pc", range(585, 600)))
-    found = fates(cell("host"), measured(rows))
-    assert fate_of("cmd-pc", found).lost == 0
-    assert fate_of("vel-pc", found).lost == 0
+    found = outcomes(cell("host"), measured(rows))
+    assert outcome_of("cmd-pc", found).lost == 0
+    assert outcome_of("vel-pc", found).lost == 0
 
 
 def test_what_comes_late_is_late_and_not_lost() -> None:
@@ -99,7 +99,7 @@ def test_what_comes_late_is_late_and_not_lost() -> None:
         for key, number, due, came in run()
         if isinstance(due, int)
     ]
-    found = fate_of("vel-base", fates(cell("cable"), measured(rows, on=240 * STEP, on_up=240 * STEP)))
+    found = outcome_of("vel-base", outcomes(cell("cable"), measured(rows, on=240 * STEP, on_up=240 * STEP)))
     assert (found.lost, found.late) == (0, 45)  # those due more than 0.1 s before
     assert found.outage == pytest.approx(51 / RATE, abs=0.002)
     assert found.after_start == pytest.approx(10 / RATE)
@@ -108,7 +108,9 @@ def test_what_comes_late_is_late_and_not_lost() -> None:
 def test_one_that_never_comes_back_is_told_and_what_hands_did() -> None:
     rows = run(("vel-base", range(100, 600)))
     rows += [("vel-base", number, END + number * STEP, END + number * STEP) for number in range(1, 9)]
-    found = fate_of("vel-base", fates(cell("master", "classic"), measured(rows, 5, node=150 * STEP, by_hand=END)))
+    found = outcome_of(
+        "vel-base", outcomes(cell("master", "classic"), measured(rows, 5, node=150 * STEP, by_hand=END))
+    )
     assert not found.back
     assert found.lost == len(COUNTED)
     assert found.after_start is None
@@ -116,17 +118,17 @@ def test_one_that_never_comes_back_is_told_and_what_hands_did() -> None:
 
 
 def test_a_flow_without_a_single_message_lost_all() -> None:
-    found = fate_of("vel-pc", fates(cell("master"), measured(run(("vel-pc", range(600))))))
+    found = outcome_of("vel-pc", outcomes(cell("master"), measured(run(("vel-pc", range(600))))))
     assert (found.lost, found.back) == (found.due, False)
     assert found.due == pytest.approx(len(COUNTED), abs=1)
 
 
 def test_a_node_that_crashed_is_measured_from_its_own_start() -> None:
     rows = run(("vel-base", range(150, 200)))
-    found = fates(
+    found = outcomes(
         cell("master"), measured(rows, node=150 * STEP, node_up=180 * STEP, on=300 * STEP, on_up=300 * STEP)
     )
-    crashed = fate_of("vel-base", found)
+    crashed = outcome_of("vel-base", found)
     assert crashed.touched
     assert crashed.after_start == pytest.approx(1.001)
     assert crashed.after_up == pytest.approx(0.401)

@@ -167,7 +167,7 @@ class _Reader:
         with self._errors():
             self._give()
             self._parser.close()
-            params = cast(tuple[XmlRpcValue, ...], self._unmarshaller.close())
+            params = cast("tuple[XmlRpcValue, ...]", self._unmarshaller.close())
         return self._unmarshaller.getmethodname(), params
 
     def _give(self) -> None:

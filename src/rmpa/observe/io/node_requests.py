@@ -1,8 +1,7 @@
-"""Nodes across modules: the control socket's op ``node``, and the peers' questions about this module's nodes."""
+"""The peers' requests about this module's nodes: list, describe, ping and end them."""
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from typing import TYPE_CHECKING, Any, Final
 
@@ -14,16 +13,14 @@ from rmpa.bridge.policy import OWN_NODE, is_own
 from rmpa.bridge.proxy_names import proxied_node
 from rmpa.config import limits as config_limits
 from rmpa.config.values import did_you_mean
-from rmpa.core.errors import ConfigError, RmpaError
+from rmpa.core.errors import RmpaError
 from rmpa.core.names import is_global_name, matches
 from rmpa.ros.core.node_calls import end_node, ping_node
-from rmpa.ros.node_info import NodeEnd, NodeFacts, NodeLine, NodePing, PeerNodes, describe_node, list_nodes
+from rmpa.ros.node_info import NodeEnd, NodeFacts, NodeLine, NodePing, describe_node, list_nodes
 from rmpa.runtime.event_loop import yielding_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rmpa.bridge.io.bridge import Bridge
+    from rmpa.bridge.session.peer_rpc import PeerRpc
     from rmpa.bridge.session.peer_session import PeerSession
     from rmpa.config.settings import Settings
     from rmpa.ros.core.api import Core
@@ -31,73 +28,35 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 LIST: Final = "node.list"
-"""The question to a peer: its module's own nodes (``NodeLine``, a list)."""
+"""The request for a module's own nodes."""
 INFO: Final = "node.info"
-"""The question to a peer: what is known of its ``node`` (``NodeFacts``)."""
+"""The request for what is known of a ``node``."""
 PING: Final = "node.ping"
-"""The question to a peer: does its ``node`` answer (``NodePing``)."""
-QUESTIONS: Final = (LIST, INFO, PING, KILL)
+"""The request to ping a ``node``."""
+REPLIES: Final[dict[str, object]] = {LIST: tuple[NodeLine, ...], INFO: NodeFacts, PING: NodePing, KILL: NodeEnd}
+"""What each request is replied by; ``KILL`` ends a ``node``, where ``nodes.kill`` allows it."""
 
 
 class NodeRequests:
-    """Answers questions about this module's nodes, and passes those about others' on.
+    """Answers the peers' requests about this module's nodes.
 
     Args:
         settings: The agent's.
         core: Its ROS core.
-        bridge: Its bridge.
-        attached: Finds the linked peer that a user names; raises if there is none.
+        asks: Brings the requests.
     """
 
-    def __init__(
-        self, settings: Settings, core: Core, bridge: Bridge, attached: Callable[[str], PeerSession]
-    ) -> None:
+    def __init__(self, settings: Settings, core: Core, asks: PeerRpc) -> None:
         self._settings = settings
         self._core = core
-        self._bridge = bridge
-        self._attached = attached
-        bridge.asks.on(LIST, self._list)
-        bridge.asks.on(INFO, self._info)
-        bridge.asks.on(PING, self._ping)
-        bridge.asks.on(KILL, self._kill)
+        asks.on(LIST, self._list)
+        asks.on(INFO, self._info)
+        asks.on(PING, self._ping)
+        asks.on(KILL, self._kill)
 
     def reload(self, settings: Settings) -> None:
         """Other settings hold from now on."""
         self._settings = settings
-
-    # --- the control socket --------------------------------------------------------------------------------------
-
-    async def ask(self, args: dict[str, object]) -> Any:
-        """Pass a question on to a peer, ``{peer, what, node}``; or without a peer: list the nodes of all peers.
-
-        Raises:
-            ConfigError: It is no question of ours.
-            UnreachableError: There is no such peer.
-            PeerRefused: The peer says no.
-        """
-        what, peer = str(args.get("what", "")), args.get("peer")
-        if what not in QUESTIONS:
-            near = did_you_mean(what, QUESTIONS)
-            raise ConfigError("what", f"{what!r} is no question", f"did you mean {near}?" if near else "")
-        if peer is None:
-            everyone = list(self._bridge.attached())
-            return await asyncio.gather(*(self._list_of(attached) for attached in everyone))
-        attached = self._attached(str(peer))
-        if what == LIST:
-            return [await self._list_of(attached)]
-        question = {"node": str(args.get("node", "")), "by": OWN_NODE, "reason": "user request"}
-        return await self._bridge.asks.ask(attached, what, question, bridge_limits.NODE_KILL_TIMEOUT)
-
-    async def _list_of(self, attached: PeerSession) -> PeerNodes:
-        peer = attached.link.name
-        try:
-            value = await self._bridge.asks.ask(attached, LIST, {})
-            return PeerNodes(peer=peer, nodes=msgspec.convert(value, tuple[NodeLine, ...]))
-        except (RmpaError, msgspec.ValidationError) as error:
-            nodes = tuple(NodeLine(name=node) for node, _ in attached.proxies)
-            return PeerNodes(peer=peer, nodes=nodes, problem=str(error))
-
-    # --- the peers' questions ------------------------------------------------------------------------------------
 
     def _list(self, _asker: PeerSession, _args: dict[str, Any]) -> tuple[NodeLine, ...]:
         state = self._core.state()
@@ -129,14 +88,14 @@ class NodeRequests:
             raise RmpaError(f"no glob of nodes.kill in the rmpa.toml of {here} fits {node}; allow it there")
         _log.warning("= %s ends %s", who, node)
         gone = await end_node(node, uri, OWN_NODE, f"killed by {who}")
-        self._core.suspect(node)  # roscpp's leaves its registrations behind if it ends in a hurry
+        self._core.suspect(node)  # roscpp leaves its registrations behind when it ends in a hurry
         return NodeEnd(gone=gone)
 
     def _own(self, args: dict[str, Any]) -> tuple[str, str]:
-        """The node of this module that a question names, and its slave API.
+        """The node of this module that a request names, and its slave API.
 
         Raises:
-            RmpaError: There is none of that name.
+            RmpaError: There is no such node.
         """
         here = self._settings.name
         node = args.get("node")

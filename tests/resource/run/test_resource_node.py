@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.core.errors import ConfigError, PeerRefused
-from rmpa.resource.decide.adaptation import AdaptationSettings
 from rmpa.resource.decide.lifecycle import Transition
+from rmpa.resource.declare.adaptation_settings import AdaptationSettings
 from rmpa.resource.declare.resource import Resource
-from rmpa.resource.run.member import Member, run_all
+from rmpa.resource.run.resource_node import ResourceNode, run_all
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.http.client import call_api
 from rmpa.ros.node.node import Node
@@ -62,7 +62,7 @@ async def test_a_resource_lives_and_says_what_it_lacks(core: RosCore) -> None:
     one = echo(on_failure="deactivate")
     for event in ("configure", "activate", "deactivate", "finalize"):
         one.on(event)(lambda event=event: events.append(event))
-    member = Member(one, core.uri, window=0.1)
+    member = ResourceNode(one, core.uri, window=0.1)
     await member.start()
     assert events == ["configure", "activate"]
     async with Node("watcher", master_uri=core.uri) as node:
@@ -93,16 +93,16 @@ async def test_a_resource_lives_and_says_what_it_lacks(core: RosCore) -> None:
     assert core.state().nodes.keys() <= {"/rosout"}
 
 
-async def test_a_second_one_of_its_name_is_refused_and_the_first_lives_on(core: RosCore) -> None:
-    member = Member(echo(), core.uri)
+async def test_second_node_of_a_name_is_refused(core: RosCore) -> None:
+    member = ResourceNode(echo(), core.uri)
     await member.start()
     with pytest.raises(PeerRefused, match="a node /echo runs there already"):
-        await Member(echo(), core.uri).start()
+        await ResourceNode(echo(), core.uri).start()
     assert not member.ended.is_set()
     await member.close()
 
 
-async def test_it_is_configured_with_its_parameters_before_a_profile_is_applied(core: RosCore) -> None:
+async def test_configure_runs_between_parameters_and_profile(core: RosCore) -> None:
     events: list[str] = []
     one = Resource("arm", role="acting")
     speed = one.parameter("speed", 1.0)
@@ -123,14 +123,14 @@ async def test_it_is_configured_with_its_parameters_before_a_profile_is_applied(
 
     async with Node("launch", master_uri=core.uri) as node:
         await call_api(core.uri, "setParam", node.name, "/arm/speed", 2.5)
-    member = Member(one, core.uri)
+    member = ResourceNode(one, core.uri)
     await member.start()
     await member.close()
     assert events == ["configure 2.5", "profile", "activate"]
 
 
 @pytest.mark.parametrize("event", ["configure", "activate"])
-async def test_a_hook_that_raises_is_why_it_does_not_start(core: RosCore, event: str) -> None:
+async def test_failing_hook_prevents_the_start(core: RosCore, event: str) -> None:
     events: list[str] = []
     one = echo()
     one.on("finalize")(lambda: events.append("finalize"))
@@ -140,20 +140,20 @@ async def test_a_hook_that_raises_is_why_it_does_not_start(core: RosCore, event:
         raise OSError("no such device")
 
     with pytest.raises(PeerRefused, match=f"{event}: OSError: no such device"):
-        await Member(one, core.uri).start()
+        await ResourceNode(one, core.uri).start()
     assert "/echo" not in core.state().nodes
     assert events == ["finalize"]
 
 
 def test_a_resource_without_a_profile_is_refused() -> None:
     async def make() -> None:
-        Member(Resource("bare", role="sensing"), "http://127.0.0.1:1/")
+        ResourceNode(Resource("bare", role="sensing"), "http://127.0.0.1:1/")
 
     with pytest.raises(ConfigError, match="it has no System Profile; declare one"):
         asyncio.run(make())
 
 
-async def test_several_run_until_they_are_told_to_stop(core: RosCore) -> None:
+async def test_resources_run_until_stopped(core: RosCore) -> None:
     stop, ready = asyncio.Event(), asyncio.Event()
     other = Resource("other", role="sensing")
     other.profile(offers={}, name="plain")(lambda: None)
@@ -184,16 +184,16 @@ class Loud:
         await asyncio.sleep(0)
 
 
-async def test_nothing_leaves_unless_the_resource_is_active(core: RosCore, caplog: pytest.LogCaptureFixture) -> None:
+async def test_outputs_send_only_while_active(core: RosCore, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO", "rmpa")
     loud = Loud()
     words: list[str] = []
     modes: list[str] = []
-    member = Member(loud.resource, core.uri, settings=AdaptationSettings(dwell=0.0))
+    member = ResourceNode(loud.resource, core.uri, settings=AdaptationSettings(dwell=0.0))
     async with Node("ear", master_uri=core.uri) as node, asyncio.timeout(40):
         await node.subscribe("/loud/words", "std_msgs/String", lambda m: words.append(m.message.data))
         await node.subscribe("/loud/mode", "std_msgs/String", lambda m: modes.append(m.message.data))
-        await member.runtime.start()
+        await member.runtime.start(member.parts)
         while not (member.runtime._publishers["words"].subscribers and member.adapter.loop.profile == "plain"):
             await asyncio.sleep(0.01)
         while not member.runtime._publishers["mode"].subscribers:
@@ -202,7 +202,7 @@ async def test_nothing_leaves_unless_the_resource_is_active(core: RosCore, caplo
             await loud.thread()
         member.adapter.pin("other")
         await member.adapter.settled()
-        await member._turn(Transition.ACTIVATE)
+        await member._change_state(Transition.ACTIVATE)
         await loud.thread()
         while len(words) < 2 or not modes:
             await asyncio.sleep(0.01)

@@ -1,4 +1,4 @@
-"""Reads what a user declares a resource with: functions, a contract's words, one word of several."""
+"""Checks arguments of a declaration: functions, keys of a contract, members of an ``Enum``."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 
-def check_takes(function: Callable[..., object], count: int, where: str) -> None:
-    """Check that a function can be called with so many arguments.
+def check_arity(function: Callable[..., object], count: int, where: str) -> None:
+    """Check that a function can be called with ``count`` arguments.
 
     Raises:
         ConfigError: It cannot.
@@ -28,25 +28,25 @@ def check_takes(function: Callable[..., object], count: int, where: str) -> None
         name = getattr(function, "__name__", "its function")
         raise ConfigError(where, f"{name} cannot be called {what}: {error}", "change its arguments") from None
     except ValueError:
-        pass  # something that tells nothing of itself
+        pass  # a callable without a signature, such as some built-in ones
 
 
-def read_contract(where: str, words: Mapping[str, object]) -> Contract:
-    """The contract of an output or input, from the words of a ``[[contract]]``.
+def read_contract(where: str, terms: Mapping[str, object]) -> Contract:
+    """The contract of an output or input, from the keys of a ``[[contract]]`` (docs/contracts.md).
 
     Raises:
-        ConfigError: A word that no contract has, or a value that it cannot have.
+        ConfigError: An unknown key, or an invalid value.
     """
     known = [key for key in LISTS["contract"] if key not in ("topics", "types")]
-    for word in words:
-        if word not in known:
-            near = did_you_mean(word, known)
+    for term in terms:
+        if term not in known:
+            near = did_you_mean(term, known)
             remedy = f"did you mean {near}?" if near else f"known here: {', '.join(known)}"
-            raise ConfigError(where, f"a contract has no {word!r}", remedy)
-    if not words:
+            raise ConfigError(where, f"a contract has no {term!r}", remedy)
+    if not terms:
         return Contract()
     try:
-        rules = read_contracts([{"topics": ["/**"], **words}]).rules
+        rules = read_contracts([{"topics": ["/**"], **terms}]).rules
     except BadValue as error:
         key = error.at[-1] if error.at else ""
         remedy = error.remedy or (f"did you mean {error.better}?" if error.better else "")
@@ -54,15 +54,15 @@ def read_contract(where: str, words: Mapping[str, object]) -> Contract:
     return Contract(**rules[0].values)  # type: ignore[arg-type] # as Rule.values promises
 
 
-def read_word(kind: type[Any], word: str, where: str) -> Any:
-    """A member of an ``Enum``, from its value.
+def read_enum(kind: type[Any], text: str, where: str) -> Any:
+    """The member of an ``Enum`` with this value.
 
     Raises:
         ConfigError: It has no such value.
     """
-    words = [item.value for item in kind]
-    if word not in words:
-        near = did_you_mean(word, words)
-        remedy = f"did you mean {near}?" if near else f"it is one of {', '.join(words)}"
-        raise ConfigError(where, f"{word!r} is not known here", remedy)
-    return kind(word)
+    known = [item.value for item in kind]
+    if text not in known:
+        near = did_you_mean(text, known)
+        remedy = f"did you mean {near}?" if near else f"it is one of {', '.join(known)}"
+        raise ConfigError(where, f"{text!r} is not known here", remedy)
+    return kind(text)

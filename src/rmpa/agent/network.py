@@ -1,22 +1,24 @@
-"""An agent's place in the network: one GUID, its port, its discovery and its links.
+"""An agent's place in the network: its GUID and mesh port, discovery and mesh, wired to the bridge.
 
-When the addresses of the machine change so that the GUID's own is no longer among them (an agent that started
-before the network did has 127.0.0.1), the agent leaves with a goodbye and takes a new place; its core and the
-local graph do not notice.
+When the machine loses the address in the GUID (an agent that started before the network did has 127.0.0.1), the agent
+leaves with a goodbye and joins under a new GUID. Its core and the local graph do not notice.
 """
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits
+from rmpa.core.errors import RmpaError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.discovery.events import PeerChanged, PeerConflict, PeerFound, PeerLost, PeerRestarted
 from rmpa.discovery.io.discovery import Discovery
 from rmpa.discovery.io.interfaces import choose, further_addresses, list_interfaces, pick_address
+from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
 from rmpa.mesh.peering import LinkDown, LinkDownCause
@@ -43,12 +45,12 @@ class NetworkEndpoint:
 
     Args:
         settings: The agent's settings.
-        bridge: Told of links, their messages and their end.
-        port: The mesh port to take; 0 lets the system choose.
-        on_displaced: Called when the machine's addresses no longer fit the identity.
+        bridge: Gets links, their messages and their end.
+        port: The mesh port; 0 lets the system choose.
+        on_displaced: Called when the machine has lost the address in the GUID.
 
     Raises:
-        StartError: The port cannot be had.
+        StartError: The port cannot be bound.
     """
 
     def __init__(self, settings: Settings, bridge: Bridge, *, port: int, on_displaced: Callable[[], None]) -> None:
@@ -87,13 +89,13 @@ class NetworkEndpoint:
         self._udp = udp
 
     async def start(self) -> None:
-        """Accept links, then say that we are here."""
+        """Accept links, then send beacons."""
         await self.mesh.start()
         await self.discovery.start()
         _log.info("= %s, domain %d, is on the air", self.identity, self.identity.domain)
 
     async def close(self) -> None:
-        """Say goodbye, end the links in order."""
+        """Send the goodbye, and close the links in order."""
         await self.discovery.close()
         self._udp.close()
         await self.mesh.close()
@@ -113,36 +115,93 @@ class NetworkEndpoint:
                 _log.info("- %s %s", identity, reason.value)
                 self.mesh.peer_gone(identity.guid)
             case PeerConflict():
-                pass  # said by the discovery, no more often than a log can bear
+                pass  # discovery has logged it, at a bounded rate
 
     def _link_up(self, link: PeerLink) -> None:
-        # Its beacons' port is its mesh port, whichever port an accepted connection came from.
+        # Its beacons come from its mesh port; an accepted connection may come from any port.
         self.discovery.link_up(link.identity, (link.remote_endpoint[0], link.identity.guid.port))
         self._bridge.sessions.link_up(link)
 
     def _link_down(self, link: PeerLink, down: LinkDown) -> None:
         self._bridge.sessions.link_down(link)
-        if down.cause is not LinkDownCause.REPLACED:  # the peer is still linked, and keeps its place in the roster
+        if down.cause is not LinkDownCause.REPLACED:  # else its peer stays linked, and keeps its endpoint
             self.discovery.link_down(link.identity.guid, link.identity.instance)
 
     def _interfaces(self, everything: tuple[Interface, ...]) -> bool:
-        """Whether we stay where we are."""
+        """The machine's interfaces have changed; returns whether the GUID still fits."""
         displaced = is_displaced(self.identity.guid.address, everything, self._settings.interfaces)
         if displaced:
             self._on_displaced()
         return not displaced
 
 
-def is_displaced(ours: IPv4Address, everything: tuple[Interface, ...], wanted: tuple[str, ...]) -> bool:
-    """Whether another address must stand for us.
-
-    An interface without its cable keeps its address, which comes back with it; until then links by other interfaces
-    go on. An address that is gone altogether may come back too (a lease renewed), but not one that was replaced.
+class Network:
+    """Keeps an agent in the network, and moves it to a new endpoint when it has lost its address.
 
     Args:
-        ours: The address in our GUID.
+        settings: The agent's settings.
+        bridge: Its bridge.
+    """
+
+    def __init__(self, settings: Settings, bridge: Bridge) -> None:
+        self._settings = settings
+        self._bridge = bridge
+        self._moving: asyncio.Task[None] | None = None
+        self.endpoint: NetworkEndpoint | None = None
+        """The place now; ``None`` before the start, and while the agent moves."""
+
+    async def start(self) -> None:
+        """Join the network.
+
+        Raises:
+            StartError: The mesh's port is taken.
+        """
+        await self._join(self._settings.port)
+
+    async def close(self) -> None:
+        """Leave the network."""
+        if self._moving is not None:
+            self._moving.cancel()
+        await self._leave()
+
+    async def _join(self, port: int) -> None:
+        self.endpoint = NetworkEndpoint(self._settings, self._bridge, port=port, on_displaced=self._displaced)
+        await self.endpoint.start()
+
+    async def _leave(self) -> None:
+        if self.endpoint is not None:
+            endpoint, self.endpoint = self.endpoint, None
+            await endpoint.close()
+
+    def _displaced(self) -> None:
+        if self._moving is None:
+            self._moving = asyncio.create_task(self._move(), name="move to the new address")
+
+    async def _move(self) -> None:
+        try:
+            port = self.endpoint.port if self.endpoint is not None else self._settings.port
+            _log.info("= the machine's addresses have changed: taking a new GUID")
+            await self._leave()
+            while self.endpoint is None:
+                try:
+                    await self._join(port)
+                except RmpaError as error:
+                    _log.warning("! cannot join with the new address yet: %s", error)
+                    await asyncio.sleep(mesh_limits.JOIN_RETRY)
+        finally:
+            self._moving = None
+
+
+def is_displaced(ours: IPv4Address, everything: tuple[Interface, ...], wanted: tuple[str, ...]) -> bool:
+    """Whether the agent needs a GUID with another address.
+
+    An interface without its cable keeps its address, and links by other interfaces go on meanwhile. An address that
+    is gone may come back too (a lease is renewed), but not one in whose place there is another.
+
+    Args:
+        ours: The address in the GUID.
         everything: All interfaces, up or not.
-        wanted: The names of those that the user chose; empty means all.
+        wanted: The names of the interfaces that the settings give; empty for all.
     """
     if pick_address(choose(everything, wanted)).is_loopback:
         return False

@@ -1,4 +1,4 @@
-"""What this agent knows of one topic on its way: for its own user, and for the agent at the other end."""
+"""What this agent knows of a topic on its path: for its own user, and for the agent at the other end."""
 
 from __future__ import annotations
 
@@ -13,7 +13,13 @@ from rmpa.config.values import did_you_mean
 from rmpa.core.contract import Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.names import is_global_name
-from rmpa.observe.why.diagnosis import FarSource, FarTopic, NearTopic, Reader
+from rmpa.observe.why.diagnosis import (
+    ProxyState,
+    PublisherReport,
+    SubscriberConnection,
+    TopicAtPublisher,
+    TopicAtSubscriber,
+)
 from rmpa.ros.wire.tcpros import printable
 from rmpa.runtime.event_loop import yielding_to_data
 
@@ -26,20 +32,20 @@ if TYPE_CHECKING:
     from rmpa.ros.core.api import Core
 
 
-class TopicFacts:
-    """Reads the rooms; changes nothing.
+class TopicEvidence:
+    """Reads what the rooms know of one topic; changes nothing.
 
     Args:
         settings: The agent's.
         core: Its ROS core.
         bridge: Its bridge.
-        view: Its snapshots.
+        snapshots: Its snapshots.
     """
 
-    def __init__(self, settings: Settings, core: Core, bridge: Bridge, view: SnapshotBuilder) -> None:
+    def __init__(self, settings: Settings, core: Core, bridge: Bridge, snapshots: SnapshotBuilder) -> None:
         self._core = core
         self._bridge = bridge
-        self._view = view
+        self._snapshots = snapshots
         self.reload(settings)
 
     def reload(self, settings: Settings) -> None:
@@ -55,60 +61,48 @@ class TopicFacts:
         return [f"{node} at {uri}" for node, uri in self._core.awaited(topic).items()]
 
     def there(self, peer: str, topic: str) -> tuple[str, str]:
-        """A topic of a peer, as a user names it: its name here, and over there.
+        """The names of a topic of a peer here and at the peer.
 
-        Where the rules for that peer leave nothing that has this name here, it is taken for the peer's own name.
+        A user may write either: a name that no topic of the peer can have here is taken for the peer's own.
         """
         names = self._bridge.names.of(peer)
         wires = names.wires_of(topic)
         return (topic, wires[0]) if wires else (names.local_name(topic), topic)
 
-    def near(self, attached: PeerSession | None, peer: PeerInfo | None, topic: str) -> NearTopic:
+    def here(self, session: PeerSession | None, peer: PeerInfo | None, topic: str) -> TopicAtSubscriber:
         """What is known here of a topic that a peer publishes.
 
         Args:
-            attached: Whose link brings it, if one does.
-            peer: Whose it is.
+            session: The session whose link carries it, if one does.
+            peer: The module of its publishers.
             topic: Its name here.
         """
-        snapshot = self._view.snapshot(frozenset({topic}))
-        if attached is None or peer is None:
-            return NearTopic(snapshot, topic)
-        only, registered, conflict = set(), set(), set()
-        readers, mismatches, proxies = {}, {}, {}
-        publishers, standing = self._core.publishers(topic), dict(attached.proxies)
+        snapshot = self._snapshots.build(frozenset({topic}))
+        if session is None or peer is None:
+            return TopicAtSubscriber(snapshot, topic)
+        proxies = {}
+        publishers, standing = self._core.publishers(topic), dict(session.proxies)
         for number, source in list(self._bridge.imports.at(topic)):
             entry = self._bridge.imports.get(number, source)
-            if number != attached.peer or entry is None:
+            if number != session.peer or entry is None:
                 continue
-            if (entry.origin.instance if entry.origin else attached.link.identity.instance.hex()) != peer.instance:
+            if (entry.origin.instance if entry.origin else session.link.identity.instance.hex()) != peer.instance:
                 continue
             node = source.node
-            only.add(node)
-            if entry.conflict:
-                conflict.add(node)
-            name = attached.proxies.name(node)
-            proxies[node] = name
-            if node in standing and publishers.get(name) == standing[node].node.uri:
-                registered.add(node)
-            readers[node] = self._readers(attached, source)
-            mismatches[node] = self._bridge.mismatches(source)
-        return NearTopic(
-            snapshot,
-            topic,
-            attached.link.name,
-            frozenset(only),
-            proxies,
-            frozenset(registered),
-            frozenset(conflict),
-            readers,
-            mismatches,
-        )
+            name = session.proxies.name(node)
+            proxies[node] = ProxyState(
+                name=name,
+                registered=node in standing and publishers.get(name) == standing[node].node.uri,
+                conflict=entry.conflict,
+                connections=self._connections(session, source),
+                mismatches=self._bridge.mismatches(source),
+            )
+        return TopicAtSubscriber(snapshot, topic, session.link.name, proxies)
 
-    def _readers(self, attached: PeerSession, source: Source) -> tuple[Reader, ...]:
-        publication = self._bridge.topics.of(attached).publication(source)
+    def _connections(self, session: PeerSession, source: Source) -> tuple[SubscriberConnection, ...]:
+        publication = self._bridge.topics.of(session).publication(source)
         return tuple(
-            Reader(
+            SubscriberConnection(
                 number=link.number,
                 node=printable(link.other),
                 held=not link.connected,
@@ -119,53 +113,53 @@ class TopicFacts:
             for link in (publication.connections() if publication is not None else ())
         )
 
-    async def tell(self, attached: PeerSession, args: dict[str, Any]) -> FarTopic:
-        """Answer the agent that should receive a topic.
+    async def answer(self, session: PeerSession, args: dict[str, Any]) -> TopicAtPublisher:
+        """The reply to ``why.topic``.
 
         Args:
-            attached: Who asks.
-            args: ``topic``: its name on the way; ``instance``: the module whose it is, if we only relay it.
+            session: The peer that asks.
+            args: ``topic``: its name on the wire; ``instance``: the instance id of its module, if this module only
+                relays it.
         """
         wire = name_in(args, "topic")
         instance = args.get("instance") or ""
-        asker = attached.link.name
+        asker = session.link.name
         names = self._bridge.names.of(asker)
         state = self._core.state()
-        sources: list[FarSource] = []
+        sources: list[PublisherReport] = []
         subscribers: list[str] = []
         awaited: list[str] = []
         for topic in names.locals_of(wire):
             kind = self._core.type_of(topic)
             nodes = self._relayed(topic, instance) if instance else list(self.own(topic))
             if names.wire_name(topic, kind) == wire:
-                sources += [self._far(attached, Source(topic, node), wire) for node in nodes]
+                sources += [self._report(session, Source(topic, node), wire) for node in nodes]
                 subscribers += [node for node in state.subscribers.get(topic, {}) if not is_own(node)]
                 awaited += self.awaited(topic)
-        station = self._view.station
-        problem = station.mesh.paths.problem(attached.link) if station is not None else None
-        return FarTopic(
+        endpoint = self._snapshots.endpoint
+        problem = endpoint.mesh.paths.problem(session.link) if endpoint is not None else None
+        return TopicAtPublisher(
             path_problem=problem.text if problem is not None else "",
             path_remedy=problem.remedy if problem is not None else "",
             sources=tuple(sources[: bridge_limits.WHY_SOURCES_MAX]),
             subscribers=tuple(subscribers[: bridge_limits.WHY_SOURCES_MAX]),
-            near="" if sources else await self._nearest(attached.link.name, wire),
+            similar="" if sources else await self._similar(session.link.name, wire),
             awaited=tuple(awaited[: bridge_limits.WHY_SOURCES_MAX]),
         )
 
-    async def _nearest(self, asker: str, wire: str) -> str:
-        """The topic of ours whose name over there is most like this one; empty if none is."""
+    async def _similar(self, asker: str, wire: str) -> str:
+        """The topic of this module whose name on the wire is most like this one; empty if none is."""
         names, state = self._bridge.names.of(asker), self._core.state()
         known = {
             names.wire_name(topic, state.types.get(topic, ""))
             for topic, nodes in yielding_to_data(list(state.publishers.items()))
             if not all(map(is_own, nodes))
         }
-        # To compare with thousands of names takes longer than a message may wait.
-        near = await asyncio.to_thread(did_you_mean, wire, known)
-        return near or ""
+        # In a thread: comparing thousands of names takes longer than a message may wait.
+        return await asyncio.to_thread(did_you_mean, wire, known) or ""
 
     def _relayed(self, topic: str, instance: object) -> list[str]:
-        """What stands here for the nodes of a module whose topic we pass on."""
+        """The proxies of the nodes of a module whose topic this one relays."""
         offered = self._bridge.exports.offered
         return [
             node
@@ -175,29 +169,29 @@ class TopicFacts:
             and local.origin.instance == instance
         ]
 
-    def _far(self, attached: PeerSession, source: Source, wire: str) -> FarSource:
+    def _report(self, session: PeerSession, source: Source, wire: str) -> PublisherReport:
         exports = self._bridge.exports
         local = exports.offered.get(source)
         kind = local.type if local is not None else self._core.type_of(source.topic)
         node = source.node if local is None or local.origin is None else local.origin.node
         decision = self._policy.judge(source.topic, kind, node)
         if decision.allowed:
-            special = self._policy.judge_for(attached.link.name, source.topic, kind, wire)
+            special = self._policy.judge_for(session.link.name, source.topic, kind, wire)
             decision = special if special.rule else decision
         flow = self._bridge.outbound.flows.get(source)
-        contract = exports.contract(source, attached.peer)
+        contract = exports.contract(source, session.peer)
         reliable = contract is not None and contract.reliability is Reliability.RELIABLE
-        return FarSource(
+        return PublisherReport(
             node=source.node,
             topic=source.topic,
             type=kind,
             crosses=decision.allowed,
             rule=decision.rule,
-            offered=exports.offer(attached.peer, source) is not None,
-            route="open" if attached.peer in exports.flowing(source) else "opening" if contract is not None else "",
+            offered=exports.offer(session.peer, source) is not None,
+            route="open" if session.peer in exports.flowing(source) else "opening" if contract is not None else "",
             messages=flow.messages if flow is not None else 0,
             dropped=flow.dropped if flow is not None and not reliable else 0,
-            lost=self._bridge.outbound.lost(source, attached.peer),
+            lost=self._bridge.outbound.lost(source, session.peer),
             oversized=flow.oversized if flow is not None else 0,
             oversized_bytes=flow.oversized_bytes if flow is not None else 0,
             beyond=exports.beyond.limit if exports.is_beyond(source) else 0,
@@ -210,10 +204,10 @@ class TopicFacts:
 
 
 def name_in(args: dict[str, Any], key: str) -> str:
-    """A name in a question of another agent.
+    """The argument ``key`` of a peer's request, a ROS name.
 
     Raises:
-        RemoteProtocolError: It is none.
+        RemoteProtocolError: It is not a ROS name.
     """
     name = args.get(key)
     if not isinstance(name, str) or len(name) > config_limits.CROSSING_NAME_MAX or not is_global_name(name):

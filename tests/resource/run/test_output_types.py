@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import pytest
 
 from rmpa.resource.declare.resource import Resource
-from rmpa.resource.run.member import Member, run_all
+from rmpa.resource.run.resource_node import ResourceNode, run_all
 from rmpa.ros import limits
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
@@ -67,7 +67,7 @@ async def run(core: RosCore, one: Resource, heard: list[int], change: asyncio.Ev
     async with Node("around", master_uri=core.uri) as node:
         publisher = await node.advertise("/in", FOO)
         results = await node.subscribe("/out", FOO)
-        member = Member(one, core.uri, window=0.1)
+        member = ResourceNode(one, core.uri, window=0.1)
         await member.start()
         async with asyncio.timeout(30):
             await publisher.wait_for_subscriber()
@@ -155,12 +155,12 @@ def ear() -> Resource:
     return one
 
 
-async def test_a_definition_that_cannot_be_used_is_said_once(
+async def test_unusable_definition_is_reported_once(
     core: RosCore, ear: Resource, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with Node("liar", master_uri=core.uri) as node, asyncio.timeout(30):
         publisher = await node.advertise("/in", TopicDescription(NAME, "0" * 32, "int32 a"))
-        member = Member(ear, core.uri, window=0.1)
+        member = ResourceNode(ear, core.uri, window=0.1)
         await member.start()
         await publisher.wait_for_subscriber()
         for _ in range(5):

@@ -6,7 +6,7 @@ from ipaddress import IPv4Address
 
 import pytest
 
-from rmpa.bridge.io.network_endpoint import is_displaced
+from rmpa.agent.network import is_displaced
 from rmpa.discovery.io.interfaces import Interface
 
 LO = Interface("lo", 1, (IPv4Address("127.0.0.1"),), up=True, multicast=False, loopback=True)
