@@ -93,7 +93,7 @@ async def large_calls_are_made(world: World) -> None:
 
 async def the_link_falls_and_comes_back(world: World) -> None:
     for _ in range(3):
-        attached = next(iter(world.near.bridge.attached()))
+        attached = next(iter(world.near.bridge.sessions.linked()))
         attached.link.abort("pulled")
         await world.until(lambda attached=attached: attached.linked and world.linked())  # type: ignore[misc]
         await world.until(lambda: shown(world) == SERVICES)

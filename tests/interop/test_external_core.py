@@ -96,9 +96,7 @@ def test_a_new_node_is_seen_within_a_second_and_a_dead_one_hidden(joined: Callab
     talker.kill()
     # The listener's subscription to the proxy goes with the proxy: only then is the topic's last name gone there.
     eventually(lambda: "/rmpa/a/talker" not in b.ros.tool("rostopic", "info", "/chatter"), what="no proxy at b")
-    assert "/chatter" in a.topics(), (
-        "rosmaster keeps registrations, and these are not the agent's"
-    )
+    assert "/chatter" in a.topics(), "rosmaster keeps registrations, and these are not the agent's"
 
 
 def test_flows_outlive_the_roscore_and_the_next_one_gets_our_nodes(joined: Callable[..., Joined]) -> None:

@@ -42,7 +42,7 @@ def test_both_ends_say_it_and_smaller_ones_go_on(
             speaker.say(size)
             await world.rest(0.2)
         assert [number for _, number in listener.got[speaker.number]] == [1, 3, 5]
-        flow = a.bridge.outbound.flows[BIG]
+        flow = a.bridge.topics.outbound.flows[BIG]
         assert (flow.messages, flow.oversized, flow.oversized_bytes) == (3, 2, 1001)
         assert (there(world).oversized, there(world).oversized_bytes, there(world).lost) == (2, 1001, 0)
         assert a.bridge.counters["message.oversized"] == b.bridge.counters["message.oversized_there"] == 2

@@ -82,7 +82,7 @@ class Side:
     @property
     def attached(self) -> Iterator[PeerSession]:
         """The other side, as far as this one knows it."""
-        return self.bridge.everyone()
+        return iter(self.bridge.sessions)
 
     def publications(self, topic: str) -> Iterator[Publication]:
         """What local nodes can connect to."""
@@ -296,11 +296,11 @@ class World:
         """Nobody listens: nothing is connected, nothing flows, nothing is remembered of it."""
         for side in self.sides:
             bridge = side.bridge
-            assert not bridge.exports._flows
-            assert not bridge.outbound.flows
-            assert not bridge.outbound._connections
-            assert not bridge.outbound._senders
-            assert not bridge.outbound._parked
+            assert not bridge.topics.exports._flows
+            assert not bridge.topics.outbound.flows
+            assert not bridge.topics.outbound._connections
+            assert not bridge.topics.outbound._senders
+            assert not bridge.topics.outbound._parked
             for attached in side.attached:
                 topics = bridge.topics.of(attached)
                 assert not topics.flows

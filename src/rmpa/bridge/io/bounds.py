@@ -43,7 +43,7 @@ class Bounds(Part):
         self._most = most
         self._told: dict[int, tuple[Beyond, ...]] = {}
         self._there: dict[int, tuple[Beyond, ...]] = {}
-        rpc.on_tell(HIDDEN, self._told_by_peer)
+        rpc.on_notification(HIDDEN, self._told_by_peer)
 
     def here(self, peer: int) -> tuple[Beyond, ...]:
         """What of a peer is hidden here."""
@@ -76,7 +76,7 @@ class Bounds(Part):
             found = self.here(session.peer)
             if found != self._told.get(session.peer, ()):
                 self._told[session.peer] = found
-                self._rpc.tell(session, HIDDEN, to_json(found))
+                self._rpc.notify(session, HIDDEN, to_json(found))
 
     def link_up(self, session: PeerSession) -> None:
         """The peer may be another run; what is hidden is told anew."""

@@ -24,16 +24,10 @@ from rmpa.ros.node.slave_node import SlaveNode
 from rmpa.runtime.event_loop import yield_to_data
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from rmpa.bridge.data.io.route_sender import RouteSender
-    from rmpa.bridge.messages import Source
     from rmpa.bridge.session.part import Part
-    from rmpa.bridge.session.peer_session import PeerSession
-    from rmpa.bridge.topics.exports import Exports
-    from rmpa.bridge.topics.imports import Imports
-    from rmpa.bridge.topics.io.local_subscriptions import LocalSubscriptions
-    from rmpa.bridge.topics.io.loss_reports import LossReports
     from rmpa.config.settings import Settings
     from rmpa.core.identity import Identity
     from rmpa.mesh.io.link import PeerLink
@@ -68,9 +62,9 @@ class Bridge:
     ) -> None:
         self._core = core
         self.counters = Counters()
-        self.asks = PeerRpc(self.counters)
+        self.rpc = PeerRpc(self.counters)
         """Requests to the peers, and theirs."""
-        kills = RemoteKills(self.asks)
+        kills = RemoteKills(self.rpc)
         self.node = SlaveNode(
             OWN_NODE,
             core.node_host,
@@ -86,7 +80,7 @@ class Bridge:
         """Makes the nodes that stand for the nodes of peers."""
         self.receiver = DataReceiver(self.counters, self._sender)
         """Takes the data frames of the links."""
-        self._parts: list[Part] = [self.asks]
+        self._parts: list[Part] = [self.rpc]
         self._by_op: dict[str, Part] = {}
         self.sessions = PeerSessions(self._parts, self.proxy_nodes, self.receiver, kills.proxy)
         """The peers."""
@@ -96,7 +90,7 @@ class Bridge:
             core,
             self.node,
             self.sessions,
-            self.asks,
+            self.rpc,
             self.relay,
             policy,
             contracts=contracts if contracts is not None else Contracts(),
@@ -141,45 +135,6 @@ class Bridge:
             await part.close()
         await self.proxy_nodes.close()
         await self.node.close()
-
-    # --- for the monitor ---------------------------------------------------------------------------------------
-
-    @property
-    def names(self) -> Names:
-        """How names read at the peers, and theirs here."""
-        return self.topics.names
-
-    @property
-    def exports(self) -> Exports:
-        """The outbound plan of topics."""
-        return self.topics.exports
-
-    @property
-    def imports(self) -> Imports:
-        """The inbound plan of topics."""
-        return self.topics.imports
-
-    @property
-    def outbound(self) -> LocalSubscriptions:
-        """The subscriptions to local publishers."""
-        return self.topics.outbound
-
-    @property
-    def losses(self) -> LossReports:
-        """What does not reach its listeners."""
-        return self.topics.losses
-
-    def mismatches(self, source: Source) -> tuple[str, ...]:
-        """Definitions that did not fit a source's."""
-        return self.topics.mismatches(source)
-
-    def attached(self) -> Iterator[PeerSession]:
-        """Every peer whose link is up."""
-        return self.sessions.linked()
-
-    def everyone(self) -> Iterator[PeerSession]:
-        """These, and the peers whose sessions wait for a link."""
-        return iter(self.sessions)
 
     # --- the mesh's side ---------------------------------------------------------------------------------------
 

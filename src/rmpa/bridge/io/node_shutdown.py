@@ -82,7 +82,7 @@ class RemoteKills:
         self._under_way += 1
         try:
             args = {"node": node, "by": caller, "reason": reason[: limits.ASK_NAME_MAX]}
-            answer = await self._rpc.ask(session, KILL, args, limits.NODE_KILL_TIMEOUT)
+            answer = await self._rpc.request(session, KILL, args, limits.NODE_KILL_TIMEOUT)
         except RmpaError as error:
             return str(error)
         finally:

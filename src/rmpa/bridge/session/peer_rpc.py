@@ -49,19 +49,19 @@ class PeerRpc(Part):
         self._listeners: dict[str, Listener] = {}
         self._answering: dict[int, set[asyncio.Task[None]]] = {}
 
-    def on(self, what: str, handler: Handler) -> None:
+    def on_request(self, what: str, handler: Handler) -> None:
         """Answer a question from now on."""
         self._handlers[what] = handler
 
-    def on_tell(self, what: str, listener: Listener) -> None:
+    def on_notification(self, what: str, listener: Listener) -> None:
         """Take news of this name from now on."""
         self._listeners[what] = listener
 
-    def tell(self, session: PeerSession, what: str, args: dict[str, Any]) -> None:
+    def notify(self, session: PeerSession, what: str, args: dict[str, Any]) -> None:
         """Send news to a linked peer."""
         session.link.send_control(encode(Notification(what, args)))
 
-    async def ask(
+    async def request(
         self,
         session: PeerSession,
         what: str,

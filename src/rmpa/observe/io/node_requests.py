@@ -49,10 +49,10 @@ class NodeRequests:
     def __init__(self, settings: Settings, core: Core, asks: PeerRpc) -> None:
         self._settings = settings
         self._core = core
-        asks.on(LIST, self._list)
-        asks.on(INFO, self._info)
-        asks.on(PING, self._ping)
-        asks.on(KILL, self._kill)
+        asks.on_request(LIST, self._list)
+        asks.on_request(INFO, self._info)
+        asks.on_request(PING, self._ping)
+        asks.on_request(KILL, self._kill)
 
     def reload(self, settings: Settings) -> None:
         """Other settings hold from now on."""

@@ -116,7 +116,7 @@ class Side:
             await asyncio.sleep(0)
 
     async def ask(self, what: str, args: dict[str, Any], number: int = 1) -> Any:
-        return await self.asks.ask(self.links[number], what, args)
+        return await self.asks.request(self.links[number], what, args)
 
     async def drive(self, steps: Any) -> Any:
         try:
@@ -428,7 +428,7 @@ async def test_values_that_do_not_parse_change_nothing(sides: Any, caplog: pytes
     base.core.set("/arm", 1)
     join(base, pad)
     await until(lambda: pad.core.get("/arm") == 1)
-    base.asks.tell(base.links[1], transfer.VALUE, {"key": "/arm", "exists": True, "size": 3, "text": "<x>"})
+    base.asks.notify(base.links[1], transfer.VALUE, {"key": "/arm", "exists": True, "size": 3, "text": "<x>"})
     await until(lambda: pad.states() == {"/arm": "refused"})
     assert pad.core.get("/arm") == 1
     assert "/arm is not as over there" in caplog.text

@@ -53,7 +53,7 @@ class ParamFollower:
         self._asking: dict[int, asyncio.Task[None]] = {}
         self._subscribed: set[str] = set()
         self._left: set[str] = set()
-        rpc.on_tell(transfer.VALUE, self._told)
+        rpc.on_notification(transfer.VALUE, self._told)
 
     # --- what the part tells -------------------------------------------------------------------------------------
 
@@ -146,7 +146,7 @@ class ParamFollower:
         peer, name = session.peer, session.link.name
         keys = [entry.rule.key for entry in self.following if entry.peer == peer]
         try:
-            answer = await self._rpc.ask(session, transfer.FOLLOW, {"keys": keys})
+            answer = await self._rpc.request(session, transfer.FOLLOW, {"keys": keys})
             refused = answer.get("refused", {}) if isinstance(answer, dict) else {}
         except RmpaError as error:
             refused = dict.fromkeys(keys, str(error))
@@ -212,7 +212,7 @@ class ParamFollower:
         try:
             question = next(steps)
             while True:
-                question = steps.send(await self._rpc.ask(session, *question, limits.PARAM_ASK_TIMEOUT))
+                question = steps.send(await self._rpc.request(session, *question, limits.PARAM_ASK_TIMEOUT))
         except StopIteration as done:
             text = done.value
         except RmpaError:

@@ -52,13 +52,13 @@ class ParamServer:
         self._left: set[str] = set()
         self._changed: dict[str, None] = {}
         self._telling: asyncio.Task[None] | None = None
-        rpc.on(transfer.GET, self._get)
-        rpc.on(transfer.NAMES, self._names)
-        rpc.on(transfer.MORE, lambda session, args: self._of(session).more(args, self._now()))
-        rpc.on(transfer.PUT, lambda session, args: self._of(session).put(args, self._now()))
-        rpc.on(transfer.SET, self._set)
-        rpc.on(transfer.DELETE, self._delete)
-        rpc.on(transfer.FOLLOW, self._follow)
+        rpc.on_request(transfer.GET, self._get)
+        rpc.on_request(transfer.NAMES, self._names)
+        rpc.on_request(transfer.MORE, lambda session, args: self._of(session).more(args, self._now()))
+        rpc.on_request(transfer.PUT, lambda session, args: self._of(session).put(args, self._now()))
+        rpc.on_request(transfer.SET, self._set)
+        rpc.on_request(transfer.DELETE, self._delete)
+        rpc.on_request(transfer.FOLLOW, self._follow)
 
     # --- what the part tells -------------------------------------------------------------------------------------
 
@@ -99,7 +99,7 @@ class ParamServer:
             for key in [key for key in keys if self.policy.why_not_follow(key)]:
                 keys.discard(key)
                 args = {"key": key, "exists": False, "size": 0, "refused": self.policy.why_not_follow(key)}
-                self._rpc.tell(session, transfer.VALUE, args)
+                self._rpc.notify(session, transfer.VALUE, args)
         self._forget_unfollowed()
 
     async def close(self) -> None:
@@ -233,7 +233,7 @@ class ParamServer:
             self._last[key] = text if text is None or len(text) <= limits.PARAM_SMALL else ""
         for session, keys in list(self._followers.values()):
             if key in keys:
-                self._rpc.tell(session, transfer.VALUE, args)
+                self._rpc.notify(session, transfer.VALUE, args)
 
     async def _small_text(self, key: str) -> str | None:
         text = await self._core.get_text(key)

@@ -149,7 +149,7 @@ class Services(Part):
         )
         self._act = self._driver.act
         self._serving = Serving(core, self.exports, sessions, self._budgets, self._act)
-        rpc.on_tell(_MISMATCH, self._told_of_mismatch)
+        rpc.on_notification(_MISMATCH, self._told_of_mismatch)
 
     def __iter__(self) -> Iterator[ShownService]:
         """The peers' services in the local graph."""
@@ -467,7 +467,7 @@ class Services(Part):
         session, remote = self._sessions.get(shown.peer), self.imports.get(shown.peer, shown.service)
         if session is not None and session.linked and remote is not None:
             args: dict[str, Any] = {"service": remote.wire, "text": text[: limits.CONTROL_TEXT_MAX]}
-            self._rpc.tell(session, _MISMATCH, args)
+            self._rpc.notify(session, _MISMATCH, args)
 
     def _told_of_mismatch(self, session: PeerSession, args: dict[str, Any]) -> None:
         text = printable(str(args.get("text", ""))[: limits.CONTROL_TEXT_MAX])

@@ -62,7 +62,7 @@ class LossReports:
         self._rpc = rpc
         self._counters = counters
         self._refusals = refusals
-        rpc.on_tell(OVERSIZED, self._oversized_there)
+        rpc.on_notification(OVERSIZED, self._oversized_there)
 
     def away(self, peer: int) -> tuple[str, float]:
         """A peer that is away: its name, and for how many seconds it has been."""
@@ -122,7 +122,7 @@ class LossReports:
         session, offer = self._sessions.get(peer), self._exports.offer(peer, source)
         if flow.oversized and session is not None and session.linked and offer is not None:
             told = {"topic": offer.topic, "node": offer.node, "count": flow.oversized, "size": flow.oversized_bytes}
-            self._rpc.tell(session, OVERSIZED, told)
+            self._rpc.notify(session, OVERSIZED, told)
 
     def _oversized_there(self, session: PeerSession, args: dict[str, Any]) -> None:
         """A peer has left out messages of its publisher."""

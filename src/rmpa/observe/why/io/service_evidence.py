@@ -107,7 +107,7 @@ class ServiceEvidence:
         wire = name_in(args, "service")
         peer = session.link.name
         seen = self._services.exports.seen
-        for service in self._bridge.names.of(peer).locals_of(wire):
+        for service in self._bridge.topics.names.of(peer).locals_of(wire):
             server = seen.get(service)
             if server is None:
                 for node in self._core.state().services.get(service, {}):
