@@ -19,7 +19,7 @@ from rmpa.ros.wire.services import ServiceDescription
 from tests.agent.test_agent import running, settings, until
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator, Callable, Iterable
 
     from rmpa.agent import Agent
     from rmpa.mesh.io.link import PeerLink
@@ -82,9 +82,9 @@ def fall_silent(*agents: Agent) -> list[tuple[Agent, PeerLink]]:
     return links
 
 
-def come_back(links: list[tuple[Agent, PeerLink]]) -> None:
-    """They have a link again. The last one first: what the first one offers may arrive before the loop goes on."""
-    for agent, link in reversed(links):
+def come_back(links: Iterable[tuple[Agent, PeerLink]]) -> None:
+    """They have a link again; what the first one sends may come before the second one knows of it: it is dropped."""
+    for agent, link in links:
         link.silent = False
         agent.bridge.sessions.link_up(link)
 
@@ -149,7 +149,7 @@ async def test_a_link_that_stays_away_takes_its_services_and_tells_who_waits(
         assert not ok
         assert b"/add] of a: a is gone" in text
         assert provider(b) == ""
-        come_back(links)
+        come_back(reversed(links))
         await until(lambda: provider(b) == "/rmpa/a/adder")
         connection = await connect(b)
         assert await connection.call(b"2", 20.0) == (True, b"2")
