@@ -74,11 +74,13 @@ async def test_figures_of_a_topic_that_crosses(tmp_path: Path) -> None:
         publisher = await talker.advertise("/chatter", "std_msgs/String")
         subscriber = await hearer.subscribe("/chatter")
         await until(lambda: publisher.subscribers and subscriber.publishers)
-        await until(lambda: all(at.link.clock_offset is not None for at in b.bridge.attached()))
+        await until(lambda: all(at.link.clock_offset is not None for at in b.bridge.sessions.linked()))
         await send(publisher, 20, 0.01)
         await until(
             lambda: all(
-                flow.quality.messages == 20 for at in b.bridge.attached() for flow in at.inbound.flows.values()
+                flow.quality.messages == 20
+                for at in b.bridge.sessions.linked()
+                for flow in b.bridge.topics.of(at).flows.values()
             )
         )
         route = await shown("b", tmp_path, "/chatter")

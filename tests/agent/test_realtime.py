@@ -52,7 +52,7 @@ async def pair(settings: Callable[[str], Settings]) -> AsyncIterator[tuple[Agent
     a, b = Agent(settings("a")), Agent(settings("b"))
     await a.start()
     await b.start()
-    await until(lambda: len(list(a.bridge.attached())) == len(list(b.bridge.attached())) == 1)
+    await until(lambda: len(list(a.bridge.sessions.linked())) == len(list(b.bridge.sessions.linked())) == 1)
     yield a, b
     await b.close()
     await a.close()

@@ -60,6 +60,15 @@ class AbsentPeers:
             self._uncount(peer)
             self._forget(peer)
 
+    def number_of(self, identity: Identity) -> int | None:
+        """The number of this very run of a peer, if ``back`` is going to return it."""
+        for peer, absent in self._absent.items():
+            if absent.identity.instance == identity.instance:
+                return peer
+            if absent.identity.guid.place == identity.guid.place or absent.identity.name == identity.name:
+                return None
+        return None
+
     def back(self, identity: Identity) -> Absent | None:
         """Take out a peer that has a link again: the same run, or the run before of the same module."""
         for peer, absent in list(self._absent.items()):
