@@ -4,7 +4,7 @@ import asyncio
 import sys
 
 from rmpa.resource import ResourceClient, at_most
-from rmpa.ros.node.node import Node
+from rmpa.ros import Node
 
 
 async def main(master_uri: str) -> None:

@@ -263,7 +263,7 @@ async def test_slow_connections_keep_nobody_out(
         slow = [await stack.enter_async_context(client(server)) for _ in range(12)]
         for c in slow:
             c.writer.write(begin)
-        while sum(one._receiving for one in server._connections) < 8:
+        while sum(one.receiving for one in server._connections) < 8:
             await asyncio.sleep(0)
         for one in server._connections:
             one.begun -= 5.0
@@ -286,7 +286,7 @@ async def test_answers_that_nobody_reads_keep_nobody_out(
     async with client(server) as one, client(server) as other:
         for c in (one, other):
             c.writer.write(post(serialize_call("echo", ["x" * 8_000_000])))
-        while server.counters["xmlrpc.calls"] < 2 or not all(c._pending() for c in server._connections):
+        while server.counters["xmlrpc.calls"] < 2 or not all(c.pending for c in server._connections):
             await asyncio.sleep(0.001)
         assert await call(f"http://127.0.0.1:{server.port}/", "echo", 1) == [1, "127.0.0.1", [1]]
     assert server.counters["http.evicted.slow"] == 1

@@ -16,14 +16,14 @@ import socket
 from typing import Final
 from urllib.parse import urlsplit
 
-import h11
-
-from rmpa.core.errors import LimitExceeded, OutOfDescriptors, RemoteProtocolError, UnreachableError
+from rmpa.core.errors import OutOfDescriptors, UnreachableError
 from rmpa.core.sizes import KIB
 from rmpa.ros import limits
+from rmpa.ros.http.documents import read_large, slices
+from rmpa.ros.wire.http import ResponseParser, post_request
 from rmpa.ros.wire.xmlrpc import ResponseReader, RosFault, RosReply, XmlRpcValue, brief, call_pieces
 from rmpa.runtime.descriptors import DESCRIPTORS, OUT_OF_DESCRIPTORS, Use
-from rmpa.runtime.event_loop import yield_to_data, yielding_to_data
+from rmpa.runtime.event_loop import yielding_to_data
 
 __all__ = ["RosFault", "call", "call_api", "connect", "exchange", "is_own_name", "read_response", "split_uri"]
 
@@ -122,44 +122,6 @@ async def connect(host: str, port: int, use: Use = Use.DATA) -> socket.socket:
     raise error
 
 
-def _request(host: str, port: int, path: str, body: bytes) -> tuple[h11.Connection, bytes]:
-    http = h11.Connection(h11.CLIENT, max_incomplete_event_size=limits.HTTP_HEADERS_MAX)
-    headers = [
-        (b"Host", f"{host}:{port}".encode("idna" if not host.isascii() else "ascii")),
-        (b"User-Agent", b"rmpa"),
-        (b"Content-Type", b"text/xml"),
-        (b"Content-length", str(len(body)).encode("ascii")),
-        (b"Connection", b"close"),
-    ]
-    parts = [
-        http.send(h11.Request(method=b"POST", target=path.encode("ascii", "replace"), headers=headers)),
-        http.send(h11.Data(data=body)),
-        http.send(h11.EndOfMessage()),
-    ]
-    return http, b"".join(part or b"" for part in parts)
-
-
-async def _response_body(sock: socket.socket, http: h11.Connection) -> bytes:
-    loop = asyncio.get_running_loop()
-    body = bytearray()
-    while True:
-        event = http.next_event()
-        match event:
-            case h11.Data(data=data):
-                if len(body) + len(data) > limits.HTTP_BODY_MAX:
-                    raise LimitExceeded("XML-RPC response", len(body) + len(data), limits.HTTP_BODY_MAX)
-                body += data
-            case h11.EndOfMessage():
-                return bytes(body)
-            case h11.ConnectionClosed():
-                raise RemoteProtocolError("the connection was closed before the response")
-            case h11.InformationalResponse() | h11.Response():
-                # XmlRpc++ and its copies put anything into the status; the body says what happened.
-                pass
-            case _:
-                http.receive_data(await loop.sock_recv(sock, _CHUNK))
-
-
 async def call(
     uri: str,
     method: str,
@@ -203,13 +165,16 @@ async def exchange(
     ``call``; ``read_response`` reads it.
     """
     host, port, path = split_uri(uri)
-    http, request = _request(host, port, path, document)
+    loop = asyncio.get_running_loop()
+    response = ResponseParser(uri)
     try:
         async with asyncio.timeout(timeout):
             sock = await connect(host, port, use)
             try:
-                await asyncio.get_running_loop().sock_sendall(sock, request)
-                return await _response_body(sock, http)
+                await loop.sock_sendall(sock, post_request(host, port, path, document))
+                while (body := response.feed(await loop.sock_recv(sock, _CHUNK))) is None:
+                    pass
+                return body
             finally:
                 sock.close()
     except TimeoutError as error:
@@ -221,28 +186,15 @@ async def exchange(
             raise OutOfDescriptors("XML-RPC server", uri, "`rmpa doctor` says what to do") from error
         problem = os.strerror(error.errno) if error.errno else str(error)
         raise UnreachableError("XML-RPC server", uri, f"{problem}; is that program running?") from error
-    except h11.RemoteProtocolError as error:
-        raise RemoteProtocolError(f"{uri} does not speak HTTP: {error}") from error
 
 
 async def read_response(body: bytes) -> XmlRpcValue:
-    """Read a response, a little at a time.
+    """Read a response, with turns for others in between.
 
     Raises:
         RosFault, RemoteProtocolError: As for ``call``.
     """
-    reader = ResponseReader()
-    try:
-        for begin in range(0, len(body), limits.XMLRPC_SLICE):
-            reader.feed(body[begin : begin + limits.XMLRPC_SLICE])
-            if begin >= limits.HTTP_BODY_INLINE:
-                await asyncio.sleep(0)
-            else:
-                yield_to_data()
-    except asyncio.CancelledError:
-        reader.abandon()
-        raise
-    return reader.close()
+    return await read_large(ResponseReader(), slices(body))
 
 
 async def call_api(

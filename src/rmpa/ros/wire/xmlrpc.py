@@ -7,9 +7,10 @@ on the types that ROS has. Long documents are read and written piece by piece.
 from __future__ import annotations
 
 import contextlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime
-from typing import Final, NamedTuple, TypeAlias, Union, cast
+from typing import Final, Generic, NamedTuple, TypeAlias, TypeVar, Union, cast
 from xml.parsers.expat import ExpatError
 from xmlrpc.client import Fault, ResponseError, Unmarshaller
 
@@ -25,6 +26,7 @@ XmlRpcValue: TypeAlias = Union[  # noqa: UP007 - | does not take the forward ref
 ]
 """What can be said in XML-RPC. Parsed values are made of lists and dicts; ``None`` is read, never written."""
 
+_T = TypeVar("_T")
 _MAX_INT: Final = (1 << 31) - 1
 _MIN_INT: Final = -(1 << 31)
 _DECLARATION: Final = "<?xml version='1.0'?>\n"
@@ -123,8 +125,8 @@ class _BoundedUnmarshaller(Unmarshaller):
         super().end(tag)
 
 
-class _Reader:
-    """A document that is read piece by piece, for who has something else to do in between."""
+class DocumentReader(ABC, Generic[_T]):
+    """Reads one document piece by piece, so that something else can be done between two pieces."""
 
     def __init__(self) -> None:
         self._unmarshaller = _BoundedUnmarshaller()
@@ -135,7 +137,7 @@ class _Reader:
         self._waiting = bytearray()
         self._token = 0
 
-    def feed(self, data: bytes | memoryview) -> None:
+    def feed(self, data: bytes | bytearray | memoryview) -> None:
         """Take the next piece.
 
         Raises:
@@ -157,6 +159,10 @@ class _Reader:
         """Read no more: breaks a reference cycle, which nobody else does while the collector is off."""
         with contextlib.suppress(Exception):
             self._parser.close()
+
+    @abstractmethod
+    def close(self) -> _T:
+        """What the document says, once all pieces are there."""
 
     def _end(self) -> tuple[str | None, tuple[XmlRpcValue, ...]]:
         """The method's name, if it is a call, and the values.
@@ -197,7 +203,7 @@ class _Reader:
             raise
 
 
-class CallReader(_Reader):
+class CallReader(DocumentReader["tuple[str, tuple[XmlRpcValue, ...]]"]):
     """Reads a ``methodCall`` document."""
 
     def close(self) -> tuple[str, tuple[XmlRpcValue, ...]]:
@@ -215,7 +221,7 @@ class CallReader(_Reader):
         return method, params
 
 
-class ResponseReader(_Reader):
+class ResponseReader(DocumentReader[XmlRpcValue]):
     """Reads a ``methodResponse`` document."""
 
     def close(self) -> XmlRpcValue:
