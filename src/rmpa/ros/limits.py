@@ -206,22 +206,22 @@ CORE_STATE_CLOSE: Final = 3.0
 """For the last write of a core that ends; a disk that hangs is left behind."""
 CORE_STATE_UNFIT_SHOWN: Final = 3
 """Names of what did not fit that a text for the user has."""
-TAKE_UP_AT_ONCE: Final = 32
+VERIFY_AT_ONCE: Final = 32
 """Nodes of the run before that are asked at the same time: a connection each, and who asks the core meanwhile comes
 behind that many."""
-TAKE_UP_PROMPT: Final = 0.25
+VERIFY_PROMPT: Final = 0.25
 """A node that has not answered after this long does not count among these: who hangs delays nobody else."""
-TAKE_UP_RETRY_FIRST: Final = 0.5
+VERIFY_RETRY_FIRST: Final = 0.5
 """Before a node that did not answer is asked again."""
-TAKE_UP_RETRY_MAX: Final = 10.0
+VERIFY_RETRY_MAX: Final = 10.0
 """Between two questions at the most."""
-TAKE_UP_PATIENCE: Final = 600.0
+VERIFY_PATIENCE: Final = 600.0
 """A node that did not answer for this long is given up: one that a debugger stopped may be on again by then."""
-TAKE_UP_LISTS: Final = 8
+VERIFY_LISTS: Final = 8
 """Nodes that are asked at the same time what they publish and subscribe to, once all have been asked who they are."""
-TAKE_UP_COMPARED: Final = 3
+VERIFY_COMPARED: Final = 3
 """Times that a node is asked so; one that registers something each time is busy, and tells everything itself."""
-TAKE_UP_ANNOUNCE: Final = 3.0
+VERIFY_ANNOUNCE: Final = 3.0
 """What was taken up is told to subscribers when all have answered or hang, or after this long: to ask 500 nodes takes
 a second, and what follows from each (connections to it, the aggregator's among them) would come between."""
 

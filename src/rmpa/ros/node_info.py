@@ -96,7 +96,7 @@ def list_nodes(
     services: Mapping[str, Collection[str]],
     uris: Mapping[str, str],
     problems: Mapping[str, str],
-    breathing: Callable[[Iterable[Collection[str]]], Iterable[Collection[str]]] = iter,
+    yielder: Callable[[Iterable[Collection[str]]], Iterable[Collection[str]]] = iter,
 ) -> tuple[NodeLine, ...]:
     """Every node of a graph, by name.
 
@@ -106,11 +106,11 @@ def list_nodes(
         services: Nodes by service.
         uris: Slave APIs by node, as far as they are known.
         problems: By node: why it cannot be connected to.
-        breathing: For graphs of thousands of topics.
+        yielder: For graphs of thousands of topics.
     """
     counts: dict[str, list[int]] = {}
     for index, table in enumerate((publishers, subscribers, services)):
-        for nodes in breathing(list(table.values())):
+        for nodes in yielder(list(table.values())):
             for node in nodes:
                 counts.setdefault(node, [0, 0, 0])[index] += 1
     return tuple(

@@ -145,7 +145,7 @@ class SnapshotBuilder:
             proxies=proxies,
             proxy_sockets=self._bridge.proxy_nodes.sockets(proxies),
             proxy_listening=self._bridge.proxy_nodes.listening,
-            core_memory=self._core.remembered(),
+            core_memory=self._core.restored(),
         )
 
     def _cpu_share(self) -> float | None:

@@ -52,7 +52,7 @@ class TopicFacts:
 
     def awaited(self, topic: str) -> list[str]:
         """Nodes that published a topic before this agent was restarted, each with its address."""
-        return [f"{node} at {uri}" for node, uri in self._core.awaited(topic).items()]
+        return [f"{node} at {uri}" for node, uri in self._core.unverified(topic).items()]
 
     def there(self, peer: str, topic: str) -> tuple[str, str]:
         """A topic of a peer, as a user names it: its name here, and over there.

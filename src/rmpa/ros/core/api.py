@@ -95,10 +95,10 @@ class Core(Protocol):
         """What the user should know: that the master does not answer, say."""
         ...
 
-    def remembered(self) -> str:
+    def restored(self) -> str:
         """What the core keeps over its end, and took up of the run before, ready to read; empty for nothing."""
         ...
 
-    def awaited(self, topic: str) -> Mapping[str, str]:
+    def unverified(self, topic: str) -> Mapping[str, str]:
         """Nodes that published a topic in the run before and have not answered since, and their slave APIs."""
         ...

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.counters import Counters
 from rmpa.ros.core.liveness import Liveness
-from rmpa.ros.core.memory import CoreMemory
 from rmpa.ros.core.notifier import Notifier
+from rmpa.ros.core.persistence import CorePersistence
 from rmpa.ros.core.rosout import NODE, Rosout
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.master.api import MasterApi
@@ -74,18 +74,18 @@ class RosCore:
         self._host = host
         self._advertised = advertised_host or (os.uname().nodename if host in {"", "0.0.0.0"} else host)  # noqa: S104
         self._on_shutdown = on_shutdown
-        self._api = MasterApi("", os.getpid(), self._asked_to_end, breathing=yielding_to_data)
+        self._api = MasterApi("", os.getpid(), self._asked_to_end, yielder=yielding_to_data)
         self._server = XmlRpcServer(self._answer, host, port, counters=self.counters, name="ROS core", use=Use.CORE)
         self._notifier: Notifier | None = None
         self._liveness: Liveness | None = None
         self._with_rosout = rosout
         self._rosout: Rosout | None = None
         self._callbacks: list[Callable[[GraphChange], None]] = []
-        self.memory: CoreMemory | None = None
+        self.memory: CorePersistence | None = None
         """What it keeps over its end, if it keeps anything."""
         if state is not None:
             own = {NODE, CALLER_ID}
-            self.memory = CoreMemory(
+            self.memory = CorePersistence(
                 state,
                 self._api,
                 fresh=fresh,
@@ -139,7 +139,7 @@ class RosCore:
         if rosout is not None:
             await rosout.close()
         if self.memory is not None:
-            await self.memory.ask_no_more()
+            await self.memory.stop_verification()
         if self._notifier is not None:
             await self._notifier.close()
         if self._liveness is not None:
@@ -213,13 +213,13 @@ class RosCore:
         """What is wrong with what it keeps: it is there itself as long as the agent is."""
         return self.memory.notes() if self.memory is not None else ()
 
-    def remembered(self) -> str:
+    def restored(self) -> str:
         """Its file, and what became of the nodes and parameters in it."""
-        return self.memory.told() if self.memory is not None else ""
+        return self.memory.summary() if self.memory is not None else ""
 
-    def awaited(self, topic: str) -> Mapping[str, str]:
+    def unverified(self, topic: str) -> Mapping[str, str]:
         """Nodes that published a topic in the run before and have not answered since, and their slave APIs."""
-        return self._api.registrations.awaited.publishers_of(topic)
+        return self._api.registrations.unverified.publishers_of(topic)
 
     def unreachable(self) -> Mapping[str, Unreachable]:
         """The registered nodes that nothing can connect to; not to be changed."""
@@ -241,7 +241,7 @@ class RosCore:
     def _carry_out(self) -> None:
         effects, changes = self._api.take()
         if self.memory is not None:
-            self.memory.look_soon()
+            self.memory.schedule_write()
         # Queued before anybody hears of the change: a callback that registers something must not be overtaken by
         # the list as it was before.
         if self._notifier is not None:

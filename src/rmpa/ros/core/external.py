@@ -85,7 +85,7 @@ class ExternalCore:
         self._own_node = own_node
         self._node_host = node_host
         self._node_address = node_address
-        self._mirror = Mirror(breathing=yielding_to_data)
+        self._mirror = Mirror(yielder=yielding_to_data)
         self._liveness = Liveness(nodes=self._mirror.others, on_dead=self._dead)
         self._callbacks: list[Callable[[GraphChange], None]] = []
         self._writes: deque[_Write] = deque()
@@ -225,11 +225,11 @@ class ExternalCore:
         """The registered nodes that nothing can connect to; not to be changed."""
         return self._liveness.unreachable
 
-    def remembered(self) -> str:
+    def restored(self) -> str:
         """Nothing of ours: what a roscore forgets is its own."""
         return ""
 
-    def awaited(self, topic: str) -> Mapping[str, str]:  # noqa: ARG002 - of ``Core``
+    def unverified(self, topic: str) -> Mapping[str, str]:  # noqa: ARG002 - of ``Core``
         """None, likewise."""
         return {}
 
@@ -401,7 +401,7 @@ class ExternalCore:
         if body == self._seen and self._usable:
             return False
         answer = await read_response(body)
-        survey = read_survey(answer, self._nodes, self._services, breathing=yielding_to_data)
+        survey = read_survey(answer, self._nodes, self._services, yielder=yielding_to_data)
         self._seen = body
         survey = await self._completed(survey)
         if self._ending:
@@ -417,7 +417,7 @@ class ExternalCore:
         new_services = [service for service in services if service not in survey.services]
         if new_nodes or new_services:
             answer = await self._many(lookup_calls(self._own_node, new_nodes, new_services))
-            survey = survey.with_more(*read_lookups(answer, new_nodes, new_services, breathing=yielding_to_data))
+            survey = survey.with_more(*read_lookups(answer, new_nodes, new_services, yielder=yielding_to_data))
         if tuple(nodes) != self._nodes or tuple(services) != self._services:
             self._nodes, self._services = tuple(nodes), tuple(services)
             self._request, self._seen = b"", b""

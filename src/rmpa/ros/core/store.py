@@ -1,6 +1,6 @@
 """The file in which a core keeps its registrations and parameters: SQLite, written in threads.
 
-One table, ``kept(kind, name, value)``; ``ros.master.kept`` says what is in it. A commit is one transaction in a
+One table, ``kept(kind, name, value)``; ``ros.master.stored_rows`` says what is in it. A commit is one transaction in a
 write-ahead log, which survives the end of the process, however it ends, without a wait for the disk; a loss of power
 may take the last seconds. A file that is damaged, of another program or of a newer release is set aside under
 ``.damaged``.
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from rmpa.ros.master.kept import Key, Row
+    from rmpa.ros.master.stored_rows import Key, Row
 
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")

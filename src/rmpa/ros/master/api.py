@@ -45,11 +45,11 @@ class MasterApi:
         uri: What ``getUri`` answers.
         pid: What ``getPid`` answers.
         on_shutdown: Called with the reason when somebody asks the master to end.
-        breathing: For what takes long in a graph of thousands, or with large parameters.
+        yielder: For what takes long in a graph of thousands, or with large parameters.
     """
 
-    def __init__(self, uri: str, pid: int, on_shutdown: Callable[[str], None], *, breathing: Yielder = iter) -> None:
-        self._breathing = breathing
+    def __init__(self, uri: str, pid: int, on_shutdown: Callable[[str], None], *, yielder: Yielder = iter) -> None:
+        self._yielder = yielder
         self.uri = uri
         self._pid = pid
         self._on_shutdown = on_shutdown
@@ -160,7 +160,7 @@ class MasterApi:
         return RosReply(SUCCESS, f"deleted {key}", 0)
 
     def _set_param(self, caller_id: str, key: str, value: XmlRpcValue) -> RosReply:
-        if params.holds_nil(value, self._breathing):
+        if params.holds_nil(value, self._yielder):
             text = "value is nil or contains one, which ROS does not have"
             _log.info("! %s: setParam: %s", caller_id, text)
             return RosReply(ERROR, text, 0)
@@ -169,7 +169,7 @@ class MasterApi:
         except TypeError as error:
             return RosReply(ERROR, str(error), 0)
         subscribers = self.registrations.param_subscribers()
-        self.registrations.effects += params.updates(subscribers, key, value, caller_id, self._breathing)
+        self.registrations.effects += params.updates(subscribers, key, value, caller_id, self._yielder)
         return RosReply(SUCCESS, f"set {key}", 0)
 
     def _get_param(self, _caller_id: str, key: str) -> RosReply:
@@ -202,7 +202,7 @@ class MasterApi:
         return RosReply(SUCCESS, key, self.parameters.has(key))
 
     def _get_param_names(self, _caller_id: str) -> RosReply:
-        return RosReply(SUCCESS, "the names of all parameters", list(self._breathing(self.parameters.names())))
+        return RosReply(SUCCESS, "the names of all parameters", list(self._yielder(self.parameters.names())))
 
     # --- services ---------------------------------------------------------------------------------------------
 
@@ -251,18 +251,18 @@ class MasterApi:
     def _get_published_topics(self, _caller_id: str, subgraph: str) -> RosReply:
         prefix = subgraph if not subgraph or subgraph.endswith("/") else f"{subgraph}/"
         types = self.registrations.types()
-        published = self._breathing(self.registrations.published())
+        published = self._yielder(self.registrations.published())
         found = [[topic, types[topic]] for topic in published if topic.startswith(prefix)]
         return RosReply(SUCCESS, "the topics that somebody publishes", found)
 
     def _get_topic_types(self, _caller_id: str) -> RosReply:
-        types = self._breathing(list(self.registrations.types().items()))
+        types = self._yielder(list(self.registrations.types().items()))
         return RosReply(SUCCESS, "the topics and their types", [list(item) for item in types])
 
     def _get_system_state(self, _caller_id: str) -> RosReply:
         tables: list[XmlRpcValue] = []
         for kind in (RegistrationKind.PUBLISHER, RegistrationKind.SUBSCRIBER, RegistrationKind.SERVICE):
-            providers = self._breathing(self.registrations.providers(kind))
+            providers = self._yielder(self.registrations.providers(kind))
             tables.append([[key, list(nodes)] for key, nodes in providers])
         return RosReply(SUCCESS, "publishers, subscribers and services", tables)
 

@@ -53,11 +53,11 @@ class Mirror:
     """What is known of the graph of one master.
 
     Args:
-        breathing: For surveys of thousands of topics.
+        yielder: For surveys of thousands of topics.
     """
 
-    def __init__(self, *, breathing: Yielder = iter) -> None:
-        self._breathing = breathing
+    def __init__(self, *, yielder: Yielder = iter) -> None:
+        self._yielder = yielder
         self._known = Registrations()
         self._own: dict[Entry, _Own] = {}
         # What we asked for and no survey was begun since: a survey from before says nothing about it.
@@ -241,7 +241,7 @@ class Mirror:
     def _drop_gone(
         self, kind: RegistrationKind, table: Mapping[str, Sequence[str]], passed: set[str], survey: Survey
     ) -> None:
-        for key, nodes in self._breathing(self._known.providers(kind)):
+        for key, nodes in self._yielder(self._known.providers(kind)):
             there = table.get(key, ())
             for node, api in nodes.items():
                 if node in passed or self._orphans.get(node) == api:
@@ -256,7 +256,7 @@ class Mirror:
     def _add_new(
         self, kind: RegistrationKind, table: Mapping[str, Sequence[str]], passed: set[str], survey: Survey, seen: int
     ) -> None:
-        for key, nodes in self._breathing(table.items()):
+        for key, nodes in self._yielder(table.items()):
             for node in nodes:
                 api = survey.uris.get(node)
                 if node in passed or api is None:
@@ -285,7 +285,7 @@ class Mirror:
     def _learn_types(self, survey: Survey, passed: set[str]) -> None:
         """A topic whose type is known only now, or another: its publishers' word, since the master keeps the last."""
         types = self._known.types()
-        for topic, type_name in self._breathing(survey.types.items()):
+        for topic, type_name in self._yielder(survey.types.items()):
             if types.get(topic) == type_name or type_name == ANY_TYPE:
                 continue
             for node, api in self._known.at(RegistrationKind.PUBLISHER, topic).items():
@@ -297,7 +297,7 @@ class Mirror:
 
     def _missing(self, survey: Survey, seen: int, ignored: Mapping[str, str]) -> list[Call]:
         again = []
-        for (kind, key, node), own in self._breathing(list(self._own.items())):
+        for (kind, key, node), own in self._yielder(list(self._own.items())):
             if kind is RegistrationKind.PARAM or self._touched.get((kind, key, node), 0) > seen or node in ignored:
                 continue
             there = node in survey.holders[kind].get(key, ()) and survey.uris.get(node) == own.api
@@ -310,22 +310,22 @@ class Mirror:
         ours = {node: own.api for (_, _, node), own in self._own.items()}
         nodes = {node: api for node, api in ours.items() if survey.uris.get(node) == api}
         again = []
-        for call, entry in leftovers(survey, nodes, self._breathing):
+        for call, entry in leftovers(survey, nodes, self._yielder):
             if entry not in self._own and self._touched.get(entry, 0) <= seen:
                 again.append(call)
         return again
 
 
-def leftovers(survey: Survey, nodes: Mapping[str, str], breathing: Yielder = iter) -> Iterator[tuple[Call, Entry]]:
+def leftovers(survey: Survey, nodes: Mapping[str, str], yielder: Yielder = iter) -> Iterator[tuple[Call, Entry]]:
     """Everything that a master has of some nodes, and what takes it away.
 
     Args:
         survey: What the master said.
         nodes: The nodes and their slave APIs.
-        breathing: For large graphs.
+        yielder: For large graphs.
     """
     for kind, table in survey.holders.items():
-        for key, holders in breathing(table.items()):
+        for key, holders in yielder(table.items()):
             for node in holders:
                 if node not in nodes:
                     continue

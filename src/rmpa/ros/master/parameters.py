@@ -48,9 +48,9 @@ def _without(tree: Tree, parts: list[str]) -> Tree:
     return copy
 
 
-def holds_nil(value: XmlRpcValue, breathing: Yielder = iter) -> bool:
+def holds_nil(value: XmlRpcValue, yielder: Yielder = iter) -> bool:
     """Whether there is a nil in a value, at any depth; ROS has none, and it could not be written again."""
-    return any(part is None for part in breathing(_all_parts(value)))
+    return any(part is None for part in yielder(_all_parts(value)))
 
 
 def _all_parts(value: XmlRpcValue) -> Iterator[XmlRpcValue]:
@@ -177,7 +177,7 @@ def updates(
     key: str,
     value: XmlRpcValue,
     setter: str | None = None,
-    breathing: Yielder = iter,
+    yielder: Yielder = iter,
 ) -> list[ParamUpdate]:
     """Who is to be told what after a parameter was set or deleted.
 
@@ -186,7 +186,7 @@ def updates(
         key: The key that changed.
         value: What it is now; deleted is ``{}``.
         setter: The node that set it, which is not told of its own namespace's change.
-        breathing: For large values.
+        yielder: For large values.
 
     Returns:
         In rosmaster's order: first those who subscribed the key or a namespace above it, or something below that is
@@ -197,7 +197,7 @@ def updates(
     key = with_slash(key)
     # Most values are set where nobody has subscribed something within them, and some are large.
     within = any(subscribed != key and subscribed.startswith(key) for subscribed in subscribers)
-    below = dict(breathing(_below(key, value))) if within else {}
+    below = dict(yielder(_below(key, value))) if within else {}
     found: list[ParamUpdate] = []
     for subscribed, nodes in subscribers.items():
         if key.startswith(subscribed):

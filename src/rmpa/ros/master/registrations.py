@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from rmpa.ros.master.awaited import Awaited, NodeRecord
 from rmpa.ros.master.effects import Effect, GraphChange, GraphState, PublisherUpdate, RegistrationKind, Shutdown
+from rmpa.ros.master.unverified import NodeRecord, UnverifiedNodes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -51,10 +51,10 @@ class Registrations:
         # The URI that each node's name was last taken from, while the name is in use.
         self._evicted: dict[str, str] = {}
         self._state: GraphState | None = None
-        self.awaited = Awaited()
-        self._taken_up: set[str] = set()
-        self._count = 0
-        self.marks: dict[str, int] = {}
+        self.unverified = UnverifiedNodes()
+        self._restored: set[str] = set()
+        self._revision = 0
+        self.revisions: dict[str, int] = {}
         """Of each node that is registered or awaited: a number that is another one after each change of it."""
         self.effects: list[Effect] = []
         self.changes: list[GraphChange] = []
@@ -129,7 +129,7 @@ class Registrations:
             retyped = self._types.get(topic) != topic_type
             self._types[topic] = topic_type
         self._register(RegistrationKind.PUBLISHER, topic, node, api, retyped=retyped)
-        self._tell_subscribers(topic)
+        self._notify_subscribers(topic)
 
     def register_subscriber(self, topic: str, topic_type: str, node: str, api: str) -> None:
         """Add a subscriber; its type counts only while the topic has none."""
@@ -140,7 +140,7 @@ class Registrations:
 
     def register_service(self, service: str, uri: str, node: str, api: str) -> None:
         """Make this node the service's provider, in place of any other."""
-        self._seat(node, api)
+        self._claim_name(node, api)
         retyped = self._service_uris.get(service) != uri
         before = self.at(RegistrationKind.SERVICE, service)
         if gone := [other for other in before if other != node]:
@@ -172,7 +172,7 @@ class Registrations:
         if found:
             self._remove(kind, key, node, api)
         if kind is RegistrationKind.PUBLISHER and (found or withdrawn):
-            self._tell_subscribers(key)
+            self._notify_subscribers(key)
         self._forget_if_empty(node)
         return found or withdrawn
 
@@ -186,7 +186,7 @@ class Registrations:
         found = api is not None and self._service_uris.get(service) == uri
         if api is not None and found:
             self._remove(RegistrationKind.SERVICE, service, node, api)
-        record = self.awaited.get(node)
+        record = self.unverified.get(node)
         if record is not None and record.services.get(service) == uri:
             found = self._withdraw(RegistrationKind.SERVICE, service, node, record.api)
         self._forget_if_empty(node)
@@ -205,16 +205,16 @@ class Registrations:
         self._empty(node)
         self._nodes.pop(node, None)
         self._evicted.pop(node, None)
-        self._touch(node)
+        self._mark_changed(node)
         for topic in topics:
-            self._tell_subscribers(topic)
+            self._notify_subscribers(topic)
         return True
 
     # --- nodes of the run before ------------------------------------------------------------------------------
 
     def record(self, node: str) -> NodeRecord | None:
         """Everything that a node has registered, and what an awaited one had."""
-        found, awaited = self._nodes.get(node), self.awaited.get(node)
+        found, awaited = self._nodes.get(node), self.unverified.get(node)
         if found is None:
             return awaited
         types = self._types
@@ -234,24 +234,24 @@ class Registrations:
                 record.of(kind).update(awaited.of(kind))  # type: ignore[arg-type] # both of one kind
         return record
 
-    def await_node(self, node: str, record: NodeRecord) -> None:
+    def restore(self, node: str, record: NodeRecord) -> None:
         """Remember a node of the run before; nothing shows it. Its topics have their types again."""
-        self.awaited.add(node, record)
+        self.unverified.add(node, record)
         for topic, topic_type in [*record.publishers.items(), *record.subscribers.items()]:
             self._types.setdefault(topic, topic_type)
         self._state = None
-        self._touch(node)
+        self._mark_changed(node)
 
-    def take_up(self, node: str) -> tuple[list[str], list[str]]:
+    def confirm(self, node: str) -> tuple[list[str], list[str]]:
         """Show an awaited node, which has answered. What others registered meanwhile stays theirs.
 
         Returns:
             The topics that it publishes and those that it subscribes to: ``announce`` and ``tell`` them.
         """
-        record = self.awaited.pop(node)
+        record = self.unverified.pop(node)
         if record is None:
             return [], []
-        self._taken_up.add(node)
+        self._restored.add(node)
         for topic in record.publishers:
             self._register(RegistrationKind.PUBLISHER, topic, node, record.api)
         for topic in record.subscribers:
@@ -261,62 +261,62 @@ class Registrations:
                 self.register_service(service, uri, node, record.api)
         for key in record.params:
             self._register(RegistrationKind.PARAM, key, node, record.api)
-        self._touch(node)
+        self._mark_changed(node)
         return list(record.publishers), list(record.subscribers)
 
-    def tell(self, topic: str, node: str) -> None:
+    def notify_subscriber(self, topic: str, node: str) -> None:
         """Tell one subscriber who publishes a topic."""
         api = self.at(RegistrationKind.SUBSCRIBER, topic).get(node)
         if api is not None:
-            publishers = self._publishers(topic, awaited=node in self._taken_up)
+            publishers = self._publishers(topic, awaited=node in self._restored)
             self.effects.append(PublisherUpdate(api, topic, publishers))
 
-    def give_up(self, node: str) -> None:
+    def discard(self, node: str) -> None:
         """Forget an awaited node, and tell those that may be connected to it."""
-        record = self.awaited.pop(node)
+        record = self.unverified.pop(node)
         if record is not None:
-            self._touch(node)
+            self._mark_changed(node)
             for topic in record.publishers:
-                self._tell_subscribers(topic, self._taken_up.__contains__)
+                self._notify_subscribers(topic, self._restored.__contains__)
 
-    def announce(self, topic: str) -> None:
+    def notify_new_subscribers(self, topic: str) -> None:
         """Tell the subscribers of a topic that do not know those of its publishers that were taken up."""
-        self._tell_subscribers(topic, lambda node: node not in self._taken_up)
+        self._notify_subscribers(topic, lambda node: node not in self._restored)
 
     def _withdraw(self, kind: RegistrationKind, key: str, node: str, api: str) -> bool:
         """Take a registration of an awaited node away; whether it was there."""
-        if not self.awaited.withdraw(kind, key, node, api):
+        if not self.unverified.withdraw(kind, key, node, api):
             return False
-        record = self.awaited.get(node)
+        record = self.unverified.get(node)
         if record is not None and not any(record.of(kind) for kind in RegistrationKind):
-            self.awaited.pop(node)
-        self._touch(node)
+            self.unverified.pop(node)
+        self._mark_changed(node)
         return True
 
-    def _touch(self, node: str) -> None:
+    def _mark_changed(self, node: str) -> None:
         """What is to be kept of a node has changed."""
-        if node in self._nodes or self.awaited.get(node) is not None:
-            self._count += 1
-            self.marks[node] = self._count
+        if node in self._nodes or self.unverified.get(node) is not None:
+            self._revision += 1
+            self.revisions[node] = self._revision
         else:
-            self.marks.pop(node, None)
-            self._taken_up.discard(node)
+            self.revisions.pop(node, None)
+            self._restored.discard(node)
 
     # --- the tables -------------------------------------------------------------------------------------------
 
-    def _seat(self, node: str, api: str) -> _Node:
+    def _claim_name(self, node: str, api: str) -> _Node:
         """The node's record; a node of the same name at another URI is pushed out with all it had."""
-        awaited = self.awaited.get(node)
+        awaited = self.unverified.get(node)
         if awaited is not None and awaited.api != api:
             self.effects.append(Shutdown(awaited.api, node, tuple(awaited.publishers)))
             self._evicted[node] = awaited.api
-            self.give_up(node)
+            self.discard(node)
         found = self._nodes.get(node)
         if found is not None and found.api != api:
             self.effects.append(Shutdown(found.api, node, tuple(found.keys[RegistrationKind.PUBLISHER])))
             self._empty(node)
             self._evicted[node] = found.api
-            self._taken_up.discard(node)
+            self._restored.discard(node)
             found = None
             # Its place in the order of nodes stays, as rosmaster has it.
         if found is None:
@@ -324,10 +324,10 @@ class Registrations:
         return found
 
     def _register(self, kind: RegistrationKind, key: str, node: str, api: str, *, retyped: bool = False) -> None:
-        keys = self._seat(node, api).keys[kind]
+        keys = self._claim_name(node, api).keys[kind]
         if retyped or key not in keys:
             keys[key] = None
-            self._touch(node)
+            self._mark_changed(node)
         providers = self.at(kind, key)
         new = node not in providers
         if providers.get(node) != api:
@@ -346,7 +346,7 @@ class Registrations:
                 del self._service_uris[key]
                 del self._services[key]
         self._nodes[node].keys[kind].pop(key, None)
-        self._touch(node)
+        self._mark_changed(node)
         self._changed(kind, key, node, api, added=False)
 
     def _empty(self, node: str) -> None:
@@ -362,7 +362,7 @@ class Registrations:
             del self._nodes[node]
             self._evicted.pop(node, None)
             self._state = None
-            self._touch(node)
+            self._mark_changed(node)
 
     def _changed(self, kind: RegistrationKind, key: str, node: str, api: str, *, added: bool) -> None:
         self._state = None
@@ -373,10 +373,10 @@ class Registrations:
     def _publishers(self, topic: str, *, awaited: bool) -> tuple[str, ...]:
         """The slave APIs of a topic's publishers, with or without those of the run before."""
         apis = self.apis(RegistrationKind.PUBLISHER, topic)
-        more = self.awaited.publishers(topic) if awaited else ()
+        more = self.unverified.publishers(topic) if awaited else ()
         return tuple(dict.fromkeys([*apis, *more])) if more else tuple(apis)
 
-    def _tell_subscribers(self, topic: str, which: Callable[[str], bool] | None = None) -> None:
+    def _notify_subscribers(self, topic: str, which: Callable[[str], bool] | None = None) -> None:
         """Tell the subscribers of a topic who publishes it, or only those nodes for which ``which`` says so.
 
         Who was taken up is connected to publishers that have not answered yet, and would hang up on them.
@@ -388,5 +388,5 @@ class Registrations:
             if api not in told and (
                 which is None or which(node)
             ):  # nodelets of one process share an API: it is told once
-                told[api] = old if node in self._taken_up else known
+                told[api] = old if node in self._restored else known
         self.effects += [PublisherUpdate(api, topic, publishers) for api, publishers in told.items()]

@@ -76,7 +76,7 @@ def lookup_calls(caller_id: str, nodes: Iterable[str], services: Iterable[str]) 
 
 
 def read_survey(
-    answer: XmlRpcValue, nodes: Sequence[str], services: Sequence[str], *, breathing: Yielder = iter
+    answer: XmlRpcValue, nodes: Sequence[str], services: Sequence[str], *, yielder: Yielder = iter
 ) -> Survey:
     """Read the answer to ``survey_calls`` with the same nodes and services.
 
@@ -89,15 +89,15 @@ def read_survey(
     if not isinstance(state, list) or len(state) != len(_KINDS):
         raise RemoteProtocolError(f"the master's system state is not three lists: {brief(state)}")
     survey = Survey(
-        {kind: _holders(table, breathing) for kind, table in zip(_KINDS, state, strict=True)},
-        dict(breathing(_pairs(types))),
+        {kind: _holders(table, yielder) for kind, table in zip(_KINDS, state, strict=True)},
+        dict(yielder(_pairs(types))),
         f"{pid} {run_id}",
     )
-    return survey.with_more(*read_lookups(answer[len(_HEAD) + 1 :], nodes, services, breathing=breathing))
+    return survey.with_more(*read_lookups(answer[len(_HEAD) + 1 :], nodes, services, yielder=yielder))
 
 
 def read_lookups(
-    answer: XmlRpcValue, nodes: Sequence[str], services: Sequence[str], *, breathing: Yielder = iter
+    answer: XmlRpcValue, nodes: Sequence[str], services: Sequence[str], *, yielder: Yielder = iter
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Read the answer to ``lookup_calls`` with the same nodes and services: where they are, those that are.
 
@@ -106,7 +106,7 @@ def read_lookups(
     """
     if not isinstance(answer, list) or len(answer) != len(nodes) + len(services):
         raise RemoteProtocolError(f"the master's answer to system.multicall is no list of answers: {brief(answer)}")
-    found = [_value(one) for one in breathing(answer)]
+    found = [_value(one) for one in yielder(answer)]
     places = [value if isinstance(value, str) else "" for value in found]
     uris = {node: uri for node, uri in zip(nodes, places, strict=False) if uri}
     return uris, {name: uri for name, uri in zip(services, places[len(nodes) :], strict=True) if uri}
@@ -120,9 +120,9 @@ def _value(answer: XmlRpcValue) -> XmlRpcValue:
     return None
 
 
-def _holders(table: XmlRpcValue, breathing: Yielder) -> Holders:
+def _holders(table: XmlRpcValue, yielder: Yielder) -> Holders:
     found: Holders = {}
-    for entry in breathing(table) if isinstance(table, list) else ():
+    for entry in yielder(table) if isinstance(table, list) else ():
         match entry:
             case [str(key), list(nodes)]:
                 found[key] = tuple(node for node in nodes if isinstance(node, str))

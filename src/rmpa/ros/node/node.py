@@ -25,7 +25,7 @@ from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.environment import RosEnvironment, host_of, is_loopback
 from rmpa.ros.http.client import call_api
-from rmpa.ros.node.learn_type import find_or_learn
+from rmpa.ros.node.fetch_type import find_or_fetch
 from rmpa.ros.node.local_addresses import local_addresses
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.services import Handler, Service, ServiceClient, probe
@@ -170,7 +170,7 @@ class Node:
         """
         resolved = self._resolve(topic)
         if isinstance(kind, str):
-            kind = await find_or_learn(self.master_uri, self.name, kind, resolved)
+            kind = await find_or_fetch(self.master_uri, self.name, kind, resolved)
         description = kind if isinstance(kind, TopicDescription) else kind.describe(latching=latch)
         publisher = Publisher(
             resolved,
@@ -423,7 +423,7 @@ class Node:
         try:
             return await asyncio.to_thread(find_message_type, name)
         except UnknownTypeError as error:
-            if not error.learnable:
+            if not error.fetchable:
                 raise
             return None
 

@@ -104,44 +104,46 @@ class Publication:
     @property
     def listeners(self) -> tuple[str, ...]:
         """The caller ids of those that are served, as they gave them."""
-        return tuple(link.caller_id for link in self._open)
+        return tuple(connection.caller_id for connection in self._open)
 
     @property
     def dropped(self) -> int:
         """Messages that slow subscribers missed, those that have left included."""
-        return self._dropped_before + sum(link.dropped for link in self._open)
+        return self._dropped_before + sum(connection.dropped for connection in self._open)
 
     def connections(self) -> list[BusConnection]:
         """All connections, for ``getBusInfo`` and ``getBusStats``."""
         return [
             BusConnection(
-                link.number,
-                link.caller_id,
+                connection.number,
+                connection.caller_id,
                 OUTBOUND,
                 self.topic,
-                link in self._open,
-                link.info,
-                link.stream.bytes_out,
-                link.messages,
-                link.dropped,
-                link.stream.pending_bytes,
+                connection in self._open,
+                connection.info,
+                connection.stream.bytes_out,
+                connection.messages,
+                connection.dropped,
+                connection.stream.pending_bytes,
             )
-            for link in (*self._open, *self._held)
+            for connection in (*self._open, *self._held)
         ]
 
-    def attach(self, link: AcceptedConnection) -> None:
+    def attach(self, connection: AcceptedConnection) -> None:
         """Take over a connection whose header names this topic: serve it, hold it, or refuse it."""
-        problem = check_subscriber(link.fields, self.topic, self.caller_id, self._description)
+        problem = check_subscriber(connection.fields, self.topic, self.caller_id, self._description)
         if problem is not None:
-            self._refuse(link, problem)
+            self._refuse(connection, problem)
             return
         first = self.subscribers == 0
-        link.on_end = self._gone
+        connection.on_end = self._gone
         if self._description is None:
-            _log.debug("= %s: holds subscriber %s until the type is known", self.topic, printable(link.caller_id))
-            self._held += (link,)
+            _log.debug(
+                "= %s: holds subscriber %s until the type is known", self.topic, printable(connection.caller_id)
+            )
+            self._held += (connection,)
         else:
-            self._serve(link)
+            self._serve(connection)
         if first and self.subscribers:
             self._on_first()
 
@@ -164,18 +166,18 @@ class Publication:
             self._latched.clear()
             old, self._open = self._open, ()
             self._on_listeners()
-            for link in old:
-                self._count_out(link)
-                link.close()
+            for connection in old:
+                self._count_out(connection)
+                connection.close()
         self._description = description
         self._reply = reply
         held, self._held = self._held, ()
-        for link in held:
-            problem = check_subscriber(link.fields, self.topic, self.caller_id, description)
+        for connection in held:
+            problem = check_subscriber(connection.fields, self.topic, self.caller_id, description)
             if problem is None:
-                self._serve(link)
+                self._serve(connection)
             else:
-                self._refuse(link, problem)
+                self._refuse(connection, problem)
         if before and not self.subscribers:
             self._on_last()
         return len(old)
@@ -194,8 +196,8 @@ class Publication:
         if self._description is not None and self._description.latching:
             self._latched.append(bytes(framed))
         dropped = 0
-        for link in self._open:
-            dropped += link.send(framed)
+        for connection in self._open:
+            dropped += connection.send(framed)
         return dropped
 
     def begin(self, size: int) -> None:
@@ -204,14 +206,14 @@ class Publication:
         Those that come before its end subscribe too late for it, unless it is kept for such.
         """
         self._size = self._left = size
-        self._parcels = [(link, link.begin(size)) for link in self._open]
+        self._parcels = [(connection, connection.begin(size)) for connection in self._open]
         latching = self._description is not None and self._description.latching
         self._whole = bytearray() if latching else None
 
     def extend(self, part: Buffer) -> None:
         """Send a part of it to all that have its beginning; none waits for another."""
-        for link, parcel in self._parcels:
-            link.extend(parcel, part)
+        for connection, parcel in self._parcels:
+            connection.extend(parcel, part)
         self._left -= len(part)
         if self._whole is not None:
             self._whole += part
@@ -223,10 +225,10 @@ class Publication:
         if self._whole is not None:
             framed, self._whole = bytes(self._whole), None
             self._latched.append(framed)
-            served = {link for link, _ in began}
-            for link in self._open:
-                if link not in served:
-                    link.send(framed)
+            served = {connection for connection, _ in began}
+            for connection in self._open:
+                if connection not in served:
+                    connection.send(framed)
 
     def abort(self) -> int:
         """The rest of it will not come.
@@ -236,14 +238,14 @@ class Publication:
         Returns:
             How many that were: if any, the owner should register the topic again.
         """
-        torn = [link for link, parcel in self._parcels if link.abandon(parcel)]
+        torn = [connection for connection, parcel in self._parcels if connection.abandon(parcel)]
         self._parcels = []
         self._whole = None
         before = self.subscribers
-        for link in torn:
-            self._count_out(link)
-            link.close()
-        self._open = tuple(link for link in self._open if link not in torn)
+        for connection in torn:
+            self._count_out(connection)
+            connection.close()
+        self._open = tuple(connection for connection in self._open if connection not in torn)
         self._on_listeners()
         if before and not self.subscribers:
             self._on_last()
@@ -252,8 +254,8 @@ class Publication:
     def bound(self, messages: int) -> None:
         """Let at most so many messages wait for one slow subscriber from now on."""
         self._queue_messages = min(messages, limits.SUBSCRIBER_QUEUE_MESSAGES)
-        for link in self._open:
-            link.bound(self._queue_messages, self._queue_bytes)
+        for connection in self._open:
+            connection.bound(self._queue_messages, self._queue_bytes)
 
     def keep(self, depth: int) -> None:
         """Where messages are latched, keep the last ``depth`` of them for later subscribers."""
@@ -266,43 +268,45 @@ class Publication:
     async def drained(self, timeout: float = runtime_limits.DRAIN_TIMEOUT) -> None:  # noqa: ASYNC109 - for all together
         """Wait until all that was published has left, or ``timeout`` seconds are over."""
         if self._open:
-            await asyncio.gather(*(link.stream.drained(timeout) for link in self._open))
+            await asyncio.gather(*(connection.stream.drained(timeout) for connection in self._open))
 
     def withdraw(self) -> None:
         """Publish no more: close all connections, without a callback."""
         self._withdrawn = True
-        links, self._held, self._open = (*self._held, *self._open), (), ()
-        for link in links:
-            self._count_out(link)
-            link.close()
+        connections, self._held, self._open = (*self._held, *self._open), (), ()
+        for connection in connections:
+            self._count_out(connection)
+            connection.close()
         self._latched.clear()
         self._parcels = []
         self._whole = None
 
-    def _serve(self, link: AcceptedConnection) -> None:
-        _log.debug("> %s: serves subscriber %s at %s", self.topic, printable(link.caller_id), link.peer[0])
-        link.accept(self._reply, self._queue_messages, self._queue_bytes)
+    def _serve(self, connection: AcceptedConnection) -> None:
+        _log.debug(
+            "> %s: serves subscriber %s at %s", self.topic, printable(connection.caller_id), connection.peer[0]
+        )
+        connection.accept(self._reply, self._queue_messages, self._queue_bytes)
         for framed in self._latched:
-            link.send(framed)
-        if not link.stream.closed:
-            self._open += (link,)
+            connection.send(framed)
+        if not connection.stream.closed:
+            self._open += (connection,)
             self._on_listeners()
 
-    def _refuse(self, link: AcceptedConnection, text: str) -> None:
-        _log.debug("! %s: refuses subscriber %s: %s", self.topic, printable(link.caller_id), text)
-        link.refuse(text)
-        self._on_mismatch(link.fields, text)
+    def _refuse(self, connection: AcceptedConnection, text: str) -> None:
+        _log.debug("! %s: refuses subscriber %s: %s", self.topic, printable(connection.caller_id), text)
+        connection.refuse(text)
+        self._on_mismatch(connection.fields, text)
 
-    def _count_out(self, link: AcceptedConnection) -> None:
-        self._dropped_before += link.dropped
+    def _count_out(self, connection: AcceptedConnection) -> None:
+        self._dropped_before += connection.dropped
 
-    def _gone(self, link: AcceptedConnection, error: Exception | None) -> None:
-        _log.debug("< %s: subscriber %s is gone (%s)", self.topic, printable(link.caller_id), error or "closed")
+    def _gone(self, connection: AcceptedConnection, error: Exception | None) -> None:
+        _log.debug("< %s: subscriber %s is gone (%s)", self.topic, printable(connection.caller_id), error or "closed")
         before = self.subscribers
-        self._count_out(link)
-        self._parcels = [(other, parcel) for other, parcel in self._parcels if other is not link]
-        self._held = tuple(other for other in self._held if other is not link)
-        self._open = tuple(other for other in self._open if other is not link)
+        self._count_out(connection)
+        self._parcels = [(other, parcel) for other, parcel in self._parcels if other is not connection]
+        self._held = tuple(other for other in self._held if other is not connection)
+        self._open = tuple(other for other in self._open if other is not connection)
         self._on_listeners()
         if before and not self.subscribers and not self._withdrawn:
             self._on_last()

@@ -38,7 +38,6 @@ _WHOLE: Final = 64 * KIB
 
 Describe = Callable[[], Awaitable[ServiceDescription | str]]
 Serve = Callable[["ServiceCall"], None]
-Respond = Callable[["ServiceCall"], Awaitable[tuple[bool, "Buffer"]]]
 
 
 class ServiceCall:
@@ -53,12 +52,12 @@ class ServiceCall:
             service is withdrawn. Called once at the most, and never behind ``reply``.
     """
 
-    __slots__ = ("_session", "caller_id", "deadline", "on_gone", "request", "service")
+    __slots__ = ("_client", "caller_id", "deadline", "on_gone", "request", "service")
 
     def __init__(
-        self, session: _ClientConnection, service: str, caller_id: str, request: bytes | bytearray, deadline: float
+        self, client: _ClientConnection, service: str, caller_id: str, request: bytes | bytearray, deadline: float
     ) -> None:
-        self._session: _ClientConnection | None = session
+        self._client: _ClientConnection | None = client
         self.service = service
         self.caller_id = caller_id
         self.request = request
@@ -68,14 +67,14 @@ class ServiceCall:
     @property
     def answered(self) -> bool:
         """Whether an answer has been given, or is not wanted any more."""
-        return self._session is None
+        return self._client is None
 
     def reply(self, ok: bool, body: Buffer) -> None:
         """Answer; ``body`` is the response, or for ``ok=False`` the error's text. The first answer counts."""
-        session, self._session = self._session, None
-        if session is not None:
+        client, self._client = self._client, None
+        if client is not None:
             self.on_gone = None
-            session.reply(ok, body)
+            client.reply(ok, body)
 
     def fail(self, text: str) -> None:
         """Answer with an error."""
@@ -83,7 +82,7 @@ class ServiceCall:
 
     def abandon(self) -> None:
         """No answer is wanted any more; for the endpoint."""
-        self._session = None
+        self._client = None
         on_gone, self.on_gone = self.on_gone, None
         if on_gone is not None:
             try:
@@ -99,7 +98,7 @@ class ServiceEndpoint:
         service: The global name, compared literally.
         caller_id: The serving node's name.
         serve: Called in the loop with each request; answers at once or later by ``call.reply``. What it raises
-            becomes the client's error. ``responding(async_function)`` makes one of a coroutine function.
+            becomes the client's error.
         describe: Asked when the first header comes and nothing is known (``description`` is ``None``); returns the
             description, which is kept, or the text of a refusal, which is not. Connections that come meanwhile wait
             for the same answer.
@@ -131,7 +130,7 @@ class ServiceEndpoint:
         """Of these, answered with an error."""
         self._describe = describe
         self._on_mismatch = on_mismatch
-        self._sessions: set[_ClientConnection] = set()
+        self._clients: set[_ClientConnection] = set()
         self._waiting: list[_ClientConnection] = []
         self._asking: asyncio.Task[None] | None = None
         self._empty: asyncio.Future[None] | None = None
@@ -139,16 +138,16 @@ class ServiceEndpoint:
     @property
     def connections(self) -> int:
         """Open connections."""
-        return len(self._sessions)
+        return len(self._clients)
 
-    def attach(self, link: AcceptedConnection) -> None:
+    def attach(self, connection: AcceptedConnection) -> None:
         """Take a connection whose header names this service and has the fields that it needs."""
-        session = _ClientConnection(self, link)
-        self._sessions.add(session)
+        client = _ClientConnection(self, connection)
+        self._clients.add(client)
         if self.description is not None:
-            session.open(self.description, resume=False)
+            client.open(self.description, resume=False)
             return
-        self._waiting.append(session)
+        self._waiting.append(client)
         if self._asking is None:
             self._asking = asyncio.get_running_loop().create_task(self._ask(), name=f"describe {self.service}")
 
@@ -158,30 +157,30 @@ class ServiceEndpoint:
         if self._asking is not None:
             self._asking.cancel()
         self._refuse_waiting(text)
-        for session in tuple(self._sessions):
-            session.withdraw(text)
+        for client in tuple(self._clients):
+            client.withdraw(text)
 
     async def closed(self) -> None:
         """Behind ``withdraw``: wait, a moment at the most, until the last replies have left."""
-        if self._sessions:
+        if self._clients:
             self._empty = asyncio.get_running_loop().create_future()
             await asyncio.wait([self._empty], timeout=runtime_limits.DRAIN_TIMEOUT)
-        for session in tuple(self._sessions):
-            session.close()
+        for client in tuple(self._clients):
+            client.close()
 
     def mismatch(self, fields: Mapping[str, str], text: str) -> None:
-        """A client's md5 sum does not fit; for the sessions."""
+        """A client's md5 sum does not fit; for the clients."""
         if self._on_mismatch is not None:
             self._on_mismatch(fields, text)
         else:
             _log.warning("! %s", text)
 
-    def left(self, session: _ClientConnection) -> None:
-        """A connection has ended; for the sessions."""
-        self._sessions.discard(session)
-        if session in self._waiting:
-            self._waiting.remove(session)
-        if not self._sessions and self._empty is not None and not self._empty.done():
+    def left(self, client: _ClientConnection) -> None:
+        """A connection has ended; for the clients."""
+        self._clients.discard(client)
+        if client in self._waiting:
+            self._waiting.remove(client)
+        if not self._clients and self._empty is not None and not self._empty.done():
             self._empty.set_result(None)
 
     async def _ask(self) -> None:
@@ -194,8 +193,8 @@ class ServiceEndpoint:
             return
         self.description = answer
         waiting, self._waiting = self._waiting, []
-        for session in waiting:
-            session.open(answer)
+        for client in waiting:
+            client.open(answer)
 
     async def _answer(self) -> ServiceDescription | str:
         if self._describe is None:
@@ -213,18 +212,18 @@ class ServiceEndpoint:
 
     def _refuse_waiting(self, text: str) -> None:
         waiting, self._waiting = self._waiting, []
-        for session in waiting:
-            session.refuse(text)
+        for client in waiting:
+            client.refuse(text)
 
 
 class _ClientConnection:
     """One client's connection: a request, its reply, and the next one where it is persistent."""
 
-    def __init__(self, endpoint: ServiceEndpoint, link: AcceptedConnection) -> None:
+    def __init__(self, endpoint: ServiceEndpoint, connection: AcceptedConnection) -> None:
         self._endpoint = endpoint
-        self._link = link
+        self._connection = connection
         self._loop = asyncio.get_running_loop()
-        self._persistent = is_persistent(link.fields)
+        self._persistent = is_persistent(connection.fields)
         self._open = False
         self._ended = False
         self._taking = False
@@ -236,29 +235,29 @@ class _ClientConnection:
         self._deadline: asyncio.TimerHandle | None = None
         self._stall: asyncio.TimerHandle | None = None
         self._seen = 0
-        link.on_bytes = self._take
-        link.on_end = self._left
+        connection.on_bytes = self._take
+        connection.on_end = self._left
 
     def open(self, description: ServiceDescription, *, resume: bool = True) -> None:
         """Answer the header; ``resume`` unless this is the very read that the header came with."""
-        link, endpoint = self._link, self._endpoint
-        problem = check_client(link.fields, endpoint.service, endpoint.caller_id, description)
+        connection, endpoint = self._connection, self._endpoint
+        problem = check_client(connection.fields, endpoint.service, endpoint.caller_id, description)
         if problem is not None:
-            endpoint.mismatch(link.fields, problem)
+            endpoint.mismatch(connection.fields, problem)
             self.refuse(problem)
             return
         self._open = True
-        link.stream.outbox.set_terms(BODIES, limits.SUBSCRIBER_QUEUE_MESSAGES, spared=True)
+        connection.stream.outbox.set_terms(BODIES, limits.SUBSCRIBER_QUEUE_MESSAGES, spared=True)
         header = server_header(endpoint.caller_id, description)
-        link.accept(header, limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SERVICE_MESSAGE_MAX, nodelay=True)
-        if not self._persistent or is_probe(link.fields):
+        connection.accept(header, limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SERVICE_MESSAGE_MAX, nodelay=True)
+        if not self._persistent or is_probe(connection.fields):
             self._watch()
         if resume:
             self._resume()
 
     def refuse(self, text: str) -> None:
         """Answer with an error header and close."""
-        self._link.refuse(text)
+        self._connection.refuse(text)
         self._over()
 
     def withdraw(self, text: str) -> None:
@@ -275,7 +274,7 @@ class _ClientConnection:
 
     def close(self) -> None:
         """Close the connection."""
-        self._link.close()
+        self._connection.close()
         self._over()
 
     def reply(self, ok: bool, body: Buffer) -> None:
@@ -349,7 +348,7 @@ class _ClientConnection:
         endpoint = self._endpoint
         endpoint.calls += 1
         deadline = self._loop.time() + endpoint.timeout
-        call = ServiceCall(self, endpoint.service, self._link.caller_id, request, deadline)
+        call = ServiceCall(self, endpoint.service, self._connection.caller_id, request, deadline)
         self._call = call
         try:
             endpoint.serve(call)
@@ -376,7 +375,7 @@ class _ClientConnection:
             f"request of {size} bytes to service [{self._endpoint.service}] exceeds the limit of "
             f"{limits.SERVICE_MESSAGE_MAX}"
         )
-        _log.warning("! %s: a %s", printable(self._link.caller_id), text)
+        _log.warning("! %s: a %s", printable(self._connection.caller_id), text)
         self._respond(False, text.encode())
 
     # --- replies ----------------------------------------------------------------------------------------------
@@ -391,7 +390,7 @@ class _ClientConnection:
             body = f"{text}{limits.SERVICE_MESSAGE_MAX}".encode()
         self._endpoint.failed += not ok
         head, body = frame_reply(ok, body)
-        stream = self._link.stream
+        stream = self._connection.stream
         if len(body) > INLINE:
             if isinstance(body, memoryview):
                 body = bytes(body)  # it may be valid for this call only
@@ -406,7 +405,7 @@ class _ClientConnection:
 
     async def _send_large(self, head: bytes, body: Buffer) -> None:
         try:
-            await send_large(self._link.stream, head, body)
+            await send_large(self._connection.stream, head, body)
             await self._drained()
         finally:
             self._sending = None
@@ -420,7 +419,7 @@ class _ClientConnection:
         self._settle()
 
     async def _drained(self) -> None:
-        stream = self._link.stream
+        stream = self._connection.stream
         while stream.pending_bytes and not stream.closed:
             await stream.drained()
 
@@ -438,21 +437,21 @@ class _ClientConnection:
     def _close_served(self) -> None:
         if self._ended:
             return
-        if self._link.stream.pending_bytes and self._sending is None:
+        if self._connection.stream.pending_bytes and self._sending is None:
             self._sending = self._loop.create_task(self._drain(), name="service response drains")
             return
         self.close()
 
     def _resume(self) -> None:
         if not self._taking and not self._ended:
-            self._link.stream.feed(b"")
+            self._connection.stream.feed(b"")
 
     # --- the end ----------------------------------------------------------------------------------------------
 
     def _watch(self) -> None:
         """Bytes must come soon."""
         if self._stall is None:
-            self._seen = self._link.stream.bytes_in
+            self._seen = self._connection.stream.bytes_in
             self._stall = self._loop.call_later(limits.SERVICE_STALL, self._stalled)
 
     def _unwatch(self) -> None:
@@ -462,16 +461,16 @@ class _ClientConnection:
 
     def _stalled(self) -> None:
         self._stall = None
-        if self._link.stream.bytes_in != self._seen:
+        if self._connection.stream.bytes_in != self._seen:
             self._watch()
             return
-        who = printable(self._link.caller_id)
+        who = printable(self._connection.caller_id)
         _log.debug("! %s: %s sent nothing for %g s; closed", self._endpoint.service, who, limits.SERVICE_STALL)
         self.close()
 
-    def _left(self, _link: AcceptedConnection, error: Exception | None) -> None:
+    def _left(self, _connection: AcceptedConnection, error: Exception | None) -> None:
         if error is not None and not isinstance(error, OSError):
-            _log.warning("! %s: %s: %s", self._endpoint.service, printable(self._link.caller_id), error)
+            _log.warning("! %s: %s: %s", self._endpoint.service, printable(self._connection.caller_id), error)
         self._over()
 
     def _over(self) -> None:
@@ -482,8 +481,8 @@ class _ClientConnection:
             self._deadline = None
         if self._sending is not None:
             self._sending.cancel()
-        self._link.on_bytes = None
-        self._link.on_end = _ended
+        self._connection.on_bytes = None
+        self._connection.on_end = _ended
         self._endpoint.left(self)
         call, self._call = self._call, None
         if call is not None:
@@ -491,33 +490,5 @@ class _ClientConnection:
             call.abandon()
 
 
-def _ended(_link: AcceptedConnection, _error: Exception | None) -> None:
+def _ended(_connection: AcceptedConnection, _error: Exception | None) -> None:
     """Of a connection that was let go of."""
-
-
-def responding(respond: Respond) -> Serve:
-    """A ``serve`` that runs a coroutine function for each call; it is cancelled when the client leaves."""
-    tasks: set[asyncio.Task[None]] = set()
-
-    async def run(call: ServiceCall) -> None:
-        try:
-            ok, body = await respond(call)
-        except RmpaError as error:
-            call.fail(str(error))
-        except Exception:  # noqa: BLE001 - a task's top: the client must hear of it
-            _log.exception("! %s: a call of %s failed", call.service, printable(call.caller_id))
-            call.fail(f"service [{call.service}] failed at this call; its log says why")
-        else:
-            call.reply(ok, body)
-
-    def serve(call: ServiceCall) -> None:
-        task = asyncio.get_running_loop().create_task(run(call), name=f"call of {call.service}")
-        tasks.add(task)
-        task.add_done_callback(tasks.discard)
-
-        def gone() -> None:
-            task.cancel()
-
-        call.on_gone = gone
-
-    return serve

@@ -399,22 +399,24 @@ class Subscription:
         self._definition = definition
         self._nodelay = nodelay
         self._number = number
-        self._links: dict[str, PublisherConnection] = {}
+        self._connections: dict[str, PublisherConnection] = {}
         self._leaving: set[PublisherConnection] = set()
 
     @property
     def publishers(self) -> int:
         """Publishers that we are connected to."""
-        return sum(link.connected for link in self._links.values())
+        return sum(connection.connected for connection in self._connections.values())
 
     @property
     def callers(self) -> set[str]:
         """The names of the publishers that we are connected to, as they say them."""
-        return {link.fields.get("callerid", "") for link in self._links.values() if link.connected}
+        return {
+            connection.fields.get("callerid", "") for connection in self._connections.values() if connection.connected
+        }
 
     def connections(self) -> list[BusConnection]:
         """For ``getBusInfo`` and ``getBusStats``."""
-        return [link.connection() for link in self._links.values()]
+        return [connection.connection() for connection in self._connections.values()]
 
     def update(self, uris: Iterable[str], *, keep: bool = False) -> None:
         """Take the list of publishers from the master: connect to the new ones, leave those that are gone.
@@ -424,57 +426,57 @@ class Subscription:
             keep: Leave none: the list is from a master that was started anew and does not know all yet.
         """
         listed = {uri for uri in uris if uri != self._own_uri}
-        for uri in () if keep else self._links.keys() - listed:
+        for uri in () if keep else self._connections.keys() - listed:
             self._leave(uri)
         for uri in listed:
-            link = self._links.get(uri)
-            if link is not None and link.refused is not None:
+            connection = self._connections.get(uri)
+            if connection is not None and connection.refused is not None:
                 self._leave(uri)
-                link = None
-            if link is None:
+                connection = None
+            if connection is None:
                 self._join(uri)
 
     def close(self) -> None:
         """Leave all publishers."""
-        for uri in tuple(self._links):
+        for uri in tuple(self._connections):
             self._leave(uri)
 
     async def closed(self) -> None:
         """Wait, behind ``close()``, until all tasks have ended."""
-        for link in tuple(self._leaving):
-            await link.closed()
+        for connection in tuple(self._leaving):
+            await connection.closed()
         self._leaving.clear()
 
     def _join(self, uri: str) -> None:
-        link = PublisherConnection(
+        connection = PublisherConnection(
             self.topic,
             uri,
             self._caller_id,
-            on_message=lambda framed: self._on_message(link, framed),
-            on_refused=lambda text: self._on_refused(link, text),
-            on_oversized=lambda size: self._oversized(link, size),
+            on_message=lambda framed: self._on_message(connection, framed),
+            on_refused=lambda text: self._on_refused(connection, text),
+            on_oversized=lambda size: self._oversized(connection, size),
             type_name=self.type_name,
             md5sum=self._md5sum,
             definition=self._definition,
             nodelay=self._nodelay,
             number=self._number(),
         )
-        self._links[uri] = link
-        link.start()
+        self._connections[uri] = connection
+        connection.start()
 
-    def _oversized(self, link: PublisherConnection, size: int) -> None:
-        if link.oversized == 1:
+    def _oversized(self, connection: PublisherConnection, size: int) -> None:
+        if connection.oversized == 1:
             limit = limits.TCPROS_MESSAGE_MAX
             _log.warning(
                 "! %s: a message of %d bytes of %s is left out: more than %d; others come as usual",
                 self.topic,
                 size,
-                link.uri,
+                connection.uri,
                 limit,
             )
 
     def _leave(self, uri: str) -> None:
-        link = self._links.pop(uri)
-        link.close()
+        connection = self._connections.pop(uri)
+        connection.close()
         self._leaving = {left for left in self._leaving if not left.ended}
-        self._leaving.add(link)
+        self._leaving.add(connection)

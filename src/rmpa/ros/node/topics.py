@@ -226,8 +226,8 @@ class Subscriber:
         self._ended = True
         self._wake.set()
 
-    def _message(self, link: PublisherConnection, framed: memoryview) -> None:
-        received = Received(bytes(framed[LENGTH.size :]), link.fields, time.time_ns(), self.kind)
+    def _message(self, connection: PublisherConnection, framed: memoryview) -> None:
+        received = Received(bytes(framed[LENGTH.size :]), connection.fields, time.time_ns(), self.kind)
         if self._callback is not None:
             try:
                 self._callback(received)
@@ -240,10 +240,12 @@ class Subscriber:
         self._queue.append(received)
         self._wake.set()
 
-    def _refused(self, link: PublisherConnection, text: str) -> None:
-        _remember(self.refusals, link.uri, text)
+    def _refused(self, connection: PublisherConnection, text: str) -> None:
+        _remember(self.refusals, connection.uri, text)
         now = asyncio.get_running_loop().time()
-        self._refusals.refuse(now, "subscription.refused", link.uri, f"{self.topic}: publisher {link.uri}: {text}")
+        self._refusals.refuse(
+            now, "subscription.refused", connection.uri, f"{self.topic}: publisher {connection.uri}: {text}"
+        )
 
 
 def _remember(refusals: dict[str, str], who: str, text: str) -> None:

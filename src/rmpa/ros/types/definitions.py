@@ -60,7 +60,7 @@ class DefinitionError(RmpaError):
 class UnknownTypeError(DefinitionError):
     """No definition of a type was found."""
 
-    learnable: bool = True
+    fetchable: bool = True
     """Whether a publisher may well know it: it is not of a package whose types all come with us."""
 
 

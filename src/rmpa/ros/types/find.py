@@ -4,7 +4,7 @@ In this order: the workspaces that are sourced (``ros.types.installed`` says whe
 ROS is
 installed on this machine. So a workspace's version of a standard type is preferred to ours, as it is by the nodes of
 that workspace. Where an md5 sum is given (a service's server or a publisher has one), the version with that sum is
-taken, wherever it is. What none of these knows may be learnt from a publisher: ``ros.node.learn_type``.
+taken, wherever it is. What none of these knows may be learnt from a publisher: ``ros.node.fetch_type``.
 """
 
 from __future__ import annotations
@@ -244,4 +244,4 @@ def _unknown(name: str, path: SearchPath, kind: str) -> NoReturn:
     near = did_you_mean(name, there or [each for each in ours if each.endswith(f"/{base}")])
     guess = f"did you mean {near}? Else " if near else ""
     problem += f"; looked in {path}, and at what comes with rmpa"
-    raise UnknownTypeError(name, problem, guess + _REMEDIES[kind], what, learnable=not ours_too)
+    raise UnknownTypeError(name, problem, guess + _REMEDIES[kind], what, fetchable=not ours_too)

@@ -31,7 +31,7 @@ _PROXIES: Final = "/rmpa/"
 
 
 @dataclass(frozen=True, slots=True)
-class Learnt:
+class FetchedType:
     """A type that a publisher has told.
 
     Args:
@@ -45,9 +45,9 @@ class Learnt:
     node: str
 
 
-async def learn_type(
+async def fetch_type(
     master_uri: str, caller_id: str, name: str, *, topic: str = "", elsewhere: bool = True
-) -> Learnt | None:
+) -> FetchedType | None:
     """Ask the publishers of a type for its definition, one behind the other, at most ``limits.ASKED_FOR_TYPE_MAX``.
 
     Args:
@@ -78,11 +78,11 @@ async def learn_type(
             _log.debug("! %s from %s: %s", name, node, error)
             continue
         if kind is not None:
-            return Learnt(kind, where, node)
+            return FetchedType(kind, where, node)
     return None
 
 
-async def find_or_learn(master_uri: str, caller_id: str, name: str, topic: str = "") -> MessageType:
+async def find_or_fetch(master_uri: str, caller_id: str, name: str, topic: str = "") -> MessageType:
     """Find a message type on this machine (``ros.types.find``), else learn it from a publisher.
 
     Args:
@@ -99,10 +99,10 @@ async def find_or_learn(master_uri: str, caller_id: str, name: str, topic: str =
     try:
         return await asyncio.to_thread(find_message_type, name)
     except UnknownTypeError as error:
-        if not error.learnable:
+        if not error.fetchable:
             raise
         unknown = error
-    learnt = await learn_type(master_uri, caller_id, name, topic=topic)
+    learnt = await fetch_type(master_uri, caller_id, name, topic=topic)
     if learnt is None:
         unknown.problem += f"; no publisher at {master_uri} tells it"
         raise unknown
@@ -146,7 +146,7 @@ async def _header(uri: str, topic: str, caller_id: str) -> Header:
         _log.debug("! %s from %s: %s", topic, uri, printable(why))
         tell({})
 
-    link = PublisherConnection(
+    connection = PublisherConnection(
         topic,
         uri,
         caller_id,
@@ -155,12 +155,12 @@ async def _header(uri: str, topic: str, caller_id: str) -> Header:
         on_refused=fail,
         on_lost=fail,
     )
-    link.start()
+    connection.start()
     try:
         async with asyncio.timeout(limits.ASKED_FOR_TYPE_TIMEOUT):
             return await told
     except TimeoutError:
         return {}
     finally:
-        link.close()
-        await link.closed()
+        connection.close()
+        await connection.closed()

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 import msgspec
 
 from rmpa.ros import limits
-from rmpa.ros.master.awaited import NodeRecord
 from rmpa.ros.master.effects import RegistrationKind
+from rmpa.ros.master.unverified import NodeRecord
 from rmpa.ros.wire.xmlrpc import brief
 from rmpa.ros.wire.xmlrpc_writer import legal_text
 
@@ -47,7 +47,7 @@ _pack = msgspec.msgpack.Encoder().encode
 _CONTAINERS: Final = (dict, list, tuple)
 
 
-class UnkeepableError(Exception):
+class NotStorableError(Exception):
     """A value that has no row; the text says why. Never leaves the core."""
 
 
@@ -116,16 +116,16 @@ def _leaves(path: Path, tree: Mapping[str, Any]) -> Iterator[Path]:
                 yield (*above, name)
 
 
-def packed(value: XmlRpcValue, breathing: Yielder = iter) -> bytes:
+def packed(value: XmlRpcValue, yielder: Yielder = iter) -> bytes:
     """A parameter's value as MessagePack.
 
     Raises:
-        UnkeepableError: It cannot be said so.
+        NotStorableError: It cannot be said so.
     """
     try:
-        return b"".join(breathing(_pieces(value)))
+        return b"".join(yielder(_pieces(value)))
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise UnkeepableError(f"{type(error).__name__}: {error}") from None
+        raise NotStorableError(f"{type(error).__name__}: {error}") from None
 
 
 def _pieces(value: Any) -> Iterator[bytes]:

@@ -7,10 +7,10 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from rmpa.ros import limits
-from rmpa.ros.core.keeper import Keeper
 from rmpa.ros.core.liveness import is_gone, listening_ports
+from rmpa.ros.core.state_writer import StateWriter
 from rmpa.ros.core.store import CoreStore
-from rmpa.ros.core.take_up import TakeUp
+from rmpa.ros.core.verification import NodeVerification
 from rmpa.ros.node.local_addresses import local_addresses
 
 if TYPE_CHECKING:
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 
     from rmpa.core.counters import Counters
     from rmpa.ros.master.api import MasterApi
-    from rmpa.ros.master.kept import StoredRegistrations
     from rmpa.ros.master.parameters import Tree
+    from rmpa.ros.master.stored_rows import StoredRegistrations
 
 _log = logging.getLogger(__name__)
 _SIMULATED: Final = "use_sim_time"
 _OF_A_CORE: Final = frozenset({"/run_id", "/rosdistro", "/rosversion"})
 
 
-class CoreMemory:
+class CorePersistence:
     """The memory of one core.
 
     Args:
@@ -52,82 +52,82 @@ class CoreMemory:
         self._api = api
         self._fresh = fresh
         self._temporary = temporary
-        self._keeper = Keeper(CoreStore(path), api, temporary, counters)
-        self.take_up = TakeUp(api.registrations, carry_out)
+        self._writer = StateWriter(CoreStore(path), api, temporary, counters)
+        self.verification = NodeVerification(api.registrations, carry_out)
         self.params = 0
         """Parameters that were taken up, those left out that every core has."""
 
     @property
     def path(self) -> Path:
         """Of the file."""
-        return self._keeper.path
+        return self._writer.path
 
     @property
     def problem(self) -> str:
         """Why nothing is kept at present, or empty."""
-        return self._keeper.problem
+        return self._writer.problem
 
     async def open(self) -> None:
         """Take up parameters, and remember the nodes that are to be asked; to be called before the core listens."""
-        kept = await self._keeper.open(fresh=self._fresh)
+        kept = await self._writer.open(fresh=self._fresh)
         registrations = self._api.registrations
         for node, record in kept.nodes.items():
             if not self._temporary(node):
-                registrations.await_node(node, record)
+                registrations.restore(node, record)
         before = kept.tree
         if before:
             tree = await self._without_old_time(kept)
             self._api.parameters.set("/", tree)
             self.params = sum(1 for name in self._api.parameters.names() if name not in _OF_A_CORE)
-        self._keeper.taken(before)
+        self._writer.taken(before)
 
     def start(self) -> None:
         """Ask the nodes from now on."""
-        self.take_up.start()
+        self.verification.start()
         if text := self.beginning():
             _log.info("= %s", text)
 
     def beginning(self) -> str:
         """What was there at the start, ready to read; empty for nothing."""
-        nodes = self.take_up.taken.nodes
+        nodes = self.verification.counts.nodes
         if not self.params and not nodes:
             return ""
         there = f"{self.path} has {_count(self.params, 'parameter')} and {_count(nodes, 'node')} of the run before"
         return there + ("; each node is asked whether it is still there" if nodes else "") + " (--fresh begins empty)"
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """Where it is kept, and what was taken up."""
         parts = [f"kept in {self.path}" if not self.problem else "nothing is kept"]
         if self._fresh:
             parts.append("begun empty (--fresh)")
-        if self.take_up.taken.nodes:
-            parts.append(self.take_up.summary())
+        if self.verification.counts.nodes:
+            parts.append(self.verification.summary())
         if self.params:
             parts.append(f"{_count(self.params, 'parameter')} of it {'was' if self.params == 1 else 'were'} taken up")
         return "; ".join(parts)
 
-    def look_soon(self) -> None:
+    def schedule_write(self) -> None:
         """Something of the core may have changed."""
-        self._keeper.look_soon()
+        self._writer.schedule_write()
 
-    async def ask_no_more(self) -> None:
+    async def stop_verification(self) -> None:
         """Ask no further nodes."""
-        await self.take_up.close()
+        await self.verification.close()
 
     async def close(self) -> None:
         """Write what has changed, and end."""
-        await self._keeper.close()
+        await self._writer.close()
 
     def notes(self) -> tuple[str, ...]:
         """What the user should know."""
-        silent = self.take_up.silent
-        notes = list(self._keeper.notes())
-        if silent and self.take_up.all_asked:
+        silent = self.verification.silent
+        notes = list(self._writer.notes())
+        if silent and self.verification.all_asked:
             named = [f"{node} at {api}" for node, api in list(silent.items())[: limits.CORE_STATE_UNFIT_SHOWN]]
             more = len(silent) - len(named)
             text = ", ".join(named) + (f" and {more} more" if more else "")
             text += " of the run before does not answer" if len(silent) == 1 else " of the run before do not answer"
-            patience = f"{limits.TAKE_UP_PATIENCE / 60:g} min"
+            patience = f"{limits.VERIFY_PATIENCE / 60:g} min"
             notes.append(f"{text}, and is not shown; asked again for {patience}: is that program stopped?")
         return tuple(notes)
 

@@ -28,8 +28,8 @@ from rmpa.runtime.event_loop import yield_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.ros.master.awaited import NodeRecord
     from rmpa.ros.master.registrations import Registrations
+    from rmpa.ros.master.unverified import NodeRecord
     from rmpa.ros.wire.xmlrpc import RosReply
 
 _log = logging.getLogger(__name__)
@@ -37,7 +37,7 @@ _CALLER_ID: Final = "/rmpa_identify"
 _LISTS: Final = ((RegistrationKind.PUBLISHER, "getPublications"), (RegistrationKind.SUBSCRIBER, "getSubscriptions"))
 
 
-class _Fate(enum.Enum):
+class _ProbeResult(enum.Enum):
     """What an address says of the nodes that were at it."""
 
     UP = "it is still that node"
@@ -47,14 +47,14 @@ class _Fate(enum.Enum):
 
 
 @dataclass(slots=True)
-class Taken:
+class VerificationCounts:
     """What became of the nodes of the run before.
 
     Args:
         nodes: How many there were.
         up: Those that answered, and are shown.
         gone: Those at whose address nobody listens, or another node does.
-        given_up: Those that did not answer for ``limits.TAKE_UP_PATIENCE``.
+        given_up: Those that did not answer for ``limits.VERIFY_PATIENCE``.
     """
 
     nodes: int = 0
@@ -63,7 +63,7 @@ class Taken:
     given_up: int = 0
 
 
-class TakeUp:
+class NodeVerification:
     """Asks every awaited node of one master.
 
     Args:
@@ -74,9 +74,9 @@ class TakeUp:
     def __init__(self, registrations: Registrations, carry_out: Callable[[], None]) -> None:
         self._registrations = registrations
         self._carry_out = carry_out
-        self.taken = Taken()
-        self._slots = asyncio.Semaphore(limits.TAKE_UP_AT_ONCE)
-        self._lists = asyncio.Semaphore(limits.TAKE_UP_LISTS)
+        self.counts = VerificationCounts()
+        self._slots = asyncio.Semaphore(limits.VERIFY_AT_ONCE)
+        self._lists = asyncio.Semaphore(limits.VERIFY_LISTS)
         self._tasks: set[asyncio.Task[None]] = set()
         self._at_start: defaultdict[str, list[str]] = defaultdict(list)
         self._first = 0
@@ -92,7 +92,7 @@ class TakeUp:
         loop = asyncio.get_running_loop()
         for node, api in self.silent.items():
             self._at_start[api].append(node)
-        self.taken.nodes = len(self._registrations.awaited)
+        self.counts.nodes = len(self._registrations.unverified)
         self._first = len(self._at_start)
         self._queued = set(self._at_start)
         for api in self._at_start:
@@ -117,30 +117,30 @@ class TakeUp:
     @property
     def silent(self) -> dict[str, str]:
         """Nodes that have not answered yet, and the URIs of their slave APIs."""
-        awaited = self._registrations.awaited
+        awaited = self._registrations.unverified
         return {node: record.api for node in awaited if (record := awaited.get(node)) is not None}
 
     # --- one address ------------------------------------------------------------------------------------------
 
     async def _follow(self, api: str) -> None:
         loop = asyncio.get_running_loop()
-        deadline = loop.time() + limits.TAKE_UP_PATIENCE
-        backoff = Backoff(limits.TAKE_UP_RETRY_FIRST, limits.TAKE_UP_RETRY_MAX, random.random)
+        deadline = loop.time() + limits.VERIFY_PATIENCE
+        backoff = Backoff(limits.VERIFY_RETRY_FIRST, limits.VERIFY_RETRY_MAX, random.random)
         first = True
         try:
             while nodes := self._at(api):
-                fate = await self._ask(api, nodes)
-                if fate is _Fate.SILENT and loop.time() > deadline:
-                    self.taken.given_up += len(nodes)
-                    self._give_up(nodes, api, f"it did not answer for {limits.TAKE_UP_PATIENCE:g} s")
-                elif fate is _Fate.UP:
+                result = await self._ask(api, nodes)
+                if result is _ProbeResult.SILENT and loop.time() > deadline:
+                    self.counts.given_up += len(nodes)
+                    self._give_up(nodes, api, f"it did not answer for {limits.VERIFY_PATIENCE:g} s")
+                elif result is _ProbeResult.UP:
                     self._take_up(self._at(api))
-                elif fate is not _Fate.SILENT:
-                    self.taken.gone += len(nodes)
-                    self._give_up(nodes, api, fate.value)
+                elif result is not _ProbeResult.SILENT:
+                    self.counts.gone += len(nodes)
+                    self._give_up(nodes, api, result.value)
                 first = self._asked(first)
-                if fate is not _Fate.SILENT:
-                    await self._compare(api, nodes if fate is _Fate.UP else {})
+                if result is not _ProbeResult.SILENT:
+                    await self._compare(api, nodes if result is _ProbeResult.UP else {})
                     return
                 await asyncio.sleep(backoff.delay())
         except Exception:  # noqa: BLE001 - a task's top
@@ -151,11 +151,11 @@ class TakeUp:
 
     def _at(self, api: str) -> dict[str, NodeRecord]:
         """The awaited nodes with this slave API: nodelets share one."""
-        awaited = self._registrations.awaited
+        awaited = self._registrations.unverified
         found = {node: awaited.get(node) for node in self._at_start[api]}
         return {node: record for node, record in found.items() if record is not None and record.api == api}
 
-    async def _ask(self, api: str, nodes: dict[str, NodeRecord]) -> _Fate:
+    async def _ask(self, api: str, nodes: dict[str, NodeRecord]) -> _ProbeResult:
         """Ask within a place of few; who does not answer soon gives the place to another."""
         await self._slots.acquire()
         held = True
@@ -167,9 +167,9 @@ class TakeUp:
                 self._slots.release()
                 self._leave_queue(api)
 
-        timer = asyncio.get_running_loop().call_later(limits.TAKE_UP_PROMPT, leave)
+        timer = asyncio.get_running_loop().call_later(limits.VERIFY_PROMPT, leave)
         try:
-            return await _fate(api, nodes)
+            return await _probe(api, nodes)
         finally:
             timer.cancel()
             leave()
@@ -182,13 +182,13 @@ class TakeUp:
 
     def _take_up(self, nodes: dict[str, NodeRecord]) -> None:
         for node in nodes:
-            published, subscribed = self._registrations.take_up(node)
+            published, subscribed = self._registrations.confirm(node)
             self._published.update(dict.fromkeys(published))
             self._subscribed += [(topic, node) for topic in subscribed]
-            self.taken.up += 1
+            self.counts.up += 1
             self._carry_out()
             yield_to_data()
-        self._announce_soon(limits.TAKE_UP_ANNOUNCE if self._queued else 0.0)
+        self._announce_soon(limits.VERIFY_ANNOUNCE if self._queued else 0.0)
 
     def _announce_soon(self, seconds: float) -> None:
         if not seconds and self._announcing is not None:
@@ -202,18 +202,18 @@ class TakeUp:
         published, self._published = self._published, {}
         subscribed, self._subscribed = self._subscribed, []
         for topic, node in subscribed:
-            self._registrations.tell(topic, node)
+            self._registrations.notify_subscriber(topic, node)
             self._carry_out()
             yield_to_data()
         for topic in published:
-            self._registrations.announce(topic)
+            self._registrations.notify_new_subscribers(topic)
             self._carry_out()
             yield_to_data()
 
     def _give_up(self, nodes: dict[str, NodeRecord], api: str, why: str) -> None:
         for node in nodes:
             _log.info("= node %s at %s, of the run before, is not taken up: %s", node, api, why)
-            self._registrations.give_up(node)
+            self._registrations.discard(node)
             self._carry_out()
 
     def _asked(self, first: bool) -> bool:
@@ -227,14 +227,14 @@ class TakeUp:
 
     def summary(self) -> str:
         """``12 of 15 nodes of the run before are taken up, 1 does not answer yet, 2 are gone``."""
-        taken = self.taken
-        parts = [f"{taken.up} of {taken.nodes} nodes of the run before are taken up"]
-        if silent := len(self._registrations.awaited):
+        counts = self.counts
+        parts = [f"{counts.up} of {counts.nodes} nodes of the run before are taken up"]
+        if silent := len(self._registrations.unverified):
             parts.append(f"{silent} {'does' if silent == 1 else 'do'} not answer yet")
-        if taken.gone:
-            parts.append(f"{taken.gone} {'is' if taken.gone == 1 else 'are'} gone")
-        if taken.given_up:
-            parts.append(f"{taken.given_up} did not answer for {limits.TAKE_UP_PATIENCE:g} s")
+        if counts.gone:
+            parts.append(f"{counts.gone} {'is' if counts.gone == 1 else 'are'} gone")
+        if counts.given_up:
+            parts.append(f"{counts.given_up} did not answer for {limits.VERIFY_PATIENCE:g} s")
         return ", ".join(parts)
 
     # --- what changed while there was no core -----------------------------------------------------------------
@@ -248,8 +248,8 @@ class TakeUp:
         registrations = self._registrations
         async with self._lists:
             for kind, method in _LISTS:
-                for _ in range(limits.TAKE_UP_COMPARED):
-                    mark = registrations.marks.get(node)
+                for _ in range(limits.VERIFY_COMPARED):
+                    mark = registrations.revisions.get(node)
                     try:
                         said = _topics(await call_api(api, method, _CALLER_ID))
                     except (RmpaError, RosFault) as error:
@@ -257,7 +257,7 @@ class TakeUp:
                         return
                     if said is None or registrations.node_api(node) != api:
                         return
-                    if registrations.marks.get(node) == mark:  # else it has changed since: ask again
+                    if registrations.revisions.get(node) == mark:  # else it has changed since: ask again
                         self._adjust(kind, node, api, said)
                         break
 
@@ -272,27 +272,27 @@ class TakeUp:
                 registrations.register_publisher(topic, said[topic], node, api)
             else:
                 registrations.register_subscriber(topic, said[topic], node, api)
-                registrations.tell(topic, node)
+                registrations.notify_subscriber(topic, node)
         self._carry_out()
 
 
-async def _fate(api: str, nodes: dict[str, NodeRecord]) -> _Fate:
+async def _probe(api: str, nodes: dict[str, NodeRecord]) -> _ProbeResult:
     topics = [topic for record in nodes.values() for topic in record.publishers if topic != "/rosout"]
     try:
         found = await name_at(api, topics)
         if found is None:
             knows = await _knows(api, nodes)
             if knows is None:
-                return _Fate.SILENT
+                return _ProbeResult.SILENT
             if knows:
-                return _Fate.UP
+                return _ProbeResult.UP
             # A publisher tells its name, unless it was too busy for that just now.
-            return _Fate.SILENT if topics else _Fate.OTHER
+            return _ProbeResult.SILENT if topics else _ProbeResult.OTHER
     except UnreachableError as error:
-        return _Fate.GONE if isinstance(error.__cause__, ConnectionRefusedError) else _Fate.SILENT
+        return _ProbeResult.GONE if isinstance(error.__cause__, ConnectionRefusedError) else _ProbeResult.SILENT
     except (RosFault, RemoteProtocolError):
-        return _Fate.OTHER
-    return _Fate.UP if found in nodes else _Fate.OTHER
+        return _ProbeResult.OTHER
+    return _ProbeResult.UP if found in nodes else _ProbeResult.OTHER
 
 
 async def _knows(api: str, nodes: dict[str, NodeRecord]) -> bool | None:

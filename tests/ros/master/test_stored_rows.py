@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.ros import limits
-from rmpa.ros.master.awaited import NodeRecord
-from rmpa.ros.master.kept import NODE, PARAM, UnkeepableError, changed_params, packed, param_key, read
 from rmpa.ros.master.parameters import Parameters
+from rmpa.ros.master.stored_rows import NODE, PARAM, NotStorableError, changed_params, packed, param_key, read
+from rmpa.ros.master.unverified import NodeRecord
 from rmpa.ros.wire.xmlrpc_writer import legal_text
 
 if TYPE_CHECKING:
-    from rmpa.ros.master.kept import Key
+    from rmpa.ros.master.stored_rows import Key
 
 TALKER = NodeRecord(
     "http://127.0.0.1:4001/",
@@ -112,9 +112,9 @@ def test_long_lists_and_names_with_slashes_come_back() -> None:
 
 
 def test_what_cannot_be_said_is_refused() -> None:
-    with pytest.raises(UnkeepableError, match="OverflowError"):
+    with pytest.raises(NotStorableError, match="OverflowError"):
         packed(1 << 70)
-    with pytest.raises(UnkeepableError):
+    with pytest.raises(NotStorableError):
         packed(object())  # type: ignore[arg-type]
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core import limits as core_limits
 from rmpa.ros import limits
 from rmpa.ros.core.store import is_locked
-from rmpa.ros.master import kept
+from rmpa.ros.master import stored_rows
 from rmpa.ros.wire.xmlrpc import brief
 from rmpa.runtime.event_loop import yielding_to_data
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from rmpa.core.counters import Counters
     from rmpa.ros.core.store import CoreStore
     from rmpa.ros.master.api import MasterApi
-    from rmpa.ros.master.kept import Key, Row, StoredRegistrations
     from rmpa.ros.master.parameters import Tree
+    from rmpa.ros.master.stored_rows import Key, Row, StoredRegistrations
 
 _log = logging.getLogger(__name__)
 _NONE: Final = (0, 0)
@@ -33,7 +33,7 @@ _RECORDS: Final = 8
 """Nodes that are looked at between two breaths: to write one down takes some 25 microseconds."""
 
 
-class Keeper:
+class StateWriter:
     """Looks what has changed, and writes that; where nothing has, it writes nothing.
 
     Args:
@@ -85,11 +85,11 @@ class Keeper:
             self._anew = self._unread = True
             self._say(str(error))
             self._after(limits.CORE_STATE_RETRY)
-            return kept.StoredRegistrations()
+            return stored_rows.StoredRegistrations()
         if fresh:
             self._anew = bool(rows)
-            return kept.StoredRegistrations()
-        found = kept.read(rows)
+            return stored_rows.StoredRegistrations()
+        found = stored_rows.read(rows)
         for lost in found.lost[: core_limits.LOG_LINES_MAX]:
             _log.warning("! %s: left out: %s", self.path, lost)
         self._known = {(kind, name): _known(name, value) for kind, name, value in rows}
@@ -108,10 +108,10 @@ class Keeper:
 
     def taken(self, tree: Tree) -> None:
         """Everything that was read is in the master now; ``tree`` are the parameters that were in the file."""
-        self._marks = dict(self._api.registrations.marks)
+        self._marks = dict(self._api.registrations.revisions)
         self._tree = tree
 
-    def look_soon(self) -> None:
+    def schedule_write(self) -> None:
         """Something may have changed."""
         if self._closed:
             return
@@ -171,7 +171,7 @@ class Keeper:
     async def _write(self) -> bool:
         """Write what has changed; whether that went well."""
         registrations, tree = self._api.registrations, self._api.parameters.tree
-        marks = dict(registrations.marks)
+        marks = dict(registrations.revisions)
         if marks == self._marks and tree is self._tree and not self._anew and not self.problem:
             return True
         try:
@@ -207,23 +207,23 @@ class Keeper:
 
     def _changed_nodes(self, marks: dict[str, int]) -> dict[Key, bytes | None]:
         rows: dict[Key, bytes | None] = {
-            (kept.NODE, name): None for name in yielding_to_data(list(self._marks)) if name not in marks
+            (stored_rows.NODE, name): None for name in yielding_to_data(list(self._marks)) if name not in marks
         }
         for name, mark in yielding_to_data(marks.items(), every=_RECORDS):
             if self._marks.get(name) != mark and not self._temporary(name):
                 record = self._api.registrations.record(name)
-                rows[kept.NODE, name] = record.serialize() if record is not None else None
+                rows[stored_rows.NODE, name] = record.serialize() if record is not None else None
         return rows
 
     def _changed_params(self, tree: Tree) -> dict[Key, bytes | None]:
         rows: dict[Key, bytes | None] = {}
-        for path, value in yielding_to_data(kept.changed_params(self._tree, tree)):
-            key = kept.param_key(path)
+        for path, value in yielding_to_data(stored_rows.changed_params(self._tree, tree)):
+            key = stored_rows.param_key(path)
             rows[key] = None
             if value is not None:
                 try:
-                    rows[key] = kept.packed(value, yielding_to_data)
-                except kept.UnkeepableError as error:
+                    rows[key] = stored_rows.packed(value, yielding_to_data)
+                except stored_rows.NotStorableError as error:
                     self._refuse(key, "/" + "/".join(path), str(error))
                     continue
             self._unfit.pop(key, None)

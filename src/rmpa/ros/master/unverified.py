@@ -46,7 +46,7 @@ class NodeRecord(msgspec.Struct, omit_defaults=True):
                 return self.params
 
 
-class Awaited:
+class UnverifiedNodes:
     """The records of nodes that are awaited, and the publishers among them by topic."""
 
     def __init__(self) -> None:

@@ -118,7 +118,7 @@ def rows(path: Path) -> list[tuple[str, str]]:
 async def all_asked(core: RosCore) -> None:
     assert core.memory is not None
     memory = core.memory
-    await until(lambda: memory.take_up.all_asked)
+    await until(lambda: memory.verification.all_asked)
 
 
 async def test_nodes_that_go_on_are_back_and_told_of_each_other(path: Path) -> None:
@@ -140,8 +140,8 @@ async def test_nodes_that_go_on_are_back_and_told_of_each_other(path: Path) -> N
             assert core.call("getParam", "/x", "/run_id").value == run_id
             await until(lambda: hearer.updates)
             assert hearer.updates[-1] == ("/chatter", [talker.uri])
-            assert "2 of 2 nodes of the run before are taken up" in core.remembered()
-            assert str(path) in core.remembered()
+            assert "2 of 2 nodes of the run before are taken up" in core.restored()
+            assert str(path) in core.restored()
 
 
 async def test_who_is_gone_or_has_another_name_is_not_shown(path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -154,7 +154,7 @@ async def test_who_is_gone_or_has_another_name_is_not_shown(path: Path, caplog: 
         async with running(path) as core:
             await all_asked(core)
             assert core.state().publishers == {}
-            assert core.remembered().endswith("0 of 2 nodes of the run before are taken up, 2 are gone")
+            assert core.restored().endswith("0 of 2 nodes of the run before are taken up, 2 are gone")
             assert "node /moved" in caplog.text
             assert "another node is there" in caplog.text
             await until(lambda: core.counters["kept.written"])
@@ -164,8 +164,8 @@ async def test_who_is_gone_or_has_another_name_is_not_shown(path: Path, caplog: 
 async def test_a_node_that_hangs_delays_nobody_and_is_taken_up_when_it_answers(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(limits, "TAKE_UP_AT_ONCE", 1)
-    monkeypatch.setattr(limits, "TAKE_UP_PROMPT", 0.01)
+    monkeypatch.setattr(limits, "VERIFY_AT_ONCE", 1)
+    monkeypatch.setattr(limits, "VERIFY_PROMPT", 0.01)
     monkeypatch.setattr(limits, "SLAVE_CALL_TIMEOUT", 0.3)
     async with Slave("/hangs") as hangs, Slave("/answers") as answers, Slave("/hearer") as hearer:
         async with running(path) as core:
@@ -176,7 +176,7 @@ async def test_a_node_that_hangs_delays_nobody_and_is_taken_up_when_it_answers(
         hearer.updates.clear()
         async with running(path) as core:
             await until(lambda: names(core) == {"/answers", "/hearer"})
-            assert dict(core.awaited("/a")) == {"/hangs": hangs.uri}
+            assert dict(core.unverified("/a")) == {"/hangs": hangs.uri}
             await until(lambda: hearer.updates)
             # It may be connected to the one that hangs: roscpp would hang up on who is not named.
             assert set(hearer.updates[-1][1]) == {answers.uri, hangs.uri}
@@ -188,21 +188,21 @@ async def test_a_node_that_hangs_delays_nobody_and_is_taken_up_when_it_answers(
 
 
 async def test_a_node_that_never_answers_is_given_up(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "TAKE_UP_PATIENCE", 0.1)
+    monkeypatch.setattr(limits, "VERIFY_PATIENCE", 0.1)
     monkeypatch.setattr(limits, "SLAVE_CALL_TIMEOUT", 0.1)
     async with Slave("/hangs") as hangs:
         async with running(path) as core:
             await hangs.publish(core, "/a")
         hangs.go.clear()
         async with running(path) as core:
-            await until(lambda: "did not answer for" in core.remembered())
+            await until(lambda: "did not answer for" in core.restored())
             assert core.notes() == ()
             await until(lambda: ("node", "/hangs") not in core_rows(core))
 
 
 def core_rows(core: RosCore) -> set[tuple[str, str]]:
     assert core.memory is not None
-    return set(core.memory._keeper._known)
+    return set(core.memory._writer._known)
 
 
 async def test_a_node_that_hangs_is_still_kept_when_the_core_ends_again(
@@ -286,7 +286,7 @@ async def test_parameters_survive_with_their_types_and_fresh_forgets_all(path: P
             assert core.call("getParam", "/x", "/run_id").value != run_id
             await asyncio.sleep(0)
             assert names(core) == set()
-            assert "begun empty" in core.remembered()
+            assert "begun empty" in core.restored()
             await call(core.uri, "setParam", "/x", "/after", 1)
         async with running(path) as core:
             assert (await call_api(core.uri, "hasParam", "/x", "/robot")).value is False
@@ -414,7 +414,7 @@ async def test_a_place_that_cannot_be_used_is_said_and_used_when_it_can(
         (note,) = core.notes()
         assert "nothing of the core is kept over a restart" in note
         assert "set RMPA_STATE_DIR" in note
-        assert "nothing is kept" in core.remembered()
+        assert "nothing is kept" in core.restored()
         await until(lambda: core.counters["kept.failed"] > 1)
         assert caplog.text.count("nothing of the core is kept") == 1
         path.parent.unlink()
