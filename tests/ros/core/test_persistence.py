@@ -116,8 +116,8 @@ def rows(path: Path) -> list[tuple[str, str]]:
 
 
 async def all_asked(core: RosCore) -> None:
-    assert core.memory is not None
-    memory = core.memory
+    assert core.persistence is not None
+    memory = core.persistence
     await until(lambda: memory.verification.all_asked)
 
 
@@ -201,8 +201,8 @@ async def test_a_node_that_never_answers_is_given_up(path: Path, monkeypatch: py
 
 
 def core_rows(core: RosCore) -> set[tuple[str, str]]:
-    assert core.memory is not None
-    return set(core.memory._writer._known)
+    assert core.persistence is not None
+    return set(core.persistence._writer._known)
 
 
 async def test_a_node_that_hangs_is_still_kept_when_the_core_ends_again(

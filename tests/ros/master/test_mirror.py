@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
-from rmpa.ros.master.mirror import Call, Mirror, leftovers
+from rmpa.ros.master.mirror import Call, Mirror, stale_registrations
 from rmpa.ros.master.survey import lookup_calls, read_lookups, read_survey, survey_calls
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class Pair:
     def look(self) -> list[Call]:
         """Look at the master and learn; what must be registered again is written."""
         seen = self.mirror.asked
-        again = self.mirror.learn(self.survey(), seen, {})
+        again = self.mirror.update(self.survey(), seen, {})
         self.writes += again
         return again
 
@@ -153,7 +153,7 @@ def test_a_provider_that_a_look_from_before_saw_does_not_take_ours(pair: Pair) -
     pair.theirs("unregisterService", "/n", "/srv", "rosrpc://h:9")
     pair.call("registerService", "/rmpa/b/n", "/srv", "rosrpc://h:10", OURS)
     pair.flush()
-    pair.mirror.learn(survey, seen, {})
+    pair.mirror.update(survey, seen, {})
     assert pair.mirror.state().services == {"/srv": {"/rmpa/b/n": "rosrpc://h:10"}}
     assert pair.look() == []
 
@@ -165,15 +165,15 @@ def test_ours_counts_at_once_and_a_look_from_before_takes_nothing_back(pair: Pai
     assert pair.call("registerPublisher", "/rmpa", "/t", STRING, OURS) == [THEIRS]
     assert pair.call("registerSubscriber", "/rmpa", "/t", STRING, OURS) == [OURS]
     assert pair.mirror.publishers("/t") == {"/rmpa": OURS}
-    assert pair.mirror.learn(survey, seen, {}) == []
+    assert pair.mirror.update(survey, seen, {}) == []
     assert pair.mirror.publishers("/t") == {"/rmpa": OURS}
     pair.flush()
     assert pair.look() == []
     seen, survey = pair.mirror.asked, pair.survey()
     assert pair.call("unregisterPublisher", "/rmpa", "/t", OURS) == 1
     assert pair.call("unregisterPublisher", "/rmpa", "/t", OURS) == 0
-    assert pair.mirror.strangers(survey, "/rmpa", seen) == {}
-    assert pair.mirror.learn(survey, seen, {}) == []
+    assert pair.mirror.foreign_agents(survey, "/rmpa", seen) == {}
+    assert pair.mirror.update(survey, seen, {}) == []
     assert pair.mirror.publishers("/t") == {}
 
 
@@ -194,7 +194,7 @@ def test_what_the_master_lacks_of_ours_is_registered_again(pair: Pair) -> None:
     pair.flush()
     assert pair.look() == []
     assert pair.mirror.state() == pair.master.registrations.state()
-    for method, params in pair.mirror.undo_all():
+    for method, params in pair.mirror.unregister_calls():
         pair.call(method, *params)
     pair.flush()
     assert pair.master.registrations.nodes() == {}
@@ -208,7 +208,7 @@ def test_nodes_of_a_master_that_is_no_more_stay_until_they_die_or_come_back(pair
     pair.look()
     assert pair.mirror.publishers("/t") == {"/dies": THEIRS, "/returns": MOVED}
     pair.theirs("registerPublisher", "/returns", "/other", STRING, "http://127.0.0.1:4/")
-    pair.mirror.buried("/dies", THEIRS)
+    pair.mirror.mark_dead("/dies", THEIRS)
     pair.look()
     assert pair.mirror.publishers("/t") == {}
     assert pair.mirror.state().nodes == {"/returns": "http://127.0.0.1:4/"}
@@ -218,13 +218,13 @@ def test_a_dead_node_counts_no_more_until_it_is_somewhere_else_or_lives_after_al
     pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
     pair.look()
     pair.changes()
-    pair.mirror.buried("/p", THEIRS)
+    pair.mirror.mark_dead("/p", THEIRS)
     pair.look()
     assert pair.changes() == {("-", "/t", "/p")}
-    pair.mirror.risen("/p")
+    pair.mirror.mark_alive("/p")
     pair.look()
     assert pair.mirror.publishers("/t") == {"/p": THEIRS}
-    pair.mirror.buried("/p", THEIRS)
+    pair.mirror.mark_dead("/p", THEIRS)
     pair.theirs("registerPublisher", "/p", "/t", STRING, MOVED)
     pair.look()
     assert (pair.mirror.publishers("/t"), dict(pair.mirror.dead)) == ({"/p": MOVED}, {})
@@ -259,8 +259,8 @@ def test_a_proxy_that_left_since_the_look_began_is_no_stranger(pair: Pair) -> No
     pair.look()
     seen, survey = pair.mirror.asked, pair.survey()
     pair.call("unregisterPublisher", "/rmpa/b/n", "/t", OURS)
-    assert pair.mirror.strangers(survey, "/rmpa", seen) == {}
-    assert set(pair.mirror.strangers(survey, "/rmpa", pair.mirror.asked)) == {"/rmpa/b/n"}
+    assert pair.mirror.foreign_agents(survey, "/rmpa", seen) == {}
+    assert set(pair.mirror.foreign_agents(survey, "/rmpa", pair.mirror.asked)) == {"/rmpa/b/n"}
 
 
 def test_names_of_an_agent_that_are_not_ours_are_strangers_and_leave_nothing(pair: Pair) -> None:
@@ -269,11 +269,11 @@ def test_names_of_an_agent_that_are_not_ours_are_strangers_and_leave_nothing(pai
     pair.theirs("registerService", "/rmpa/b/n", "/srv", "rosrpc://h:9", MOVED)
     pair.theirs("registerPublisher", "/rmpaint", "/t", STRING, THEIRS)
     survey = pair.survey()
-    strangers = pair.mirror.strangers(survey, "/rmpa", pair.mirror.asked)
+    strangers = pair.mirror.foreign_agents(survey, "/rmpa", pair.mirror.asked)
     assert strangers == {"/rmpa": THEIRS, "/rmpa/b/n": MOVED}
-    assert pair.mirror.learn(survey, 0, strangers) == []
+    assert pair.mirror.update(survey, 0, strangers) == []
     assert set(pair.mirror.state().nodes) == {"/rmpaint"}
-    for (method, params), _ in leftovers(survey, strangers):
+    for (method, params), _ in stale_registrations(survey, strangers):
         pair.theirs(method, *map(str, params))
     assert set(pair.master.registrations.nodes()) == {"/rmpaint"}
 
@@ -312,7 +312,7 @@ def test_whatever_a_master_answers_is_a_survey_or_an_error(answer: list[XmlRpcVa
     except RemoteProtocolError:
         return
     mirror = Mirror()
-    mirror.learn(survey, 0, mirror.strangers(survey, "/rmpa", 0))
+    mirror.update(survey, 0, mirror.foreign_agents(survey, "/rmpa", 0))
     assert set(mirror.state().nodes) <= set(survey.uris)
 
 
@@ -350,8 +350,8 @@ def test_whatever_happened_the_next_look_shows_what_the_master_has(steps: list[t
     pair.flush()
     pair.look()
     pair.flush()
-    strangers = pair.mirror.strangers(pair.survey(), "/rmpa", pair.mirror.asked)
-    for (method, params), _ in leftovers(pair.survey(), strangers):
+    strangers = pair.mirror.foreign_agents(pair.survey(), "/rmpa", pair.mirror.asked)
+    for (method, params), _ in stale_registrations(pair.survey(), strangers):
         pair.theirs(method, *map(str, params))
     assert pair.look() == []
     mirror, master = pair.mirror.state(), pair.master.registrations.state()

@@ -76,7 +76,7 @@ async def test_a_publisher_tells_a_type(core: RosCore) -> None:
 
 
 async def test_publishers_that_cannot_tell_are_passed_over(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "ASKED_FOR_TYPE_TIMEOUT", 0.5)
+    monkeypatch.setattr(limits, "FETCH_TYPE_TIMEOUT", 0.5)
     silent = socket.create_server(("127.0.0.1", 0))  # listens, and never answers
     port = silent.getsockname()[1]
     core.call("registerPublisher", "/a_gone", "/a", NAME, "http://127.0.0.1:9/")
@@ -88,7 +88,7 @@ async def test_publishers_that_cannot_tell_are_passed_over(core: RosCore, monkey
         assert await learnt(core) is None
         await two.advertise("/f", FOO)
         assert await learnt(core) == ("/two", "/f", FOO.md5sum)
-        monkeypatch.setattr(limits, "ASKED_FOR_TYPE_MAX", 3)
+        monkeypatch.setattr(limits, "FETCH_TYPE_PUBLISHERS", 3)
         assert await learnt(core) is None
     silent.close()
 

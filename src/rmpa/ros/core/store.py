@@ -1,8 +1,8 @@
 """The file in which a core keeps its registrations and parameters: SQLite, written in threads.
 
-One table, ``kept(kind, name, value)``; ``ros.master.stored_rows`` says what is in it. A commit is one transaction in a
-write-ahead log, which survives the end of the process, however it ends, without a wait for the disk; a loss of power
-may take the last seconds. A file that is damaged, of another program or of a newer release is set aside under
+One table, ``kept(kind, name, value)``; ``ros.master.stored_rows`` says what is in it. A commit is one transaction in
+a write-ahead log, which survives the end of the process, however it ends, without a wait for the disk; a loss of
+power may take the last seconds. A file that is damaged, of another program or of a newer release is set aside under
 ``.damaged``.
 """
 

@@ -31,7 +31,7 @@ ERROR: Final = -1
 
 @dataclass(frozen=True, slots=True)
 class _Method:
-    """One method of the API: its parameters behind ``caller_id``, and the value of a reply that says no."""
+    """One method of the API: its parameters behind ``caller_id``, and the value of an error's reply."""
 
     function: Callable[..., RosReply]
     parameters: tuple[tuple[str, v.Validator], ...]
@@ -44,8 +44,8 @@ class MasterApi:
     Args:
         uri: What ``getUri`` answers.
         pid: What ``getPid`` answers.
-        on_shutdown: Called with the reason when somebody asks the master to end.
-        yielder: For what takes long in a graph of thousands, or with large parameters.
+        on_shutdown: Called with the reason when a client calls ``shutdown``.
+        yielder: Lets pending data go first in a graph of thousands, and for large parameters.
     """
 
     def __init__(self, uri: str, pid: int, on_shutdown: Callable[[str], None], *, yielder: Yielder = iter) -> None:
@@ -68,8 +68,8 @@ class MasterApi:
         """Call a method of the Master or Parameter Server API.
 
         Args:
-            method: Its name.
-            arguments: What it is called with, the caller id first.
+            method: The method's name.
+            arguments: The parameters, the caller id first.
 
         Returns:
             Code 1 with the value; or 0 or -1 with text and a value of the same kind.
@@ -127,7 +127,7 @@ class MasterApi:
         return {"faultCode": problem.code, "faultString": problem.text}
 
     def take(self) -> tuple[list[Effect], list[GraphChange]]:
-        """Take what is to be done and what has changed since the last time, in order."""
+        """Take the effects and changes since the last time, in order."""
         taken = self.registrations.effects, self.registrations.changes
         self.registrations.effects, self.registrations.changes = [], []
         return taken
@@ -194,11 +194,11 @@ class MasterApi:
 
     def _unsubscribe_param(self, caller_id: str, api: str, key: str) -> RosReply:
         self.registrations.unregister(RegistrationKind.PARAM, with_slash(key), caller_id, api)
-        # Whether it was subscribed or not: rosmaster says 1.
+        # rosmaster answers 1 whether it was subscribed or not.
         return RosReply(SUCCESS, f"not subscribed to parameter {key}", 1)
 
     def _has_param(self, _caller_id: str, key: str) -> RosReply:
-        # The name is the status: clients of old look there.
+        # rosmaster puts the name into the status, and old clients read it.
         return RosReply(SUCCESS, key, self.parameters.has(key))
 
     def _get_param_names(self, _caller_id: str) -> RosReply:

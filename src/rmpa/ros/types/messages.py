@@ -70,7 +70,7 @@ class MessageType:
 
     @classmethod
     def learn(cls, name: str, definition: str, md5: str = "") -> MessageType:
-        """A type from what its publisher says about it; the last ``limits.LEARNT_TYPES_MAX`` are remembered.
+        """A type from what its publisher says about it; the last ``limits.RECEIVED_TYPES_MAX`` are remembered.
 
         Args:
             name: ``package/Name``.
@@ -339,7 +339,7 @@ def _known_store() -> Typestore:
     return Ros1Store(Stores.ROS1_NOETIC)
 
 
-@functools.lru_cache(maxsize=limits.LEARNT_TYPES_MAX)
+@functools.lru_cache(maxsize=limits.RECEIVED_TYPES_MAX)
 def _learn(name: str, definition: str) -> MessageType:
     return MessageType(name, parse_definition(name, definition))
 
