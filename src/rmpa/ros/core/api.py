@@ -96,9 +96,7 @@ class Core(Protocol):
         ...
 
     def restored(self) -> str:
-        """Where the core stores its state and what it restored from the previous run, for people; empty for
-        nothing.
-        """
+        """Where the core stores its state and what it restored, for people; empty for nothing."""
         ...
 
     def unverified(self, topic: str) -> Mapping[str, str]:

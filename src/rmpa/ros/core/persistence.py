@@ -1,4 +1,4 @@
-"""What a core remembers over its end: its file, what is written there, and the nodes that are taken up from it."""
+"""Stores the state of a core in a file, and restores it: parameters at once, nodes when they have been verified."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ _OF_A_CORE: Final = frozenset({"/run_id", "/rosdistro", "/rosversion"})
 
 
 class CorePersistence:
-    """The memory of one core.
+    """The stored state of one core.
 
     Args:
         path: The file.
-        api: The core's.
-        fresh: Take nothing up.
-        temporary: Whether a node of this name is not to be kept.
+        api: The core's master.
+        fresh: Restore nothing.
+        temporary: Whether a node of this name is not stored.
         carry_out: Called after each change of the registrations.
-        counters: Of the core.
+        counters: The core's.
     """
 
     def __init__(
@@ -55,40 +55,40 @@ class CorePersistence:
         self._writer = StateWriter(CoreStore(path), api, temporary, counters)
         self.verification = NodeVerification(api.registrations, carry_out)
         self.params = 0
-        """Parameters that were taken up, those left out that every core has."""
+        """Restored parameters, without those that every core sets."""
 
     @property
     def path(self) -> Path:
-        """Of the file."""
+        """The file."""
         return self._writer.path
 
     @property
     def problem(self) -> str:
-        """Why nothing is kept at present, or empty."""
+        """Why nothing is stored at present, or empty."""
         return self._writer.problem
 
     async def open(self) -> None:
-        """Take up parameters, and remember the nodes that are to be asked; to be called before the core listens."""
-        kept = await self._writer.open(fresh=self._fresh)
+        """Restore parameters and unverified nodes; before the core listens."""
+        stored = await self._writer.open(fresh=self._fresh)
         registrations = self._api.registrations
-        for node, record in kept.nodes.items():
+        for node, record in stored.nodes.items():
             if not self._temporary(node):
                 registrations.restore(node, record)
-        before = kept.tree
+        before = stored.tree
         if before:
-            tree = await self._without_old_time(kept)
+            tree = await self._without_stale_sim_time(stored)
             self._api.parameters.set("/", tree)
             self.params = sum(1 for name in self._api.parameters.names() if name not in _OF_A_CORE)
-        self._writer.taken(before)
+        self._writer.restored_all(before)
 
     def start(self) -> None:
-        """Ask the nodes from now on."""
+        """Begin to verify the nodes."""
         self.verification.start()
         if text := self.beginning():
             _log.info("= %s", text)
 
     def beginning(self) -> str:
-        """What was there at the start, ready to read; empty for nothing."""
+        """What the file held at the start, for people; empty for nothing."""
         nodes = self.verification.counts.nodes
         if not self.params and not nodes:
             return ""
@@ -96,7 +96,7 @@ class CorePersistence:
         return there + ("; each node is asked whether it is still there" if nodes else "") + " (--fresh begins empty)"
 
     def summary(self) -> str:
-        """Where it is kept, and what was taken up."""
+        """The file and what was restored from it, for people."""
         parts = [f"kept in {self.path}" if not self.problem else "nothing is kept"]
         if self._fresh:
             parts.append("begun empty (--fresh)")
@@ -107,19 +107,19 @@ class CorePersistence:
         return "; ".join(parts)
 
     def schedule_write(self) -> None:
-        """Something of the core may have changed."""
+        """Write soon, if something of the core has changed."""
         self._writer.schedule_write()
 
     async def stop_verification(self) -> None:
-        """Ask no further nodes."""
+        """Stop verifying nodes."""
         await self.verification.close()
 
     async def close(self) -> None:
-        """Write what has changed, and end."""
+        """Write what has changed, and close the file."""
         await self._writer.close()
 
     def notes(self) -> tuple[str, ...]:
-        """What the user should know."""
+        """Problems that the user should know of."""
         silent = self.verification.silent
         notes = list(self._writer.notes())
         if silent and self.verification.all_asked:
@@ -131,22 +131,22 @@ class CorePersistence:
             notes.append(f"{text}, and is not shown; asked again for {patience}: is that program stopped?")
         return tuple(notes)
 
-    async def _without_old_time(self, kept: StoredRegistrations) -> Tree:
-        """The parameters; without ``/use_sim_time`` where no node is left whose time it could be.
+    async def _without_stale_sim_time(self, stored: StoredRegistrations) -> Tree:
+        """The parameters, without ``/use_sim_time`` where no restored node is left to publish ``/clock``.
 
-        A node that starts under it waits for a clock that nobody publishes any more.
+        A node that starts under it would wait for ever.
         """
-        if _SIMULATED not in kept.tree:
-            return dict(kept.tree)
-        if kept.nodes:
+        if _SIMULATED not in stored.tree:
+            return dict(stored.tree)
+        if stored.nodes:
             try:
                 ports, addresses = await asyncio.to_thread(lambda: (listening_ports(), set(local_addresses())))
-            except OSError:  # no file descriptor is left to ask the kernel: nothing is known of them
-                return dict(kept.tree)
-            if not all(is_gone(record.api, ports, addresses) for record in kept.nodes.values()):
-                return dict(kept.tree)
+            except OSError:  # no file descriptor is left to ask the kernel
+                return dict(stored.tree)
+            if not all(is_gone(record.api, ports, addresses) for record in stored.nodes.values()):
+                return dict(stored.tree)
         _log.warning("= /use_sim_time of the run before is not taken up: no node of it is left")
-        return {name: value for name, value in kept.tree.items() if name != _SIMULATED}
+        return {name: value for name, value in stored.tree.items() if name != _SIMULATED}
 
 
 def _count(number: int, what: str) -> str:

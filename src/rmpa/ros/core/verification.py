@@ -1,9 +1,9 @@
-"""Asks the nodes of the run before whether they are still there, and has those shown that are.
+"""Verifies the nodes restored from the previous run: those that still run are registered again, the others discarded.
 
-rospy tells its name (``getName``); roscpp tells it in the header of a topic that it publishes. A node is gone where
-its port refuses connections, or another node is at it. One that does not answer is asked again for a while. What a
-node registered or withdrew while there was no core is learnt from its own lists (``getPublications``,
-``getSubscriptions``), behind everything else.
+rospy has its name in ``getName``, roscpp in the header of a topic that it publishes. A node is gone if its port
+refuses connections, or another node has the port. One that does not answer is asked again for a while. What a node
+registered or unregistered while there was no core follows from its own lists (``getPublications``,
+``getSubscriptions``), which are compared last.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _LISTS: Final = ((RegistrationKind.PUBLISHER, "getPublications"), (RegistrationK
 
 
 class _ProbeResult(enum.Enum):
-    """What an address says of the nodes that were at it."""
+    """What the address of restored nodes answers."""
 
     UP = "it is still that node"
     GONE = "nobody listens there"
@@ -48,12 +48,12 @@ class _ProbeResult(enum.Enum):
 
 @dataclass(slots=True)
 class VerificationCounts:
-    """What became of the nodes of the run before.
+    """Counts of the restored nodes.
 
     Args:
-        nodes: How many there were.
-        up: Those that answered, and are shown.
-        gone: Those at whose address nobody listens, or another node does.
+        nodes: All.
+        up: Those that answered and are registered again.
+        gone: Those at whose address nothing or another node listens.
         given_up: Those that did not answer for ``limits.VERIFY_PATIENCE``.
     """
 
@@ -64,10 +64,10 @@ class VerificationCounts:
 
 
 class NodeVerification:
-    """Asks every awaited node of one master.
+    """Verifies the unverified nodes of one master.
 
     Args:
-        registrations: Of the master.
+        registrations: The master's tables.
         carry_out: Called after each change of them.
     """
 
@@ -81,14 +81,15 @@ class NodeVerification:
         self._at_start: defaultdict[str, list[str]] = defaultdict(list)
         self._first = 0
         self._queued: set[str] = set()
-        """Addresses that wait for their first question, or have just been asked."""
+        """Addresses that were not asked yet, or have not answered their first question within
+        ``limits.VERIFY_PROMPT``."""
         self._all_asked = asyncio.Event()
         self._published: dict[str, None] = {}
         self._subscribed: list[tuple[str, str]] = []
-        self._announcing: asyncio.TimerHandle | None = None
+        self._notification_timer: asyncio.TimerHandle | None = None
 
     def start(self) -> None:
-        """Ask from now on."""
+        """Begin to ask all of them."""
         loop = asyncio.get_running_loop()
         for node, api in self.silent.items():
             self._at_start[api].append(node)
@@ -96,22 +97,22 @@ class NodeVerification:
         self._first = len(self._at_start)
         self._queued = set(self._at_start)
         for api in self._at_start:
-            task = loop.create_task(self._follow(api), name=f"take up {api}")
+            task = loop.create_task(self._verify(api), name=f"verify {api}")
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
 
     async def close(self) -> None:
-        """Ask no more; who has not answered stays awaited."""
+        """Stop; nodes that have not answered stay unverified."""
         tasks = list(self._tasks)
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        if self._announcing is not None:
-            self._announcing.cancel()
+        if self._notification_timer is not None:
+            self._notification_timer.cancel()
 
     @property
     def all_asked(self) -> bool:
-        """Whether each has been asked at least once."""
+        """Whether each node has been asked at least once."""
         return self._all_asked.is_set()
 
     @property
@@ -122,7 +123,7 @@ class NodeVerification:
 
     # --- one address ------------------------------------------------------------------------------------------
 
-    async def _follow(self, api: str) -> None:
+    async def _verify(self, api: str) -> None:
         loop = asyncio.get_running_loop()
         deadline = loop.time() + limits.VERIFY_PATIENCE
         backoff = Backoff(limits.VERIFY_RETRY_FIRST, limits.VERIFY_RETRY_MAX, random.random)
@@ -132,12 +133,12 @@ class NodeVerification:
                 result = await self._ask(api, nodes)
                 if result is _ProbeResult.SILENT and loop.time() > deadline:
                     self.counts.given_up += len(nodes)
-                    self._give_up(nodes, api, f"it did not answer for {limits.VERIFY_PATIENCE:g} s")
+                    self._discard(nodes, api, f"it did not answer for {limits.VERIFY_PATIENCE:g} s")
                 elif result is _ProbeResult.UP:
-                    self._take_up(self._at(api))
+                    self._confirm(self._at(api))
                 elif result is not _ProbeResult.SILENT:
                     self.counts.gone += len(nodes)
-                    self._give_up(nodes, api, result.value)
+                    self._discard(nodes, api, result.value)
                 first = self._asked(first)
                 if result is not _ProbeResult.SILENT:
                     await self._compare(api, nodes if result is _ProbeResult.UP else {})
@@ -147,16 +148,16 @@ class NodeVerification:
             _log.exception("! the node at %s cannot be taken up", api)
         finally:
             self._asked(first)
-            self._leave_queue(api)
+            self._unqueue(api)
 
     def _at(self, api: str) -> dict[str, NodeRecord]:
-        """The awaited nodes with this slave API: nodelets share one."""
+        """The unverified nodes with this slave API: nodelets share one."""
         awaited = self._registrations.unverified
         found = {node: awaited.get(node) for node in self._at_start[api]}
         return {node: record for node, record in found.items() if record is not None and record.api == api}
 
     async def _ask(self, api: str, nodes: dict[str, NodeRecord]) -> _ProbeResult:
-        """Ask within a place of few; who does not answer soon gives the place to another."""
+        """Ask, with a bound on concurrent questions in which slow nodes do not count for long."""
         await self._slots.acquire()
         held = True
 
@@ -165,7 +166,7 @@ class NodeVerification:
             if held:
                 held = False
                 self._slots.release()
-                self._leave_queue(api)
+                self._unqueue(api)
 
         timer = asyncio.get_running_loop().call_later(limits.VERIFY_PROMPT, leave)
         try:
@@ -174,13 +175,13 @@ class NodeVerification:
             timer.cancel()
             leave()
 
-    def _leave_queue(self, api: str) -> None:
-        """An address has answered, or hangs; perhaps as the last one of all."""
+    def _unqueue(self, api: str) -> None:
+        """An address has answered, or hangs; behind the last one, notify the subscribers."""
         self._queued.discard(api)
         if not self._queued:
-            self._announce_soon(0.0)
+            self._schedule_notifications(0.0)
 
-    def _take_up(self, nodes: dict[str, NodeRecord]) -> None:
+    def _confirm(self, nodes: dict[str, NodeRecord]) -> None:
         for node in nodes:
             published, subscribed = self._registrations.confirm(node)
             self._published.update(dict.fromkeys(published))
@@ -188,17 +189,17 @@ class NodeVerification:
             self.counts.up += 1
             self._carry_out()
             yield_to_data()
-        self._announce_soon(limits.VERIFY_ANNOUNCE if self._queued else 0.0)
+        self._schedule_notifications(limits.VERIFY_ANNOUNCE if self._queued else 0.0)
 
-    def _announce_soon(self, seconds: float) -> None:
-        if not seconds and self._announcing is not None:
-            self._announcing.cancel()
-            self._announcing = None
-        if self._announcing is None and (self._published or self._subscribed):
-            self._announcing = asyncio.get_running_loop().call_later(seconds, self._announce)
+    def _schedule_notifications(self, seconds: float) -> None:
+        if not seconds and self._notification_timer is not None:
+            self._notification_timer.cancel()
+            self._notification_timer = None
+        if self._notification_timer is None and (self._published or self._subscribed):
+            self._notification_timer = asyncio.get_running_loop().call_later(seconds, self._notify_subscribers)
 
-    def _announce(self) -> None:
-        self._announcing = None
+    def _notify_subscribers(self) -> None:
+        self._notification_timer = None
         published, self._published = self._published, {}
         subscribed, self._subscribed = self._subscribed, []
         for topic, node in subscribed:
@@ -210,14 +211,14 @@ class NodeVerification:
             self._carry_out()
             yield_to_data()
 
-    def _give_up(self, nodes: dict[str, NodeRecord], api: str, why: str) -> None:
+    def _discard(self, nodes: dict[str, NodeRecord], api: str, why: str) -> None:
         for node in nodes:
             _log.info("= node %s at %s, of the run before, is not taken up: %s", node, api, why)
             self._registrations.discard(node)
             self._carry_out()
 
     def _asked(self, first: bool) -> bool:
-        """An address has been asked for the first time, perhaps as the last one of all."""
+        """Count an address that has been asked for the first time."""
         if first:
             self._first -= 1
             if not self._first:
@@ -240,9 +241,9 @@ class NodeVerification:
     # --- what changed while there was no core -----------------------------------------------------------------
 
     async def _compare(self, api: str, nodes: dict[str, NodeRecord]) -> None:
-        """Make the registrations of a node what it says itself."""
+        """Make the registrations of a node equal to its own lists."""
         if len(nodes) != 1:
-            return  # whose of several they are nothing tells
+            return  # the lists of nodelets do not say which node an entry belongs to
         await self._all_asked.wait()
         [node] = nodes
         registrations = self._registrations
@@ -251,27 +252,27 @@ class NodeVerification:
                 for _ in range(limits.VERIFY_COMPARED):
                     mark = registrations.revisions.get(node)
                     try:
-                        said = _topics(await call_api(api, method, _CALLER_ID))
+                        listed = _topics(await call_api(api, method, _CALLER_ID))
                     except (RmpaError, RosFault) as error:
                         _log.debug("= %s does not tell what it has: %s", node, error)
                         return
-                    if said is None or registrations.node_api(node) != api:
+                    if listed is None or registrations.node_api(node) != api:
                         return
-                    if registrations.revisions.get(node) == mark:  # else it has changed since: ask again
-                        self._adjust(kind, node, api, said)
+                    if registrations.revisions.get(node) == mark:  # else it changed meanwhile: ask again
+                        self._adjust(kind, node, api, listed)
                         break
 
-    def _adjust(self, kind: RegistrationKind, node: str, api: str, said: dict[str, str]) -> None:
+    def _adjust(self, kind: RegistrationKind, node: str, api: str, listed: dict[str, str]) -> None:
         registrations = self._registrations
         record = registrations.record(node)
         known = record.of(kind) if record is not None else {}
-        for topic in known.keys() - said.keys():
+        for topic in known.keys() - listed.keys():
             registrations.unregister(kind, topic, node, api)
-        for topic in said.keys() - known.keys():
+        for topic in listed.keys() - known.keys():
             if kind is RegistrationKind.PUBLISHER:
-                registrations.register_publisher(topic, said[topic], node, api)
+                registrations.register_publisher(topic, listed[topic], node, api)
             else:
-                registrations.register_subscriber(topic, said[topic], node, api)
+                registrations.register_subscriber(topic, listed[topic], node, api)
                 registrations.notify_subscriber(topic, node)
         self._carry_out()
 
@@ -281,12 +282,12 @@ async def _probe(api: str, nodes: dict[str, NodeRecord]) -> _ProbeResult:
     try:
         found = await name_at(api, topics)
         if found is None:
-            knows = await _knows(api, nodes)
+            knows = await _has_registrations(api, nodes)
             if knows is None:
                 return _ProbeResult.SILENT
             if knows:
                 return _ProbeResult.UP
-            # A publisher tells its name, unless it was too busy for that just now.
+            # A publisher sends its name in a header, unless it is too busy at present.
             return _ProbeResult.SILENT if topics else _ProbeResult.OTHER
     except UnreachableError as error:
         return _ProbeResult.GONE if isinstance(error.__cause__, ConnectionRefusedError) else _ProbeResult.SILENT
@@ -295,19 +296,19 @@ async def _probe(api: str, nodes: dict[str, NodeRecord]) -> _ProbeResult:
     return _ProbeResult.UP if found in nodes else _ProbeResult.OTHER
 
 
-async def _knows(api: str, nodes: dict[str, NodeRecord]) -> bool | None:
-    """Whether a node that does not tell its name has everything that these had registered, and something of it.
+async def _has_registrations(api: str, nodes: dict[str, NodeRecord]) -> bool | None:
+    """Whether an unnamed node has all topics that these had registered, and at least one.
 
-    ``None`` if the node does not tell what it has either.
+    ``None`` if the node does not answer with its lists either.
     """
     for kind, method in _LISTS:
         had = {topic for record in nodes.values() for topic in record.of(kind)}
         if not had:
             continue
-        said = _topics(await call_api(api, method, _CALLER_ID))
-        if said is None:
+        listed = _topics(await call_api(api, method, _CALLER_ID))
+        if listed is None:
             return None
-        if not had <= said.keys():
+        if not had <= listed.keys():
             return False
     return any(record.publishers or record.subscribers for record in nodes.values())
 

@@ -12,9 +12,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PublisherUpdate:
-    """``publisherUpdate`` for the slave API at ``api``: the publishers of ``topic`` (slave APIs, in order of
-    registration).
-    """
+    """``publisherUpdate`` for the slave API at ``api``: the publishers of ``topic``, in order of registration."""
 
     api: str
     topic: str

@@ -72,9 +72,7 @@ class Parameters:
 
     @property
     def tree(self) -> Tree:
-        """The whole tree, not to be changed; it and its parts are the same objects until something in them
-        changes.
-        """
+        """The whole tree, not to be changed; the same object until something in it changes, and so are its parts."""
         return self._tree
 
     def get(self, key: str) -> XmlRpcValue:

@@ -282,9 +282,7 @@ class Registrations:
                 self._notify_subscribers(topic, self._restored.__contains__)
 
     def notify_new_subscribers(self, topic: str) -> None:
-        """Notify the subscribers of a topic that registered after the restart: they do not know its restored
-        publishers.
-        """
+        """Notify the subscribers of a topic that registered after the restart of its restored publishers."""
         self._notify_subscribers(topic, lambda node: node not in self._restored)
 
     def _withdraw(self, kind: RegistrationKind, key: str, node: str, api: str) -> bool:
