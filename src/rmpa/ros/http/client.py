@@ -1,7 +1,6 @@
 """XML-RPC calls to nodes and masters, each on a connection of its own.
 
-A kept-alive connection costs a Python node a thread and blocks nothing for roscpp, so none is kept; a connection on
-loopback is made in 50 microseconds.
+No connection is kept alive: each costs a Python node a thread, and to open one on loopback takes 50 microseconds.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ def split_uri(uri: str) -> tuple[str, int, str]:
     """``http://host:port/path`` to ``(host, port, path)``; the path is at least ``/``.
 
     Raises:
-        UnreachableError: The text is not such a URI: ROS wants the port said.
+        UnreachableError: The text is not such a URI; ROS requires the port.
     """
     try:
         parts = urlsplit(uri)
@@ -51,12 +50,12 @@ def split_uri(uri: str) -> tuple[str, int, str]:
 
 
 def is_own_name(host: str) -> bool:
-    """Whether a host's name is this machine's, so that loopback will do."""
+    """Whether a host name is this machine's, which is reached by loopback."""
     return host in {"localhost", socket.gethostname()}
 
 
 async def _addresses(host: str, port: int) -> list[tuple[str, int]]:
-    """Where to connect, best first: names of this machine and numbers without asking the resolver."""
+    """Addresses of a host, best first; the resolver is not asked for numbers and names of this machine."""
     if is_own_name(host):
         return [(_LOOPBACK, port)]
     try:
@@ -81,9 +80,9 @@ async def _connect_one(address: tuple[str, int], use: Use) -> socket.socket:
     try:
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         await asyncio.get_running_loop().sock_connect(sock, address)
-        # This raises too, where the other side hung up at once.
+        # This raises too, if the other side closed at once.
         if sock.getsockname() == sock.getpeername():
-            # A port of the ephemeral range that nobody listens at can connect to itself.
+            # A port of the ephemeral range where nothing listens can connect to itself.
             raise ConnectionRefusedError(errno.ECONNREFUSED, "connected to itself")  # noqa: TRY301 - see below
     except BaseException:
         sock.close()
@@ -95,13 +94,13 @@ async def connect(host: str, port: int, use: Use = Use.DATA) -> socket.socket:
     """Connect by TCP, non-blocking and with TCP_NODELAY.
 
     Args:
-        host: A number, a name of this machine (connected on loopback, without the resolver) or any other name.
+        host: An address, a name of this machine (connected on loopback, without the resolver) or any other name.
         port: The port.
-        use: What for: whether it may take one of the last file descriptors.
+        use: The purpose, which decides whether the connection may take one of the last file descriptors.
 
     Raises:
         UnreachableError: The name does not resolve.
-        OSError: Nobody listens there (``ConnectionRefusedError``), the network says no, or no file descriptor is
+        OSError: The connection is refused (``ConnectionRefusedError``), the network fails, or no file descriptor is
             left (``EMFILE``).
     """
     error: OSError = ConnectionRefusedError(errno.ECONNREFUSED, f"no address for {host}")
@@ -133,17 +132,17 @@ async def call(
 
     Args:
         uri: ``http://host:port/``.
-        method: Its name.
-        params: What it is called with.
-        timeout: Seconds for everything: connecting, the call and its response.
-        use: What for: whether it may take one of the last file descriptors.
+        method: The method's name.
+        params: The parameters.
+        timeout: Seconds for everything: the connection, the call and its response.
+        use: The purpose, which decides whether the connection may take one of the last file descriptors.
 
     Raises:
-        UnreachableError: Nobody answers there, or not in time.
-        OutOfDescriptors: No file descriptor is left here to ask.
-        RosFault: The answer is a fault.
-        RemoteProtocolError: The answer is not XML-RPC, or too large.
-        LocalProtocolError: A parameter cannot be said in XML-RPC.
+        UnreachableError: The server does not answer, or not in time.
+        OutOfDescriptors: No file descriptor is left for the call.
+        RosFault: The response is a fault.
+        RemoteProtocolError: The response is not XML-RPC, or too large.
+        LocalProtocolError: A parameter cannot be written in XML-RPC.
     """
     if _log.isEnabledFor(logging.DEBUG):
         _log.debug("> %s %s%s", uri, method, brief(params))
@@ -159,10 +158,10 @@ async def exchange(
     timeout: float,  # noqa: ASYNC109 - the message names it
     use: Use = Use.DATA,
 ) -> bytes:
-    """Send a ``methodCall`` document and return the response's, which nobody has looked at.
+    """Send a ``methodCall`` document and return that of the response, unread.
 
-    For who asks the same again and again, and need not read the same answer twice. Arguments and errors as of
-    ``call``; ``read_response`` reads it.
+    A caller that polls compares the bytes with those of the last response, and need not read the same one twice.
+    Arguments and errors are those of ``call``; ``read_response`` reads the document.
     """
     host, port, path = split_uri(uri)
     loop = asyncio.get_running_loop()
@@ -204,7 +203,7 @@ async def call_api(
     timeout: float = limits.SLAVE_CALL_TIMEOUT,  # noqa: ASYNC109 - handed to ``call``
     use: Use = Use.DATA,
 ) -> RosReply:
-    """Call a method of a ROS API, all of which answer ``[code, status, value]``.
+    """Call a method of a ROS API, which answers ``[code, status, value]``.
 
     Raises:
         RemoteProtocolError: The answer is not such a triple (roscpp's ``getBusStats`` is none).

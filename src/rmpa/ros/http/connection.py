@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable
 
 _PIECE: Final = 16 * KIB
-"""Bytes that are parsed at once: the bound on headers is as exact as this, and data goes first in between."""
+"""Bytes parsed at once: the granularity of the bound on headers; pending data goes first in between."""
 
 
 class ConnectionOwner(Protocol):
@@ -51,8 +51,8 @@ class HttpConnection(asyncio.Protocol):
 
     Attributes:
         client: The client's address.
-        begun: When the call that is unfinished, or whose answer is not read, began, by the loop's clock.
-        answered: When the last answer was written, by the loop's clock.
+        begun: The start of the call that is unfinished, or whose answer is not read, by the loop's clock.
+        answered: The time of the last answer, by the loop's clock.
         gone: Done when the connection is closed.
     """
 
@@ -73,7 +73,7 @@ class HttpConnection(asyncio.Protocol):
         self.client = "?"
         self.answered: float | None = None
 
-    # --- for the choice of what gives way (ros.http.eviction) -------------------------------------------------
+    # --- http.eviction.Client ---------------------------------------------------------------------------------
 
     @property
     def idle(self) -> bool:
@@ -84,7 +84,7 @@ class HttpConnection(asyncio.Protocol):
 
     @property
     def answering(self) -> bool:
-        """Whether a call has come and is being answered."""
+        """Whether a call is being answered."""
         return self._task is not None
 
     @property
@@ -94,12 +94,12 @@ class HttpConnection(asyncio.Protocol):
 
     @property
     def reserved(self) -> int:
-        """Bytes set aside for its call."""
+        """Bytes reserved for its call."""
         return self._requests.body.reserved
 
     @property
     def received(self) -> int:
-        """Bytes of an unfinished call that have come; 0 while an answer is not read."""
+        """Received bytes of an unfinished call; 0 while an answer is not read."""
         return len(self._requests.body) if self._requests.receiving else 0
 
     @property

@@ -36,12 +36,12 @@ class XmlRpcServer:
     """Listens at one address and hands each call to ``handler``, in the loop.
 
     Args:
-        handler: Answers the calls; of one connection one at a time and in order.
+        handler: Answers the calls; those of one connection one at a time and in order.
         host: Numeric address or name to listen at.
         port: 0 lets the system choose.
-        counters: Where refusals (``http.*``, ``xmlrpc.*``) and calls are counted.
-        name: What listens here, for messages: ``ROS core``, ``node /talker``.
-        use: What its connections are for: whether they may take the last file descriptors.
+        counters: Count refusals (``http.*``, ``xmlrpc.*``) and calls.
+        name: The server, for messages: ``ROS core``, ``node /talker``.
+        use: The purpose of its connections, which decides whether they may take the last file descriptors.
     """
 
     def __init__(
@@ -63,10 +63,10 @@ class XmlRpcServer:
         self._use = use
         self._acceptor: Acceptor | None = None
         self._arriving: set[asyncio.Task[None]] = set()
-        # In the order of their last use, so that the first idle one is the one to give up.
+        # In the order of their last use: the first idle one is closed for a new one.
         self._connections: dict[HttpConnection, None] = {}
         self.port = 0
-        """The port that it listens at; 0 before ``start``."""
+        """The listening port; 0 before ``start``."""
 
     @property
     def connections(self) -> int:
@@ -86,7 +86,7 @@ class XmlRpcServer:
         _log.info("= %s listens at %s:%d", self._name, self._host, self.port)
 
     def adopt(self, sock: socket.socket, _client: tuple[str, int]) -> None:
-        """Serve a connection that was accepted, by this server's own socket or by one that several nodes share.
+        """Serve an accepted connection, of this server's own socket or of one that several nodes share.
 
         Args:
             sock: Non-blocking; owned from here on.
@@ -133,7 +133,7 @@ class XmlRpcServer:
         return True
 
     def _give_up(self, connection: HttpConnection) -> None:
-        """Close a connection for one that needs its place; an idle one's client connects anew without a word."""
+        """Close a connection for another one; the client of an idle one reconnects by itself."""
         if connection.idle:
             self.counters.add("http.evicted")
         else:
@@ -143,7 +143,7 @@ class XmlRpcServer:
         connection.abort()
 
     def reserve(self, connection: HttpConnection, size: int) -> bool:
-        """Whether there is room for a large call, which is set aside until it is answered."""
+        """Whether there is room for a large call, which stays reserved until it is answered."""
         now = asyncio.get_running_loop().time()
         while sum(one.reserved for one in self._connections) + size > limits.HTTP_BODIES_MAX:
             slow = eviction.for_call(self._connections, now)
@@ -165,7 +165,7 @@ class XmlRpcServer:
             DESCRIPTORS.offer(self, None)
 
     def _close_idle(self) -> bool:
-        """Close a connection whose client has had its answer, for one that waits for a descriptor elsewhere."""
+        """Close an idle connection, to free a file descriptor for another part of the process."""
         before = asyncio.get_running_loop().time() - limits.HTTP_IDLE_MIN
         for connection in self._connections:
             if connection.answered is not None and connection.answered < before and connection.idle:
@@ -208,7 +208,7 @@ class XmlRpcServer:
             _log.debug("< %s %s%s", connection.client, method, brief(params))
         try:
             value = self._handler(method, params, connection.client)
-        except Exception as error:  # noqa: BLE001 - the top of a call: whatever it is, the caller gets an answer
+        except Exception as error:  # noqa: BLE001 - the top of a call: the caller gets an answer in any case
             return self._failed(method, error)
         if isinstance(value, Awaitable):
             return self._answer_later(method, value)

@@ -44,12 +44,12 @@ class ServiceCall:
     """One request, until it is answered.
 
     Attributes:
-        service: The service's name here.
+        service: The service's name in this graph.
         caller_id: The calling node.
-        request: The request's bytes, without a length; belongs to the call and never changes.
-        deadline: ``loop.time()`` at which the client gets an error by itself.
-        on_gone: Set it to hear that no answer is wanted any more: the client has left, the deadline is over, or the
-            service is withdrawn. Called once at the most, and never behind ``reply``.
+        request: The request's bytes, without a length; never changed.
+        deadline: ``loop.time()`` at which the client gets an error.
+        on_gone: Set by the handler; called at most once when no answer is needed any more, because the client has
+            disconnected, the deadline is over, or the service is withdrawn. Never called behind ``reply``.
     """
 
     __slots__ = ("_client", "caller_id", "deadline", "on_gone", "request", "service")
@@ -66,11 +66,11 @@ class ServiceCall:
 
     @property
     def answered(self) -> bool:
-        """Whether an answer has been given, or is not wanted any more."""
+        """Whether the call was answered, or needs no answer any more."""
         return self._client is None
 
     def reply(self, ok: bool, body: Buffer) -> None:
-        """Answer; ``body`` is the response, or for ``ok=False`` the error's text. The first answer counts."""
+        """Answer; ``body`` is the response, or for ``ok=False`` the text of the error. Later answers are ignored."""
         client, self._client = self._client, None
         if client is not None:
             self.on_gone = None
@@ -81,28 +81,27 @@ class ServiceCall:
         self.reply(False, text.encode(errors="replace"))
 
     def abandon(self) -> None:
-        """No answer is wanted any more; for the endpoint."""
+        """The call needs no answer any more; for the endpoint."""
         self._client = None
         on_gone, self.on_gone = self.on_gone, None
         if on_gone is not None:
             try:
                 on_gone()
-            except Exception:  # noqa: BLE001 - a stranger's code within a connection's end
+            except Exception:  # noqa: BLE001 - a handler's mistake must not reach the connection
                 _log.exception("! %s: the end of a call failed", self.service)
 
 
 class ServiceEndpoint:
-    """One service of a node: takes its connections, and hands each request over as a ``ServiceCall``.
+    """One service of a node: takes its connections, and passes each request on as a ``ServiceCall``.
 
     Args:
         service: The global name, compared literally.
         caller_id: The serving node's name.
-        serve: Called in the loop with each request; answers at once or later by ``call.reply``. What it raises
-            becomes the client's error.
-        describe: Asked when the first header comes and nothing is known (``description`` is ``None``); returns the
-            description, which is kept, or the text of a refusal, which is not. Connections that come meanwhile wait
-            for the same answer.
-        description: What is known from the start.
+        serve: Called in the loop with each request; answers at once or later by ``call.reply``. An exception becomes
+            the client's error.
+        describe: Called at a header while ``description`` is ``None``; returns the description, or the text of an
+            error header, after which it is called again. Connections that come meanwhile wait for the same result.
+        description: The description, if it is known.
         timeout: Seconds for a call before the client gets an error.
         on_mismatch: ``(fields, text)``: a client with another md5 sum was refused.
     """
@@ -123,16 +122,16 @@ class ServiceEndpoint:
         self.serve = serve
         self.timeout = timeout
         self.description = description
-        """What clients are told; ``None`` to have ``describe`` asked at the next header."""
+        """The description for clients; with ``None``, ``describe`` is called at the next header."""
         self.calls = 0
-        """Requests taken so far."""
+        """Requests received."""
         self.failed = 0
-        """Of these, answered with an error."""
+        """Requests answered with an error."""
         self._describe = describe
         self._on_mismatch = on_mismatch
         self._clients: set[_ClientConnection] = set()
         self._waiting: list[_ClientConnection] = []
-        self._asking: asyncio.Task[None] | None = None
+        self._describing: asyncio.Task[None] | None = None
         self._empty: asyncio.Future[None] | None = None
 
     @property
@@ -141,27 +140,29 @@ class ServiceEndpoint:
         return len(self._clients)
 
     def attach(self, connection: AcceptedConnection) -> None:
-        """Take a connection whose header names this service and has the fields that it needs."""
+        """Take a connection whose header names this service and has the required fields."""
         client = _ClientConnection(self, connection)
         self._clients.add(client)
         if self.description is not None:
             client.open(self.description, resume=False)
             return
         self._waiting.append(client)
-        if self._asking is None:
-            self._asking = asyncio.get_running_loop().create_task(self._ask(), name=f"describe {self.service}")
+        if self._describing is None:
+            self._describing = asyncio.get_running_loop().create_task(
+                self._fetch_description(), name=f"describe {self.service}"
+            )
 
     def withdraw(self, text: str = "") -> None:
         """Close all connections; calls under way get an error with ``text``."""
         text = text or f"service [{self.service}] is no longer offered by [{self.caller_id}]"
-        if self._asking is not None:
-            self._asking.cancel()
+        if self._describing is not None:
+            self._describing.cancel()
         self._refuse_waiting(text)
         for client in tuple(self._clients):
             client.withdraw(text)
 
     async def closed(self) -> None:
-        """Behind ``withdraw``: wait, a moment at the most, until the last replies have left."""
+        """After ``withdraw``: wait until the last replies were sent, at most ``DRAIN_TIMEOUT``."""
         if self._clients:
             self._empty = asyncio.get_running_loop().create_future()
             await asyncio.wait([self._empty], timeout=runtime_limits.DRAIN_TIMEOUT)
@@ -169,25 +170,25 @@ class ServiceEndpoint:
             client.close()
 
     def mismatch(self, fields: Mapping[str, str], text: str) -> None:
-        """A client's md5 sum does not fit; for the clients."""
+        """A client's md5 sum does not match; for its connection."""
         if self._on_mismatch is not None:
             self._on_mismatch(fields, text)
         else:
             _log.warning("! %s", text)
 
-    def left(self, client: _ClientConnection) -> None:
-        """A connection has ended; for the clients."""
+    def remove(self, client: _ClientConnection) -> None:
+        """A connection has ended; for the connection."""
         self._clients.discard(client)
         if client in self._waiting:
             self._waiting.remove(client)
         if not self._clients and self._empty is not None and not self._empty.done():
             self._empty.set_result(None)
 
-    async def _ask(self) -> None:
+    async def _fetch_description(self) -> None:
         try:
-            answer = await self._answer()
+            answer = await self._call_describe()
         finally:
-            self._asking = None
+            self._describing = None
         if isinstance(answer, str):
             self._refuse_waiting(answer)
             return
@@ -196,7 +197,7 @@ class ServiceEndpoint:
         for client in waiting:
             client.open(answer)
 
-    async def _answer(self) -> ServiceDescription | str:
+    async def _call_describe(self) -> ServiceDescription | str:
         if self._describe is None:
             return f"service [{self.service}] has no description yet"
         try:
@@ -217,7 +218,7 @@ class ServiceEndpoint:
 
 
 class _ClientConnection:
-    """One client's connection: a request, its reply, and the next one where it is persistent."""
+    """One client's connection: a request, its reply, and if it is persistent the next request."""
 
     def __init__(self, endpoint: ServiceEndpoint, connection: AcceptedConnection) -> None:
         self._endpoint = endpoint
@@ -239,7 +240,7 @@ class _ClientConnection:
         connection.on_end = self._left
 
     def open(self, description: ServiceDescription, *, resume: bool = True) -> None:
-        """Answer the header; ``resume`` unless this is the very read that the header came with."""
+        """Answer the header; ``resume`` unless called within the read that brought the header."""
         connection, endpoint = self._connection, self._endpoint
         problem = check_client(connection.fields, endpoint.service, endpoint.caller_id, description)
         if problem is not None:
@@ -251,17 +252,17 @@ class _ClientConnection:
         header = server_header(endpoint.caller_id, description)
         connection.accept(header, limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SERVICE_MESSAGE_MAX, nodelay=True)
         if not self._persistent or is_probe(connection.fields):
-            self._watch()
+            self._start_stall_timer()
         if resume:
             self._resume()
 
     def refuse(self, text: str) -> None:
         """Answer with an error header and close."""
         self._connection.refuse(text)
-        self._over()
+        self._release()
 
     def withdraw(self, text: str) -> None:
-        """The service is gone."""
+        """The service is withdrawn."""
         call, self._call = self._call, None
         if call is not None and not self._ended:
             call.abandon()
@@ -275,7 +276,7 @@ class _ClientConnection:
     def close(self) -> None:
         """Close the connection."""
         self._connection.close()
-        self._over()
+        self._release()
 
     def reply(self, ok: bool, body: Buffer) -> None:
         """Answer the call that is under way."""
@@ -298,18 +299,18 @@ class _ClientConnection:
         return consumed, wanted
 
     def _step(self, data: memoryview) -> tuple[int, int]:
-        """Take one thing off what has come: a request, a part of a large one, or of one that is too large."""
+        """Consume a request, a part of a large one, or a part of one that is too large."""
         if self._discard:
             count = min(self._discard, len(data))
             self._discard -= count
             if not self._discard:
-                self._unwatch()
-                self._settle()
+                self._stop_stall_timer()
+                self._reply_sent()
             return count, 0
         if self._body is not None:
             return self._grow(data)
         if self._busy:
-            # One request at a time; what comes before its answer waits, one more at the most.
+            # One request at a time; at most one more is buffered.
             if len(data) > limits.SERVICE_MESSAGE_MAX + LENGTH.size:
                 raise LimitExceeded("what was sent ahead of a reply", len(data), limits.SERVICE_MESSAGE_MAX)
             return 0, 0
@@ -319,15 +320,15 @@ class _ClientConnection:
         end = LENGTH.size + size
         if size <= _WHOLE:
             if len(data) < end:
-                self._watch()
+                self._start_stall_timer()
                 return 0, end
-            self._begin(bytes(data[LENGTH.size : end]))
+            self._start_call(bytes(data[LENGTH.size : end]))
             return end, 0
         if size > limits.SERVICE_MESSAGE_MAX:
             self._too_large(size)
         else:
             self._body = BodyBuffer(size)
-        self._watch()
+        self._start_stall_timer()
         return LENGTH.size, 0
 
     def _grow(self, data: memoryview) -> tuple[int, int]:
@@ -336,15 +337,15 @@ class _ClientConnection:
         count = body.take(data)
         if body.whole:
             self._body = None
-            self._begin(body.data)
+            self._start_call(body.data)
         return count, 0
 
     @property
     def _busy(self) -> bool:
         return not self._open or self._call is not None or self._sending is not None or self._served
 
-    def _begin(self, request: bytes | bytearray) -> None:
-        self._unwatch()
+    def _start_call(self, request: bytes | bytearray) -> None:
+        self._stop_stall_timer()
         endpoint = self._endpoint
         endpoint.calls += 1
         deadline = self._loop.time() + endpoint.timeout
@@ -354,13 +355,13 @@ class _ClientConnection:
             endpoint.serve(call)
         except RmpaError as error:
             call.fail(str(error))
-        except Exception:  # noqa: BLE001 - a stranger's code within a connection
+        except Exception:  # noqa: BLE001 - a handler's mistake must not reach the connection
             _log.exception("! %s: a call of %s failed", endpoint.service, printable(call.caller_id))
             call.fail(f"service [{endpoint.service}]: [{endpoint.caller_id}] failed at this call; its log says why")
         if not call.answered:
-            self._deadline = self._loop.call_at(deadline, self._too_late)
+            self._deadline = self._loop.call_at(deadline, self._timed_out)
 
-    def _too_late(self) -> None:
+    def _timed_out(self) -> None:
         self._deadline = None
         call, self._call = self._call, None
         if call is not None:
@@ -393,15 +394,15 @@ class _ClientConnection:
         stream = self._connection.stream
         if len(body) > INLINE:
             if isinstance(body, memoryview):
-                body = bytes(body)  # it may be valid for this call only
+                body = bytes(body)  # a view may be valid during this call only
             self._sending = self._loop.create_task(self._send_large(head, body), name="service response")
             return
         stream.send([head, body], BODIES)
         if stream.pending_bytes:
-            # Nothing is taken from a client that does not read what it asked for.
+            # No request is read from a client that does not read its replies.
             self._sending = self._loop.create_task(self._drain(), name="service response drains")
             return
-        self._settle()
+        self._reply_sent()
 
     async def _send_large(self, head: bytes, body: Buffer) -> None:
         try:
@@ -409,29 +410,29 @@ class _ClientConnection:
             await self._drained()
         finally:
             self._sending = None
-        self._settle()
+        self._reply_sent()
 
     async def _drain(self) -> None:
         try:
             await self._drained()
         finally:
             self._sending = None
-        self._settle()
+        self._reply_sent()
 
     async def _drained(self) -> None:
         stream = self._connection.stream
         while stream.pending_bytes and not stream.closed:
             await stream.drained()
 
-    def _settle(self) -> None:
-        """A reply has left: close, or go on with what has come meanwhile."""
+    def _reply_sent(self) -> None:
+        """A reply was sent: close, or go on with the next request."""
         if self._discard or self._ended or self._sending is not None or self._call is not None:
             return
         if self._persistent:
             self._resume()
             return
         self._served = True
-        # Not now: a reply from within a read of another connection leaves at the end of that.
+        # Not now: a reply within a read of another connection is sent at the end of that read.
         self._loop.call_soon(self._close_served)
 
     def _close_served(self) -> None:
@@ -448,13 +449,13 @@ class _ClientConnection:
 
     # --- the end ----------------------------------------------------------------------------------------------
 
-    def _watch(self) -> None:
-        """Bytes must come soon."""
+    def _start_stall_timer(self) -> None:
+        """Close the connection if no bytes come within ``limits.SERVICE_STALL``."""
         if self._stall is None:
             self._seen = self._connection.stream.bytes_in
             self._stall = self._loop.call_later(limits.SERVICE_STALL, self._stalled)
 
-    def _unwatch(self) -> None:
+    def _stop_stall_timer(self) -> None:
         if self._stall is not None:
             self._stall.cancel()
             self._stall = None
@@ -462,7 +463,7 @@ class _ClientConnection:
     def _stalled(self) -> None:
         self._stall = None
         if self._connection.stream.bytes_in != self._seen:
-            self._watch()
+            self._start_stall_timer()
             return
         who = printable(self._connection.caller_id)
         _log.debug("! %s: %s sent nothing for %g s; closed", self._endpoint.service, who, limits.SERVICE_STALL)
@@ -471,11 +472,11 @@ class _ClientConnection:
     def _left(self, _connection: AcceptedConnection, error: Exception | None) -> None:
         if error is not None and not isinstance(error, OSError):
             _log.warning("! %s: %s: %s", self._endpoint.service, printable(self._connection.caller_id), error)
-        self._over()
+        self._release()
 
-    def _over(self) -> None:
+    def _release(self) -> None:
         self._ended = True
-        self._unwatch()
+        self._stop_stall_timer()
         if self._deadline is not None:
             self._deadline.cancel()
             self._deadline = None
@@ -483,7 +484,7 @@ class _ClientConnection:
             self._sending.cancel()
         self._connection.on_bytes = None
         self._connection.on_end = _ended
-        self._endpoint.left(self)
+        self._endpoint.remove(self)
         call, self._call = self._call, None
         if call is not None:
             self._endpoint.failed += 1
@@ -491,4 +492,4 @@ class _ClientConnection:
 
 
 def _ended(_connection: AcceptedConnection, _error: Exception | None) -> None:
-    """Of a connection that was let go of."""
+    """``on_end`` of a connection that the endpoint has released."""

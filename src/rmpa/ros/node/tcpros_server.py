@@ -1,4 +1,4 @@
-"""The listening TCPROS socket of one node: it accepts, reads the header and hands over to the publication."""
+"""The listening TCPROS socket of one node: passes each connection to the publication or service of its header."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ _log = logging.getLogger(__name__)
 
 
 class TcprosServer:
-    """Accepts subscribers for the publications of one node.
+    """Accepts connections for the publications and services of one node.
 
     Args:
         name: The node's name, for the texts.
-        publications: By topic; read at each header, so the owner just changes it.
-        counters: Counts ``tcpros.refused.*``.
-        numbers: Gives each connection its number; shared with the node's outgoing ones.
-        services: By name; read at each header too.
+        publications: By topic; read at each header, so that the owner can change it.
+        counters: Count ``tcpros.refused.*``.
+        numbers: The numbers of connections, shared with the node's outgoing ones.
+        services: By name; read at each header.
         clock: For the rate limit of the log.
     """
 
@@ -90,7 +90,7 @@ class TcprosServer:
         self._acceptor.start()
 
     def close(self) -> None:
-        """Stop listening, and close what has not reached a publication; the rest is the publications' own."""
+        """Stop listening, and close the connections without a header; the owner closes the others."""
         if self._acceptor is not None:
             self._acceptor.close()
             self._acceptor = None
@@ -98,10 +98,10 @@ class TcprosServer:
         for connection, timer in waiting.items():
             timer.cancel()
             connection.close()
-        self._accepted.clear()  # they know us: a cycle otherwise, with all that the publications know
+        self._accepted.clear()  # breaks a reference cycle
 
     def adopt(self, sock: socket.socket, _client: tuple[str, int]) -> None:
-        """Serve a connection that was accepted, by this server's own socket or by one that several nodes share.
+        """Serve an accepted connection, of this server's own socket or of one that several nodes share.
 
         Args:
             sock: Non-blocking; owned from here on.
@@ -127,7 +127,7 @@ class TcprosServer:
         )
 
     def _forget_closed(self) -> None:
-        """Publications do not report back who left, so the closed ones are sorted out each time they may be half."""
+        """Drop closed connections, which publications do not report; called when they may be half of all."""
         self._accepted = {connection for connection in self._accepted if not connection.stream.closed}
         self._forget_at = 2 * len(self._accepted) + 16
 
@@ -147,20 +147,20 @@ class TcprosServer:
             if endpoint is not None:
                 endpoint.attach(connection)
                 return
-            # Quiet: a client, or only its probe, that was told of a service which is gone.
+            # At debug level: a client may have looked up a service that is gone by now.
             _log.debug("! %s: no service %s", self._name, printable(fields["service"]))
             connection.refuse(f"[{self._name}] does not offer the service [{printable(fields['service'])}]")
             return
         publication = self._publications.get(fields["topic"])
         if publication is None:
-            # Quiet: a subscriber that was told of a publisher which left in the meantime.
+            # At debug level: a subscriber may have the address of a publisher that is gone by now.
             _log.debug("! %s: no publication %s", self._name, printable(fields["topic"]))
             connection.refuse(f"[{self._name}] is not a publisher of [{printable(fields['topic'])}]")
             return
         publication.attach(connection)
 
     def _ended(self, connection: AcceptedConnection, error: Exception | None) -> None:
-        """It left, or broke the protocol, before its header was there; leaving is normal for rospy."""
+        """A connection ended before its header was complete, which is normal for rospy, or broke the protocol."""
         timer = self._waiting.pop(connection, None)
         if timer is not None:
             timer.cancel()
