@@ -21,17 +21,14 @@ class Core(Protocol):
     @property
     def uri(self) -> str:
         """The master's URI: ``ROS_MASTER_URI`` of the nodes of this graph."""
-        ...
 
     @property
     def node_host(self) -> str:
         """The address that the agent's own nodes (its proxies among them) listen at."""
-        ...
 
     @property
     def node_address(self) -> str:
         """The address of the agent's own nodes that is registered in this graph."""
-        ...
 
     async def start(self) -> None:
         """Start the core, or connect to it.
@@ -39,11 +36,9 @@ class Core(Protocol):
         Raises:
             StartError: It cannot be started with these settings.
         """
-        ...
 
     async def close(self) -> None:
         """Unregister what the agent registered, and end what ends with the agent."""
-        ...
 
     def call(self, method: str, *params: XmlRpcValue) -> RosReply:
         """Register or unregister, or write a parameter, as over XML-RPC but without waiting.
@@ -54,7 +49,6 @@ class Core(Protocol):
         Returns:
             ``(code, status, value)``; the value must not be changed, nor may ``params`` be afterwards.
         """
-        ...
 
     async def ask(self, method: str, *params: XmlRpcValue) -> RosReply:
         """Call any method, behind all previous ``call``s, and wait for the master's own answer.
@@ -65,40 +59,30 @@ class Core(Protocol):
             RemoteProtocolError: The answer is malformed.
             LocalProtocolError: A parameter cannot be said in XML-RPC.
         """
-        ...
 
     def state(self) -> GraphState:
         """All known registrations; the same object until one changes."""
-        ...
 
     def publishers(self, topic: str) -> Mapping[str, str]:
         """The publishers of a topic with their slave APIs; never changed afterwards."""
-        ...
 
     def type_of(self, topic: str) -> str:
         """The type last registered for a topic; ``*`` for none."""
-        ...
 
     def on_change(self, callback: Callable[[GraphChange], None]) -> None:
         """Call ``callback`` in the loop after each change of a registration."""
-        ...
 
     def unreachable(self) -> Mapping[str, Unreachable]:
         """The registered nodes that nothing can connect to; not to be changed."""
-        ...
 
     def suspect(self, node: str) -> None:
         """Check now whether this node is dead or has moved."""
-        ...
 
     def notes(self) -> tuple[str, ...]:
         """Problems that the user should know of, such as a master that does not answer."""
-        ...
 
     def restored(self) -> str:
         """Where the core stores its state and what it restored, for people; empty for nothing."""
-        ...
 
     def unverified(self, topic: str) -> Mapping[str, str]:
         """Publishers of a topic in the previous run that have not answered since, with their slave APIs."""
-        ...

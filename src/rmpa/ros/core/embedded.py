@@ -12,6 +12,8 @@ import uuid
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.counters import Counters
+from rmpa.ros.core.api import Core
+from rmpa.ros.core.listeners import GraphListeners
 from rmpa.ros.core.liveness import Liveness
 from rmpa.ros.core.notifier import Notifier
 from rmpa.ros.core.persistence import CorePersistence
@@ -42,7 +44,7 @@ ROS_VERSION: Final = "1.15.15\n"
 """The version of ros_comm whose master this core replaces."""
 
 
-class RosCore:
+class RosCore(Core):
     """A drop-in for ``roscore``.
 
     Args:
@@ -80,7 +82,7 @@ class RosCore:
         self._liveness: Liveness | None = None
         self._with_rosout = rosout
         self._rosout: Rosout | None = None
-        self._callbacks: list[Callable[[GraphChange], None]] = []
+        self._listeners = GraphListeners()
         self.persistence: CorePersistence | None = None
         """Stores the state for the next run, if ``state`` is given."""
         if state is not None:
@@ -150,7 +152,6 @@ class RosCore:
 
     @property
     def uri(self) -> str:
-        """``http://127.0.0.1:11311/``; empty before ``start()``."""
         return self._api.uri
 
     @property
@@ -160,12 +161,10 @@ class RosCore:
 
     @property
     def node_host(self) -> str:
-        """Loopback: only nodes of this machine may reach the agent's."""
         return _LOOPBACK
 
     @property
     def node_address(self) -> str:
-        """The same address."""
         return _LOOPBACK
 
     # --- asking it --------------------------------------------------------------------------------------------
@@ -187,46 +186,34 @@ class RosCore:
         return reply
 
     async def ask(self, method: str, *params: XmlRpcValue) -> RosReply:
-        """The same as ``call``; of the ``Core`` interface, where a real roscore is waited for."""
         return self.call(method, *params)
 
     def state(self) -> GraphState:
-        """All registrations; the same object until one changes."""
         return self._api.state()
 
     def publishers(self, topic: str) -> Mapping[str, str]:
-        """The publishers of a topic with their slave APIs; never changed afterwards."""
         return self._api.registrations.at(RegistrationKind.PUBLISHER, topic)
 
     def type_of(self, topic: str) -> str:
-        """The type last registered for a topic; ``*`` for none."""
         return self._api.registrations.types().get(topic, ANY_TYPE)
 
     def on_change(self, callback: Callable[[GraphChange], None]) -> None:
-        """Call ``callback`` in the loop after each change of a registration, before the reply to it leaves.
-
-        A callback may call the core; an exception of one is logged and does not reach the node.
-        """
-        self._callbacks.append(callback)
+        self._listeners.add(callback)
 
     def notes(self) -> tuple[str, ...]:
         """Problems with storing its state; the core itself runs as long as the agent."""
         return self.persistence.notes() if self.persistence is not None else ()
 
     def restored(self) -> str:
-        """The state file, and what was restored from it."""
         return self.persistence.summary() if self.persistence is not None else ""
 
     def unverified(self, topic: str) -> Mapping[str, str]:
-        """Publishers of a topic in the previous run that have not answered since, with their slave APIs."""
         return self._api.registrations.unverified.publishers_of(topic)
 
     def unreachable(self) -> Mapping[str, Unreachable]:
-        """The registered nodes that nothing can connect to; not to be changed."""
         return self._liveness.unreachable if self._liveness is not None else {}
 
     def suspect(self, node: str) -> None:
-        """Check now whether this node is dead; unregister everything of it if it is."""
         if self._liveness is not None:
             self._liveness.suspect(node)
 
@@ -246,13 +233,7 @@ class RosCore:
         if self._notifier is not None:
             for effect in effects:
                 self._notifier.add(effect)
-        for change in changes:
-            _log.info("= %s %s %s of %s", "+" if change.added else "-", change.kind.value, change.name, change.node)
-            for callback in self._callbacks:
-                try:
-                    callback(change)
-                except Exception:  # noqa: BLE001 - a callback's mistake must not reach the node
-                    _log.exception("! a listener failed at %s", change)
+        self._listeners.notify(changes)
 
     def _unreachable(self, api: str) -> None:
         for node in self._api.registrations.nodes_at(api):

@@ -17,7 +17,9 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.counters import Counters
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, RmpaError, StartError, UnreachableError
 from rmpa.ros import limits
+from rmpa.ros.core.api import Core
 from rmpa.ros.core.identify import name_at
+from rmpa.ros.core.listeners import GraphListeners
 from rmpa.ros.core.liveness import Liveness, refuses
 from rmpa.ros.http.client import call, call_api, exchange, read_response
 from rmpa.ros.master.mirror import REGISTRATIONS, Mirror, stale_registrations
@@ -60,7 +62,7 @@ class _Write:
             self.done.set_exception(error)
 
 
-class ExternalCore:
+class ExternalCore(Core):
     """The graph of a master that is another program.
 
     Args:
@@ -87,7 +89,7 @@ class ExternalCore:
         self._node_address = node_address
         self._mirror = Mirror(yielder=yielding_to_data)
         self._liveness = Liveness(nodes=self._mirror.others, on_dead=self._dead)
-        self._callbacks: list[Callable[[GraphChange], None]] = []
+        self._listeners = GraphListeners()
         self._writes: deque[_Write] = deque()
         self._written = asyncio.Event()
         self._written.set()
@@ -147,17 +149,14 @@ class ExternalCore:
 
     @property
     def uri(self) -> str:
-        """The master's URI, as the user wrote it."""
         return self._uri
 
     @property
     def node_host(self) -> str:
-        """The address at which the agent's nodes listen."""
         return self._node_host
 
     @property
     def node_address(self) -> str:
-        """The address of the agent's nodes that is registered."""
         return self._node_address
 
     def notes(self) -> tuple[str, ...]:
@@ -189,7 +188,6 @@ class ExternalCore:
         return RosReply(1, "will be written", 0)
 
     async def ask(self, method: str, *params: XmlRpcValue) -> RosReply:
-        """Call any method and wait for the master's own answer; see ``core.api.Core``."""
         writes = method in REGISTRATIONS
         if writes:
             reply = self._mirror.apply(method, params)
@@ -206,35 +204,27 @@ class ExternalCore:
         return await call_api(self._uri, method, *params, timeout=limits.MASTER_ASK_TIMEOUT, use=Use.CORE)
 
     def state(self) -> GraphState:
-        """All known registrations; the same object until one changes."""
         return self._mirror.state()
 
     def publishers(self, topic: str) -> Mapping[str, str]:
-        """The publishers of a topic with their slave APIs; never changed afterwards."""
         return self._mirror.publishers(topic)
 
     def type_of(self, topic: str) -> str:
-        """The type that the master has for a topic; ``*`` for none."""
         return self._mirror.type_of(topic)
 
     def on_change(self, callback: Callable[[GraphChange], None]) -> None:
-        """Call ``callback`` in the loop after each change that was made here or that a poll shows."""
-        self._callbacks.append(callback)
+        self._listeners.add(callback)
 
     def unreachable(self) -> Mapping[str, Unreachable]:
-        """The registered nodes that nothing can connect to; not to be changed."""
         return self._liveness.unreachable
 
     def restored(self) -> str:
-        """Nothing: a roscore stores no state."""
         return ""
 
     def unverified(self, topic: str) -> Mapping[str, str]:  # noqa: ARG002 - of ``Core``
-        """None: a roscore restores no nodes."""
         return {}
 
     def suspect(self, node: str) -> None:
-        """Check a node that may be dead or have moved, and poll the master now."""
         if not self._mirror.is_ours(node):
             self._liveness.suspect(node)
         self._poll_soon()
@@ -472,13 +462,7 @@ class ExternalCore:
     # --- changes of the graph and of the master ---------------------------------------------------------------
 
     def _report_changes(self) -> None:
-        for change in yielding_to_data(self._mirror.take_changes()):
-            _log.info("= %s %s %s of %s", "+" if change.added else "-", change.kind.value, change.name, change.node)
-            for callback in self._callbacks:
-                try:
-                    callback(change)
-                except Exception:  # noqa: BLE001 - a callback's mistake
-                    _log.exception("! a listener failed at %s", change)
+        self._listeners.notify(yielding_to_data(self._mirror.take_changes()))
 
     def _found(self) -> None:
         if self._problem:

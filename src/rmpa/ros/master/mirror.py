@@ -25,20 +25,17 @@ Call: TypeAlias = tuple[str, tuple[XmlRpcValue, ...]]
 Entry: TypeAlias = tuple[RegistrationKind, str, str]
 """One registration: its kind, the topic, service or parameter, and the node."""
 
-_REGISTER: Final = {
-    "registerPublisher": RegistrationKind.PUBLISHER,
-    "registerSubscriber": RegistrationKind.SUBSCRIBER,
-    "registerService": RegistrationKind.SERVICE,
-    "subscribeParam": RegistrationKind.PARAM,
+REGISTRATIONS: Final = {
+    "registerPublisher": (RegistrationKind.PUBLISHER, 4),
+    "registerSubscriber": (RegistrationKind.SUBSCRIBER, 4),
+    "registerService": (RegistrationKind.SERVICE, 4),
+    "subscribeParam": (RegistrationKind.PARAM, 3),
+    "unregisterPublisher": (RegistrationKind.PUBLISHER, 3),
+    "unregisterSubscriber": (RegistrationKind.SUBSCRIBER, 3),
+    "unregisterService": (RegistrationKind.SERVICE, 3),
+    "unsubscribeParam": (RegistrationKind.PARAM, 3),
 }
-_UNREGISTER: Final = {
-    "unregisterPublisher": RegistrationKind.PUBLISHER,
-    "unregisterSubscriber": RegistrationKind.SUBSCRIBER,
-    "unregisterService": RegistrationKind.SERVICE,
-    "unsubscribeParam": RegistrationKind.PARAM,
-}
-REGISTRATIONS: Final = frozenset({*_REGISTER, *_UNREGISTER})
-"""The methods that ``Mirror.apply`` takes."""
+"""The methods that ``Mirror.apply`` accepts: what they register, and the number of their parameters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,11 +120,10 @@ class Mirror:
         """
         self._asked += 1
         words = [param for param in params if isinstance(param, str)]
-        if method in _REGISTER and len(words) == len(params) == _ARITY[method]:
-            return self._register(_REGISTER[method], method, words)
-        if method in _UNREGISTER and len(words) == len(params) == _ARITY[method]:
-            return self._unregister(_UNREGISTER[method], words)
-        return RosReply(-1, f"{method} does not take {brief(params)}", 0)
+        kind, arity = REGISTRATIONS[method]
+        if not len(words) == len(params) == arity:
+            return RosReply(-1, f"{method} does not take {brief(params)}", 0)
+        return self._unregister(kind, words) if method.startswith("un") else self._register(kind, method, words)
 
     def _register(self, kind: RegistrationKind, method: str, words: list[str]) -> RosReply:
         value: XmlRpcValue = 1
@@ -340,15 +336,3 @@ def stale_registrations(
                         yield ("unregisterSubscriber", (node, key, nodes[node])), entry
                     case _:
                         yield ("unregisterService", (node, key, survey.services.get(key, ""))), entry
-
-
-_ARITY: Final = {
-    "registerPublisher": 4,
-    "registerSubscriber": 4,
-    "registerService": 4,
-    "subscribeParam": 3,
-    "unregisterPublisher": 3,
-    "unregisterSubscriber": 3,
-    "unregisterService": 3,
-    "unsubscribeParam": 3,
-}

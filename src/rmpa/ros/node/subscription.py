@@ -47,15 +47,12 @@ class PartsTaker(Protocol):
 
     def begin(self, size: int) -> None:
         """A message of ``size`` bytes, its length included, begins."""
-        ...
 
     def part(self, part: memoryview) -> None:
         """A part of it, valid during the call only."""
-        ...
 
     def abort(self) -> None:
         """The rest of the message will not come."""
-        ...
 
 
 OUT_OF_FILES: Final = "the subscribing side has no file descriptor left for it; `rmpa doctor` there says what to do"

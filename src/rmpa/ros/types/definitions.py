@@ -321,11 +321,6 @@ def known_specifications(name: str) -> Mapping[str, Specification]:
         raise UnknownTypeError(
             name, "is not one that comes with rmpa", "its definition is learnt from a publisher of that type"
         )
-    found: dict[str, Specification] = {}
-    todo = [name]
-    while todo:
-        each = todo.pop()
-        if each not in found:
-            found[each] = Specification.parse(each, _texts()[each])
-            todo += found[each].depends()
+    found = {name: Specification.parse(name, _texts()[name])}
+    complete(found, known_text)
     return found

@@ -60,31 +60,24 @@ class NodeView(Protocol):
 
     def publications(self) -> Iterable[tuple[str, str]]:
         """Published topics with their types (``*`` where unknown)."""
-        ...
 
     def subscriptions(self) -> Iterable[tuple[str, str]]:
         """Subscribed topics with their types."""
-        ...
 
     def connections(self) -> Iterable[BusConnection]:
         """All topic connections."""
-        ...
 
     def address_of(self, topic: str) -> tuple[str, int] | None:
         """Host and port for subscribers of a topic; ``None`` if the node does not publish it."""
-        ...
 
     def publisher_update(self, topic: str, publishers: Sequence[str]) -> None:
         """The master sends the publishers of a topic, as slave API URIs."""
-        ...
 
     def param_update(self, key: str, value: XmlRpcValue) -> bool:
         """A parameter has changed (``{}``: deleted); ``False`` if the node has not subscribed to it."""
-        ...
 
     def shut_down(self, reason: str) -> None:
         """The master wants the node to end."""
-        ...
 
 
 class SlaveApi:
