@@ -81,7 +81,7 @@ def pair() -> Pair:
     return Pair()
 
 
-def test_what_others_registered_is_learnt_with_types_and_places(pair: Pair) -> None:
+def test_registrations_of_others_come_with_types_and_uris(pair: Pair) -> None:
     pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
     pair.theirs("registerSubscriber", "/s", "/t", "*", MOVED)
     pair.theirs("registerService", "/p", "/srv", "rosrpc://h:9", THEIRS)
@@ -119,7 +119,7 @@ def test_a_node_that_restarts_between_two_looks_went_and_came(pair: Pair) -> Non
     assert pair.mirror.state() == pair.master.registrations.state()
 
 
-def test_a_type_that_comes_later_is_told_but_each_publisher_keeps_its_own(pair: Pair) -> None:
+def test_later_type_is_a_change_but_publishers_keep_theirs(pair: Pair) -> None:
     pair.theirs("registerSubscriber", "/s", "/t", "*", MOVED)
     pair.look()
     pair.theirs("registerSubscriber", "/s2", "/t", STRING, MOVED)
@@ -134,7 +134,7 @@ def test_a_type_that_comes_later_is_told_but_each_publisher_keeps_its_own(pair: 
     assert [(change.node, change.type) for change in changes] == [("/other", "std_msgs/Int8")]
 
 
-def test_a_type_that_is_said_again_otherwise_is_a_change(pair: Pair) -> None:
+def test_other_type_of_a_topic_is_a_change(pair: Pair) -> None:
     pair.theirs("registerPublisher", "/p", "/t", "*", THEIRS)
     pair.theirs("registerSubscriber", "/s", "/u", "*", MOVED)
     pair.look()
@@ -200,7 +200,7 @@ def test_what_the_master_lacks_of_ours_is_registered_again(pair: Pair) -> None:
     assert pair.master.registrations.nodes() == {}
 
 
-def test_nodes_of_a_master_that_is_no_more_stay_until_they_die_or_come_back(pair: Pair) -> None:
+def test_nodes_of_a_former_master_stay_until_they_die_or_return(pair: Pair) -> None:
     for node, api in (("/dies", THEIRS), ("/returns", MOVED)):
         pair.theirs("registerPublisher", node, "/t", STRING, api)
     pair.look()
@@ -214,7 +214,7 @@ def test_nodes_of_a_master_that_is_no_more_stay_until_they_die_or_come_back(pair
     assert pair.mirror.state().nodes == {"/returns": "http://127.0.0.1:4/"}
 
 
-def test_a_dead_node_counts_no_more_until_it_is_somewhere_else_or_lives_after_all(pair: Pair) -> None:
+def test_dead_node_is_ignored_until_it_moves_or_revives(pair: Pair) -> None:
     pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
     pair.look()
     pair.changes()
@@ -230,7 +230,7 @@ def test_a_dead_node_counts_no_more_until_it_is_somewhere_else_or_lives_after_al
     assert (pair.mirror.publishers("/t"), dict(pair.mirror.dead)) == ({"/p": MOVED}, {})
 
 
-def test_what_the_master_did_not_hear_is_told_again(pair: Pair) -> None:
+def test_missing_registrations_are_sent_again(pair: Pair) -> None:
     pair.call("registerPublisher", "/rmpa", "/t", STRING, OURS)
     pair.call("registerPublisher", "/rmpa", "/u", STRING, OURS)
     pair.flush()
@@ -242,7 +242,7 @@ def test_what_the_master_did_not_hear_is_told_again(pair: Pair) -> None:
     assert pair.mirror.state() == pair.master.registrations.state()
 
 
-def test_a_local_provider_takes_a_service_from_us_and_it_is_not_taken_back(pair: Pair) -> None:
+def test_local_provider_replaces_our_service_for_good(pair: Pair) -> None:
     pair.call("registerService", "/rmpa/b/n", "/srv", "rosrpc://h:9", OURS)
     pair.flush()
     pair.look()
@@ -263,7 +263,7 @@ def test_a_proxy_that_left_since_the_look_began_is_no_stranger(pair: Pair) -> No
     assert set(pair.mirror.foreign_agents(survey, "/rmpa", pair.mirror.asked)) == {"/rmpa/b/n"}
 
 
-def test_names_of_an_agent_that_are_not_ours_are_strangers_and_leave_nothing(pair: Pair) -> None:
+def test_foreign_agents_are_found_and_unregistered(pair: Pair) -> None:
     pair.theirs("registerPublisher", "/rmpa", "/diagnostics", STRING, THEIRS)
     pair.theirs("registerSubscriber", "/rmpa", "/t", STRING, THEIRS)
     pair.theirs("registerService", "/rmpa/b/n", "/srv", "rosrpc://h:9", MOVED)

@@ -32,7 +32,7 @@ def master() -> Master:
     return made
 
 
-def test_nothing_shows_an_awaited_node(master: Master) -> None:
+def test_unverified_node_is_not_shown(master: Master) -> None:
     assert master.call("getSystemState", ["/x"]).value == [[], [], []]
     assert master.call("lookupNode", ["/x", "/talker"]).code == -1
     assert master.call("lookupService", ["/x", "/s"]).code == -1
@@ -41,7 +41,7 @@ def test_nothing_shows_an_awaited_node(master: Master) -> None:
     assert not [effect for effect in master.effects() if isinstance(effect, Shutdown)]
 
 
-def test_a_node_that_is_taken_up_has_everything_again(master: Master) -> None:
+def test_confirmed_node_has_everything_again(master: Master) -> None:
     assert master.registrations.confirm("/talker") == (["/t"], [])
     assert master.registrations.confirm("/hearer") == ([], ["/t"])
     assert master.call("getSystemState", ["/x"]).value == [
@@ -61,7 +61,7 @@ def test_a_node_that_is_taken_up_has_everything_again(master: Master) -> None:
     assert master.registrations.confirm("/talker") == ([], [])
 
 
-def test_a_subscriber_is_told_of_publishers_that_it_may_be_connected_to(master: Master) -> None:
+def test_restored_subscriber_gets_unverified_publishers(master: Master) -> None:
     master.registrations.confirm("/hearer")
     master.call("registerPublisher", ["/proxy", "/t", STRING, NEW])
     # roscpp hangs up on whom the list leaves out: the talker has not answered yet, and is still connected.
@@ -72,7 +72,7 @@ def test_a_subscriber_is_told_of_publishers_that_it_may_be_connected_to(master: 
     assert master.effects() == [PublisherUpdate(HEARER, "/t", (NEW,))]
 
 
-def test_a_new_subscriber_is_told_of_nobody_who_has_not_answered(master: Master) -> None:
+def test_new_subscriber_gets_no_unverified_publisher(master: Master) -> None:
     master.call("registerSubscriber", ["/new", "/t", STRING, NEW])
     master.call("registerPublisher", ["/proxy", "/t", STRING, "http://h:4/"])
     assert master.effects() == [PublisherUpdate(NEW, "/t", ("http://h:4/",))]
@@ -104,7 +104,7 @@ def test_a_service_that_another_provides_meanwhile_stays_his(master: Master) -> 
     assert master.state().publishers == {"/t": {"/talker": TALKER}}
 
 
-def test_what_a_node_withdraws_before_it_is_taken_up_does_not_come_back(master: Master) -> None:
+def test_unregistered_before_verification_is_not_restored(master: Master) -> None:
     master.registrations.confirm("/hearer")
     assert master.call("unregisterPublisher", ["/talker", "/t", TALKER]).value == 1
     assert master.effects() == [PublisherUpdate(HEARER, "/t", ())]
@@ -125,7 +125,7 @@ def test_a_node_that_registers_more_is_recorded_with_both(master: Master) -> Non
     assert master.registrations.record("/talker") == record
 
 
-def test_marks_change_with_what_is_to_be_kept_and_with_nothing_else(master: Master) -> None:
+def test_revision_changes_with_the_record_only(master: Master) -> None:
     registrations = master.registrations
     registrations.confirm("/talker")
     marks = copy.copy(registrations.revisions)

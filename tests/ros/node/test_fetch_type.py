@@ -59,7 +59,7 @@ async def learnt(core: RosCore, topic: str = "", *, elsewhere: bool = True) -> t
     return (found.node, found.topic, found.kind.md5sum) if found is not None else None
 
 
-async def test_a_publisher_tells_a_type(core: RosCore) -> None:
+async def test_type_is_fetched_from_a_publisher(core: RosCore) -> None:
     async with node(core, "old") as old, node(core, "new") as new, node(core, "/rmpa/base/new") as proxy:
         assert await learnt(core) is None
         await old.advertise("/c", OLD)
@@ -93,7 +93,7 @@ async def test_publishers_that_cannot_tell_are_passed_over(core: RosCore, monkey
     silent.close()
 
 
-async def test_without_a_publisher_the_error_says_all(core: RosCore) -> None:
+async def test_without_a_publisher_the_error_has_all_reasons(core: RosCore) -> None:
     with pytest.raises(UnknownTypeError) as caught:
         await find_or_fetch(core.uri, "/asker", NAME)
     assert str(caught.value) == (
@@ -107,7 +107,7 @@ async def test_without_a_publisher_the_error_says_all(core: RosCore) -> None:
         await find_or_fetch("http://127.0.0.1:9/", "/asker", NAME)
 
 
-async def test_a_node_advertises_a_type_that_it_has_learnt(core: RosCore) -> None:
+async def test_node_advertises_a_received_type(core: RosCore) -> None:
     async with node(core, "a") as a, node(core, "b") as b:
         with pytest.raises(UnknownTypeError, match="no publisher at"):
             await b.advertise("/y", NAME)

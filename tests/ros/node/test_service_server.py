@@ -295,7 +295,7 @@ async def test_bodies_of_every_size_come_back(node: SlaveNode, size: int) -> Non
     connection.close()
 
 
-async def test_a_request_beyond_the_limit_is_refused_and_the_connection_goes_on(
+async def test_oversized_request_is_refused_and_connection_goes_on(
     node: SlaveNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "SERVICE_MESSAGE_MAX", 100_000)
@@ -372,7 +372,7 @@ async def test_a_client_that_does_not_read_is_served_no_further(node: SlaveNode)
     await until(lambda: not endpoint.connections)
 
 
-async def test_a_withdrawn_service_tells_who_waits(node: SlaveNode) -> None:
+async def test_withdrawn_service_answers_waiting_clients(node: SlaveNode) -> None:
     calls: list[ServiceCall] = []
     serve(node, calls.append)
     waiting = await RawClient.call(node, persistent="1")
@@ -417,7 +417,7 @@ async def test_a_service_is_served_once(node: SlaveNode) -> None:
     node.remove_service("/none")
 
 
-async def test_junk_instead_of_a_request_hurts_nobody_else(node: SlaveNode) -> None:
+async def test_junk_instead_of_a_request_harms_no_other(node: SlaveNode) -> None:
     serve(node, echo)
     good = await ServiceConnection.open(node.service_uri, "/add", "/c")
     junk = await RawClient.call(node)

@@ -168,7 +168,7 @@ def test_a_workspace_goes_before_what_comes_with_us(tmp_path: Path) -> None:
     assert find_message_type("std_msgs/String", STRING, {"ROS_PACKAGE_PATH": str(tmp_path / "src")}).md5sum == STRING
 
 
-def test_an_unknown_type_says_where_was_looked(tmp_path: Path) -> None:
+def test_unknown_type_names_the_searched_places(tmp_path: Path) -> None:
     environ = {"ROS_PACKAGE_PATH": ":".join(f"/r{n}" for n in range(7)), "PYTHONPATH": str(tmp_path)}
     with pytest.raises(UnknownTypeError) as caught:
         find_message_type("my_msgs/Foo", environ=environ)
