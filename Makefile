@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := venv
-.PHONY: venv demo demo-kill demo-start test test-bare tests style format types imports fuzz soak bench experiment ros clean
+.PHONY: venv demo demo-kill demo-start test test-bare tests style format types imports fuzz soak bench experiment wheel ros clean
 
 $(STAMP): pyproject.toml constraints.txt scripts/bootstrap
 	scripts/bootstrap $(PYTHON) $(VENV)
@@ -50,12 +50,15 @@ fuzz: $(STAMP)  ## every fuzz target for longer: make fuzz [SECONDS=60]
 soak: $(STAMP) ros  ## disturb three modules for long and see that nothing leaks: make soak [SECONDS=600] [SEED=N]
 	$(BIN)/python -m tests.soak --seconds $(or $(SECONDS),600) $(if $(SEED),--seed $(SEED))
 
-bench: $(STAMP) ros  ## the measurements, as ratios in one run; results in bench/results
-	-$(BIN)/pip install -q -c constraints.txt -e '.[bench,bench-peers]'  # who cannot have a peer measures without it
-	$(BIN)/python -m bench $(ARGS)
+bench: $(STAMP) ros  ## the measurements, as ratios in one run; results in lab/results
+	-$(BIN)/pip install -q -c constraints.txt -e '.[lab-peers]'  # a peer that cannot be installed is left out
+	$(BIN)/python -m lab bench $(ARGS)
 
 experiment: $(STAMP) ros  ## classic ROS beside RMPA, with a report: make experiment [ARGS="--short"]; docs/experiments.md
-	$(BIN)/rmpa experiment run $(ARGS)
+	$(BIN)/python -m lab experiment run $(ARGS)
+
+wheel: $(STAMP)  ## build the wheel into dist/ and see that it holds the product alone
+	scripts/build-wheel $(BIN)/python
 
 clean:  ## remove what the commands above made
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import pytest
 from blockbuster import blockbuster_ctx
 
-from rmpa.experiments.bed import namespaces
+from lab.bed import namespaces
 from tests import probes
 from tests.interop import ros
 
@@ -40,7 +40,8 @@ def pytest_itemcollected(item: pytest.Item) -> None:
     """Put the guards around every coroutine test: named first, they are set up first and torn down last."""
     if not isinstance(item, pytest.Function) or not inspect.iscoroutinefunction(item.function):
         return
-    if item.path.relative_to(_TESTS).parts[0] in _ROOMS and "no_blocking" not in item.fixturenames:
+    rooms = {folder.name for folder in item.path.parents if folder.parent == _TESTS}
+    if rooms & _ROOMS and "no_blocking" not in item.fixturenames:
         item.fixturenames.insert(0, "no_blocking")
     item.fixturenames.insert(0, "no_leaks")
 

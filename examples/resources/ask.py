@@ -3,8 +3,7 @@
 import asyncio
 import sys
 
-from rmpa.resource import ResourceClient, at_most
-from rmpa.ros import Node
+from rmpa.resource import Node, ResourceClient, at_most
 
 
 async def main(master_uri: str) -> None:

@@ -1,4 +1,4 @@
-"""The module *joystick*: publishes the Command Information, ten times a second, or more often if somebody asks.
+"""The module *joystick*: publishes the Command Information, ten times a second, or more often on request.
 
 rmpa run joystick.py --set device=/dev/input/js0
 """
@@ -24,7 +24,7 @@ def steady() -> None:
 
 @joystick.profile(offers={"rate": "25 Hz"}, cost=3)
 def brisk() -> None:
-    """For who steers a fast robot."""
+    """For a fast robot."""
     rate.value = 25.0
 
 

@@ -1,4 +1,4 @@
-"""The module *pc*: watches every topic and shows who is there, how regularly and how late messages come.
+"""The module *pc*: watches every topic and shows the peers, and how regularly and how late messages arrive.
 
 rmpa up --name pc &
 python pc.py
@@ -96,7 +96,7 @@ def _pose(received: Received) -> PoseView:
 
 
 async def _look(watch: Watch) -> None:
-    """Ask our agent who is there, and how long messages without a header were on the way."""
+    """Ask the own agent for its peers, and for the latency of messages without a header."""
     counted: dict[str, int] = {}
     async for _ in Rate(LOOKS):
         with contextlib.suppress(RmpaError):

@@ -13,7 +13,7 @@ ATTEMPTS = 200
 
 
 def free_port(kind: socket.SocketKind, taken: set[int]) -> int:
-    """A port that nobody uses now, added to ``taken``.
+    """A free port, which is added to ``taken``.
 
     Args:
         kind: ``SOCK_STREAM`` on loopback, or ``SOCK_DGRAM`` on all addresses.

@@ -1,4 +1,4 @@
-"""The simulated Turtlebot: where it is, what it is told, what its odometry says. No I/O; ``now`` is told."""
+"""The simulated Turtlebot: pose, command and odometry. No I/O; ``now`` is an argument."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from rmpa.ros.types.messages import Plain
 
 ORDER_TIMEOUT = 0.5
-"""Seconds: a robot that hears no order for this long stops."""
+"""Seconds: without a command for so long the robot stops."""
 SURE, UNKNOWN = 1e-4, 1e6
 """Variances: of what wheels measure, and of what a robot on the floor cannot know (height, roll, pitch)."""
 COVARIANCE: list[Plain] = [

@@ -162,7 +162,7 @@ class Supervisor:
         self.failures.append(f"the {child.name} ended with status {status}\n{tail}")
         self._news({"event": "note", "module": module.name, "text": f"the {child.name} ended with status {status}"})
         if child.process.stdin is not None:
-            self._over.set()  # without the pc's node nobody sees anything
+            self._over.set()  # without the pc's node nothing is shown
 
     async def _kill(self, module: Module) -> None:
         await asyncio.gather(*(child.kill() for child in module.children))

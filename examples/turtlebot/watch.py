@@ -1,4 +1,4 @@
-"""What the module *pc* knows: figures of every topic, who is there, where the robot is. No I/O; ``now`` is told.
+"""The data of the module *pc*: figures of every topic, the peers, the robot's pose. No I/O; ``now`` is an argument.
 
 Times are seconds. ``now`` is the system's monotonic clock, which all processes of one machine share.
 """
@@ -222,7 +222,7 @@ class Watch:
             self._trail.append((pose.x, pose.y))
 
     def peers(self, states: dict[str, str], now: float) -> None:
-        """Our agent said who is there: each known peer's state."""
+        """Take the state of each known peer, as the own agent reports it."""
         for name, module in self._modules.items():
             if name == HERE:
                 state = "here"

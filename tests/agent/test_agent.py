@@ -144,7 +144,7 @@ async def test_three_modules_hear_each_other_and_nothing_loops(settings: Callabl
         assert [sorted(sink.heard) for sink in sinks] == [["from 0", "from 1", "from 2"]] * 3
 
 
-async def test_data_flows_only_while_somebody_listens(settings: Callable[..., Settings]) -> None:
+async def test_data_flows_only_with_a_subscriber(settings: Callable[..., Settings]) -> None:
     async with (
         running(settings("a"), settings("b")) as (a, b),
         node("talker", a) as talker,
@@ -159,7 +159,7 @@ async def test_data_flows_only_while_somebody_listens(settings: Callable[..., Se
         await until(lambda: publisher.subscribers == 0)
 
 
-async def test_one_copy_crosses_however_many_listen(settings: Callable[..., Settings]) -> None:
+async def test_one_copy_crosses_for_many_subscribers(settings: Callable[..., Settings]) -> None:
     async with running(settings("a"), settings("b")) as (a, b), node("talker", a) as talker:
         publisher = await talker.advertise("/chatter", "std_msgs/String")
         async with node("one", b) as one, node("two", b) as two:
@@ -222,7 +222,7 @@ async def test_policy_keeps_topics_home_on_either_side(settings: Callable[..., S
             assert not any(n.startswith("/rmpa/a") for n in b.core.state().publishers.get("/rosout", {}))
 
 
-async def test_another_md5_is_refused_on_both_sides_and_remembered(settings: Callable[..., Settings]) -> None:
+async def test_another_md5_sum_is_refused_on_both_sides(settings: Callable[..., Settings]) -> None:
     async with (
         running(settings("a"), settings("b")) as (a, b),
         node("talker", a) as talker,
@@ -235,7 +235,7 @@ async def test_another_md5_is_refused_on_both_sides_and_remembered(settings: Cal
         await until(lambda: a.bridge.counters["mismatch.remote"])
         assert b.bridge.counters["mismatch.md5"] == 1
         for agent in (a, b):
-            [topic] = [t for t in agent._view.snapshot().topics if t.name == "/chatter"]
+            [topic] = [t for t in agent.snapshots.build().topics if t.name == "/chatter"]
             assert len(topic.mismatches) == 1
         await until(lambda: publisher.subscribers == 0)
 
@@ -274,7 +274,7 @@ def core_port(agent: Agent) -> int:
     return urlsplit(agent.core.uri).port or 0
 
 
-async def test_a_second_agent_of_one_name_or_core_port_says_so(settings: Callable[..., Settings]) -> None:
+async def test_a_second_agent_of_one_name_or_port_is_refused(settings: Callable[..., Settings]) -> None:
     async with running(settings("a")) as (a,):
         with pytest.raises(StartError, match="a"):
             await Agent(settings("a")).start()
@@ -291,7 +291,7 @@ async def test_a_start_that_fails_leaves_nothing_open(settings: Callable[..., Se
             pass
 
 
-async def test_the_control_socket_tells_and_pings(settings: Callable[..., Settings], tmp_path: Path) -> None:
+async def test_the_control_socket_answers(settings: Callable[..., Settings], tmp_path: Path) -> None:
     async with running(settings("a"), settings("b")) as (a, b), node("talker", a) as talker:
         await talker.advertise("/chatter", "std_msgs/String")
         await until(lambda: "/chatter" in b.core.state().publishers)
@@ -307,14 +307,14 @@ async def test_the_control_socket_tells_and_pings(settings: Callable[..., Settin
         [topic] = [t for t in snapshot.topics if t.name == "/chatter"]
         assert (topic.type, topic.publishers, topic.peers) == ("std_msgs/String", (), ("a",))
         assert snapshot.agent.core_uri == b.core.uri
-        answer = await b._ping({"peer": "a", "count": 2})
+        answer = await b.operations.ping({"peer": "a", "count": 2})
         assert len(answer.times) == 2
         assert all(time is not None and 0 <= time < DEADLINE for time in answer.times)
         with pytest.raises(UnreachableError, match="did you mean a"):
-            await b._ping({"peer": "aa"})
+            await b.operations.ping({"peer": "aa"})
 
 
-async def test_the_agents_own_node_tells_what_it_is_connected_to(settings: Callable[..., Settings]) -> None:
+async def test_bus_info_of_the_agents_own_node(settings: Callable[..., Settings]) -> None:
     """``rosnode info /rmpa`` and rqt_graph ask it for that."""
     async with (
         running(settings("a"), settings("b")) as (a, b),

@@ -81,7 +81,7 @@ async def test_hidden_nodes_are_told_at_both_ends_and_come_with_a_reload(
             assert found.failed is not None
             assert (found.failed.name, "limits.nodes = 2" in found.failed.text) == ("limit", True)
 
-        near._take(replace(few, limits=LimitSettings(nodes=4)))
+        near.apply_settings(replace(few, limits=LimitSettings(nodes=4)))
         await until(lambda: stands(near, 0, 1, 2, 3))
         assert await beyond("near", tmp_path) == ()
         while await beyond("far", tmp_path):

@@ -23,16 +23,16 @@ async def test_a_followed_clock_does_not_stay_home(settings: Callable[..., Setti
         await simulator.advertise("/clock", "rosgraph_msgs/Clock")
         await user.subscribe("/clock", "rosgraph_msgs/Clock", lambda _: None)
         await until(lambda: "/rmpa/a/simulator" in b.core.publishers("/clock"))
-        (here,) = b._view.snapshot(frozenset({"/clock"})).topics
+        (here,) = b.snapshots.build(frozenset({"/clock"})).topics
         assert [route.direction for route in here.routes] == ["in"]
         text = 'time.follow = "a": that module\'s comes here; one of this module stays home'
         assert (here.crosses, here.policy) == (True, text)
-        (there,) = a._view.snapshot(frozenset({"/clock"})).topics
+        (there,) = a.snapshots.build(frozenset({"/clock"})).topics
         assert (there.crosses, there.policy) == (True, "time.share = true: peers may follow this module's time")
 
 
-async def test_a_clock_that_nobody_follows_stays_home(settings: Callable[..., Settings]) -> None:
+async def test_a_clock_without_followers_stays_home(settings: Callable[..., Settings]) -> None:
     async with running(settings("a"), settings("b")) as (a, _), node("simulator", a) as simulator:
         await simulator.advertise("/clock", "rosgraph_msgs/Clock")
-        (shown,) = a._view.snapshot(frozenset({"/clock"})).topics
+        (shown,) = a.snapshots.build(frozenset({"/clock"})).topics
         assert (shown.crosses, shown.policy.startswith("built in: time stays home")) == (False, True)

@@ -167,7 +167,7 @@ async def test_the_control_socket_answers_again(
 
 
 @pytest.mark.usefixtures("fresh")
-async def test_who_dials_says_why_it_cannot_and_tries_again(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_failed_dial_is_logged_and_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ros_limits, "TCPROS_RETRY_FIRST", 0.01)
     monkeypatch.setattr(ros_limits, "TCPROS_RETRY_MAX", 0.02)
     core = RosCore("127.0.0.1", 0)
@@ -190,7 +190,7 @@ async def test_who_dials_says_why_it_cannot_and_tries_again(monkeypatch: pytest.
 
 
 @pytest.mark.usefixtures("fresh")
-async def test_a_node_is_not_taken_for_dead_for_want_of_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_without_descriptors_no_node_is_taken_for_dead(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ros_limits, "NODE_UNREACHABLE_AFTER", 0.0)
     core = RosCore("127.0.0.1", 0)
     await core.start()
@@ -226,7 +226,7 @@ async def test_a_topic_without_a_proxy_says_why_and_comes_later(
             await until(lambda: any(at.inbound.problems for at in b.bridge.attached()))
             await until(lambda: len(routes(b)) == 5)
             assert all("no file descriptor is left for its proxy" in route.problem for route in routes(b))
-            (found,) = await b._whys.answer({"peer": "a", "name": "/t1"})
+            (found,) = await b.operations.why({"peer": "a", "name": "/t1"})
             assert found.failed is not None
             assert found.failed.name == "graph"
             assert "LimitNOFILE=" in found.failed.remedy
@@ -247,7 +247,7 @@ async def test_proxies_at_shared_sockets_need_no_descriptor(settings: Callable[.
 
 
 def routes(agent: Agent) -> list[RouteInfo]:
-    topics = [topic for topic in agent._view.snapshot().topics if topic.name.startswith("/t")]
+    topics = [topic for topic in agent.snapshots.build().topics if topic.name.startswith("/t")]
     return [route for topic in topics for route in topic.routes if route.direction == "in"]
 
 

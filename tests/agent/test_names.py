@@ -36,7 +36,7 @@ def publishers(agent: Agent, topic: str) -> list[str]:
 
 
 def info(agent: Agent, topic: str) -> TopicInfo:
-    return next(found for found in agent._view.snapshot().topics if found.name == topic)
+    return next(found for found in agent.snapshots.build().topics if found.name == topic)
 
 
 def imported(agent: Agent, topic: str) -> RemoteTopic:
@@ -66,7 +66,7 @@ async def test_topics_have_each_sides_names_both_ways(agents: tuple[Agent, Agent
         assert [(r.direction, r.wire) for r in info(robot, "/odom").routes] == [("out", "")]
 
 
-async def test_a_peer_is_told_of_no_more_than_its_rules_allow(settings: Callable[..., Settings]) -> None:
+async def test_a_peer_is_offered_only_what_its_rules_allow(settings: Callable[..., Settings]) -> None:
     guest = PeerRule("guest", policy=PolicySettings(allow=("/pose",)))
     async with (
         running(replace(settings("pc"), peers=(guest,)), settings("guest"), settings("friend")) as (
@@ -80,11 +80,11 @@ async def test_a_peer_is_told_of_no_more_than_its_rules_allow(settings: Callable
             await ours.advertise(topic, "std_msgs/String")
         await until(lambda: publishers(other, "/pose") and publishers(friend, "/secret"))
         assert not publishers(other, "/secret")
-        counts = {peer.name: peer.topics_out for peer in pc._view.snapshot().peers}
+        counts = {peer.name: peer.topics_out for peer in pc.snapshots.build().peers}
         assert counts == {"guest": 1, "friend": 2}
 
 
-async def test_a_mismatch_is_told_under_each_sides_name(agents: tuple[Agent, Agent]) -> None:
+async def test_a_mismatch_has_each_sides_names(agents: tuple[Agent, Agent]) -> None:
     pc, robot = agents
     async with node("base", robot) as base, node("driver", pc) as driver:
         cmd = await driver.advertise("/robot/cmd", "std_msgs/String")
@@ -97,9 +97,7 @@ async def test_a_mismatch_is_told_under_each_sides_name(agents: tuple[Agent, Age
 
 
 @pytest.mark.parametrize("far", [False, True], ids=["here", "there"])
-async def test_what_a_reload_is_not_about_keeps_its_route_and_its_connections(
-    agents: tuple[Agent, Agent], far: bool
-) -> None:
+async def test_a_reload_keeps_unchanged_routes_and_connections(agents: tuple[Agent, Agent], far: bool) -> None:
     pc, robot = agents
     async with node("base", robot) as base, node("driver", pc) as driver:
         names = ("steady", "named", "denied", "tuned")
@@ -115,7 +113,7 @@ async def test_what_a_reload_is_not_about_keeps_its_route_and_its_connections(
         agent, prefix = (robot, "/") if far else (pc, "/robot/")
         near_rule = replace(PREFIX[0], remap_in=(Remap("/named", "/robot/other"),))
         far_rule = PeerRule("pc", "", (), (Remap("/named", "/other"),))
-        agent._take(
+        agent.apply_settings(
             replace(
                 agent._settings,
                 policy=PolicySettings(deny=(f"{prefix}denied",)),

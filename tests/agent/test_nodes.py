@@ -28,7 +28,9 @@ __all__ = ["settings"]
 
 
 async def ask(agent: Agent, kind: Any, what: str, name: str = "", peer: str | None = "b") -> Any:
-    return msgspec.convert(msgspec.to_builtins(await agent._node({"what": what, "peer": peer, "node": name})), kind)
+    return msgspec.convert(
+        msgspec.to_builtins(await agent.operations.node({"what": what, "peer": peer, "node": name})), kind
+    )
 
 
 @asynccontextmanager
@@ -57,7 +59,7 @@ def proxy(agent: Agent, name: str) -> str:
     return agent.core.state().nodes.get(f"/rmpa/b/{name}", "")
 
 
-async def test_they_are_listed_described_and_asked(settings: Callable[..., Settings]) -> None:
+async def test_nodes_of_a_peer_are_listed_described_and_pinged(settings: Callable[..., Settings]) -> None:
     async with (
         running(settings("a"), settings("b")) as (a, b),
         node("talker", b) as talker,
@@ -93,7 +95,7 @@ async def test_they_are_listed_described_and_asked(settings: Callable[..., Setti
             await ask(a, NodeEnd, "node.kil", "/x")
 
 
-async def test_an_agent_that_does_not_know_the_question(settings: Callable[..., Settings]) -> None:
+async def test_an_older_agent_without_node_requests(settings: Callable[..., Settings]) -> None:
     """An older release: what stands here is shown, and the rest says why not."""
     async with running(settings("a"), settings("b")) as (a, b), node("talker", b) as talker:
         await talker.advertise("/chatter", "std_msgs/String")
@@ -109,7 +111,7 @@ async def test_an_agent_that_does_not_know_the_question(settings: Callable[..., 
         assert (reply.code, "does not know" in reply.status) == (0, True)
 
 
-async def test_to_kill_a_proxy_ends_its_node(settings: Callable[..., Settings]) -> None:
+async def test_killing_a_proxy_ends_its_node(settings: Callable[..., Settings]) -> None:
     async with running(settings("a"), settings("b")) as (a, b), mortal("talker", b) as (talker, ended):
         await talker.advertise("/chatter", "std_msgs/String")
         await until(lambda: proxy(a, "talker"))
@@ -127,7 +129,7 @@ async def test_a_node_is_ended_by_name(settings: Callable[..., Settings]) -> Non
         assert "/talker" not in b.core.state().nodes
 
 
-async def test_what_a_module_does_not_allow_lives_on(settings: Callable[..., Settings]) -> None:
+async def test_a_node_is_not_ended_without_permission(settings: Callable[..., Settings]) -> None:
     b_settings = replace(settings("b"), nodes=NodeSettings(kill=("/demo/**",)))
     async with running(settings("a"), b_settings) as (a, b), mortal("talker", b) as (talker, ended):
         await talker.advertise("/chatter", "std_msgs/String")
@@ -138,7 +140,7 @@ async def test_what_a_module_does_not_allow_lives_on(settings: Callable[..., Set
         with pytest.raises(PeerRefused, match=refusal):
             await ask(a, NodeEnd, "node.kill", "/talker")
         assert not ended.is_set()
-        b._take(replace(b_settings, nodes=NodeSettings()))
+        b.apply_settings(replace(b_settings, nodes=NodeSettings()))
         assert (await ask(a, NodeEnd, "node.kill", "/talker")).gone
 
 
@@ -169,7 +171,7 @@ async def test_kill_all_ends_the_nodes_of_this_module_alone(settings: Callable[.
         await asyncio.wait_for(ended.wait(), 20)
 
 
-async def test_a_master_that_takes_the_name_of_a_proxy_ends_no_node_elsewhere(
+async def test_taking_a_proxys_name_ends_no_node_elsewhere(
     settings: Callable[..., Settings],
 ) -> None:
     async with running(settings("a"), settings("b")) as (a, b), mortal("talker", b) as (talker, ended):

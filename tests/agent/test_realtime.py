@@ -126,7 +126,7 @@ async def test_garbage_of_control_work_is_collected_while_the_agent_runs(
     assert 2 <= len(collections) < 40
     assert set(collections) == {0}
     # Both live on one loop here, and either one's collector may come first.
-    assert sum(agent._view.snapshot().counters.get("collector.young", 0) for agent in (a, b)) >= 1
+    assert sum(agent.snapshots.build().counters.get("collector.young", 0) for agent in (a, b)) >= 1
 
 
 async def test_the_collector_is_the_interpreters_again_when_the_agent_ends(

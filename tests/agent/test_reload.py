@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.agent import reload
-from rmpa.agent.reload import Hangups, Reloader
+from rmpa.agent.reload import Reloader, SighupHandler
 from rmpa.config.settings import HostPort, PeerRule, PolicySettings, Settings
 from rmpa.config.sources import Flags, Loaded, load_settings
 from rmpa.core.contract import ContractRule
@@ -69,7 +69,7 @@ async def test_a_second_time_only_what_waits_is_left() -> None:
     assert (reply.changed, len(reply.restart), len(applied)) == ((), 3, 1)
 
 
-async def test_settings_that_cannot_be_used_change_nothing(caplog: pytest.LogCaptureFixture) -> None:
+async def test_invalid_settings_change_nothing(caplog: pytest.LogCaptureFixture) -> None:
     def load() -> Loaded:
         raise ConfigError("bridge.deny", "no", "yes", Path("/x.toml"), 7)
 
@@ -97,29 +97,29 @@ def test_a_file_is_read_again(tmp_path: Path) -> None:
 # --- SIGHUP -------------------------------------------------------------------------------------------------------
 
 
-async def test_sighup_reads_the_settings_again_and_tells_the_service_manager(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_sighup_reloads_and_notifies_the_service_manager(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[str] = []
     monkeypatch.setattr(reload, "notify_service_manager", told.append)
     monkeypatch.setattr(reload, "_has_terminal", lambda: False)
     applied: list[Settings] = []
-    hangups = Hangups(reloader(lambda: Loaded(NEW), applied), lambda: pytest.fail("it must go on"))
-    hangups.start()
+    sighup = SighupHandler(reloader(lambda: Loaded(NEW), applied), lambda: pytest.fail("it must go on"))
+    sighup.start()
     os.kill(os.getpid(), signal.SIGHUP)
     async with asyncio.timeout(20):
         while "READY=1" not in told:
             await asyncio.sleep(0.005)
     assert applied
     assert told[0].startswith("RELOADING=1\nMONOTONIC_USEC=")
-    await hangups.close()
+    await sighup.close()
 
 
-async def test_where_sighup_is_ignored_it_stays_so(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_an_ignored_sighup_stays_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        hangups = Hangups(reloader(lambda: pytest.fail("nobody asked"), []), lambda: None)
-        hangups.start()
+        sighup = SighupHandler(reloader(lambda: pytest.fail("nobody asked"), []), lambda: None)
+        sighup.start()
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-        await hangups.close()
+        await sighup.close()
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)

@@ -88,7 +88,7 @@ def come_back(*agents: Agent) -> None:
             agent.services.link_up(attached)
 
 
-async def test_a_call_goes_there_and_back_and_is_counted_on_both_sides(settings: Callable[..., Settings]) -> None:
+async def test_a_call_is_counted_on_both_sides(settings: Callable[..., Settings]) -> None:
     async with running(settings("a"), settings("b")) as (a, b), serving(a) as server:
         await until(lambda: provider(b) == "/rmpa/a/adder")
         connection = await connect(b, md5sum=MD5)
@@ -97,8 +97,8 @@ async def test_a_call_goes_there_and_back_and_is_counted_on_both_sides(settings:
             assert await connection.call(body, 20.0) == (True, body)
         connection.close()
         assert len(server.calls) == 4
-        (there,) = [i for i in a._snapshot({}).services if i.name == "/add"]
-        (here,) = [i for i in b._snapshot({}).services if i.name == "/add"]
+        (there,) = [i for i in a.operations.snapshot({}).services if i.name == "/add"]
+        (here,) = [i for i in b.operations.snapshot({}).services if i.name == "/add"]
         assert (there.direction, there.state, there.callers, there.calls, there.failed) == (
             "out",
             "open",
@@ -114,7 +114,7 @@ async def test_a_call_goes_there_and_back_and_is_counted_on_both_sides(settings:
     assert provider(b) == ""
 
 
-async def test_a_link_that_is_back_soon_keeps_services_and_answers_who_called_meanwhile(
+async def test_a_short_outage_keeps_services_and_answers_calls(
     settings: Callable[..., Settings],
 ) -> None:
     async with running(settings("a"), settings("b")) as (a, b), serving(a) as server:
@@ -155,7 +155,7 @@ async def test_a_link_that_stays_away_takes_its_services_and_tells_who_waits(
         connection.close()
 
 
-async def test_a_local_service_is_never_pushed_out_and_ours_comes_when_it_goes(
+async def test_a_local_service_hides_the_peers_until_it_ends(
     settings: Callable[..., Settings],
 ) -> None:
     async with running(settings("a"), settings("b")) as (a, b), serving(a):
@@ -167,13 +167,13 @@ async def test_a_local_service_is_never_pushed_out_and_ours_comes_when_it_goes(
             b.services.reconcile()
             await asyncio.sleep(0.05)
             assert provider(b) == "/mine"
-            (info,) = [i for i in b._snapshot({}).services if i.peer == "a"]
+            (info,) = [i for i in b.operations.snapshot({}).services if i.peer == "a"]
             assert (info.state, info.hidden) == ("hidden", "/mine of this module provides it itself")
         await until(lambda: provider(b) == "/rmpa/a/adder")
         assert seen == ["/mine", "/mine", "", "/rmpa/a/adder"], "ours went, its came; its went, ours came"
 
 
-async def test_what_somebody_took_out_of_the_graph_comes_back(settings: Callable[..., Settings]) -> None:
+async def test_a_removed_proxy_comes_back(settings: Callable[..., Settings]) -> None:
     async with running(settings("a"), settings("b")) as (a, b), serving(a):
         await until(lambda: provider(b) == "/rmpa/a/adder")
         (uri,) = b.core.state().services["/add"].values()
@@ -183,7 +183,7 @@ async def test_what_somebody_took_out_of_the_graph_comes_back(settings: Callable
         assert provider(b) == "/rmpa/a/adder"
 
 
-async def test_a_server_that_comes_back_at_another_address_is_asked_anew(settings: Callable[..., Settings]) -> None:
+async def test_a_server_at_a_new_address_is_found(settings: Callable[..., Settings]) -> None:
     async with running(settings("a"), settings("b")) as (a, b), serving(a):
         await until(lambda: provider(b) == "/rmpa/a/adder")
         connection = await connect(b)
@@ -205,7 +205,7 @@ async def test_another_md5_sum_is_refused_and_both_sides_say_so(
             await connect(b, md5sum="f" * 32)
         await until(lambda: a.bridge.counters["service.mismatch_remote"])
         assert b.bridge.counters["service.mismatch"] == 1
-        (info,) = [i for i in b._snapshot({}).services if i.name == "/add"]
+        (info,) = [i for i in b.operations.snapshot({}).services if i.name == "/add"]
         assert "md5sum" in info.problem
         said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
         assert sum(MD5 in line for line in said) == 2
@@ -213,7 +213,7 @@ async def test_another_md5_sum_is_refused_and_both_sides_say_so(
         connection.close()
 
 
-async def test_names_and_rules_of_a_peer_hold_for_services_and_change_at_a_reload(
+async def test_peer_rules_hold_for_services_and_reload(
     settings: Callable[..., Settings],
 ) -> None:
     mine = replace(settings("b"), peers=(PeerRule("a", prefix="/robot1"),))
@@ -246,7 +246,7 @@ async def test_the_deadline_of_a_call_is_the_callers(settings: Callable[..., Set
         connection.close()
 
 
-async def test_a_service_that_has_no_server_behind_it_is_refused_with_the_reason(
+async def test_a_service_without_a_server_is_refused_with_the_reason(
     settings: Callable[..., Settings],
 ) -> None:
     async with running(settings("a"), settings("b")) as (a, b), serving(a) as server:
@@ -258,7 +258,7 @@ async def test_a_service_that_has_no_server_behind_it_is_refused_with_the_reason
         await until(lambda: not provider(b, "/boo"))
 
 
-async def test_a_hundred_services_of_fifty_nodes_stand_in_the_other_graph(settings: Callable[..., Settings]) -> None:
+async def test_a_hundred_services_appear_at_the_peer(settings: Callable[..., Settings]) -> None:
     async with running(settings("a"), settings("b")) as (a, b), serving(a) as server:
         for number in range(100):
             a.core.call(

@@ -12,12 +12,18 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from rmpa.config.settings import PeerRule, ServiceSettings
-from rmpa.runtime.event_loop import AgentLoop
-from tests.agent.test_isolation import NODES, STRAYS, Watched, World, call, calls, watched, worlds
+from tests.agent.test_isolation import (
+    NODES,
+    World,
+    assert_yields_to_data,
+    call,
+    calls,
+    watched,
+)
 from tests.agent.test_services import connect, serving
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
 
 __all__ = ["watched"]
@@ -55,16 +61,16 @@ async def plans_are_reconciled(world: World) -> None:
 
 async def somebody_looks_at_everything(world: World) -> None:
     for _ in range(4):
-        assert len(world.near._snapshot({}).services) > SERVICES
+        assert len(world.near.operations.snapshot({}).services) > SERVICES
         await asyncio.sleep(0)
 
 
 async def other_rules_hold(world: World) -> None:
     for rules in ((PeerRule("far", "/moved"),), ()) * 2:
-        world.near._take(replace(world.near._settings, peers=rules))
+        world.near.apply_settings(replace(world.near._settings, peers=rules))
         await world.until(lambda rules=rules: shown(world) == (0 if rules else SERVICES))  # type: ignore[misc]
     for services in (ServiceSettings(deny=("/fleet/**",)), ServiceSettings()) * 2:
-        world.far._take(replace(world.far._settings, services=services))
+        world.far.apply_settings(replace(world.far._settings, services=services))
         await world.until(lambda services=services: shown(world) == (0 if services.deny else SERVICES))  # type: ignore[misc]
 
 
@@ -100,30 +106,14 @@ async def the_fleet_leaves(world: World) -> None:
     await world.until(lambda: shown(world) == 0)
 
 
-PHASES: Final[tuple[Callable[[World], Awaitable[None]], ...]] = (
-    a_fleet_registers,
-    plans_are_reconciled,
-    somebody_looks_at_everything,
-    other_rules_hold,
-    large_calls_are_made,
-    the_link_falls_and_comes_back,
-    the_fleet_leaves,
-)
-
-
-def test_no_work_of_a_thousand_services_goes_on_without_a_look_at_the_data(tmp_path: Path) -> None:
-    found: dict[str, list[tuple[float, str]]] = {}
-
-    async def main() -> None:
-        async with worlds(tmp_path) as world:
-            for phase in PHASES:
-                Watched.holds.clear()
-                await phase(world)
-                if len(Watched.holds) > STRAYS:
-                    found[phase.__name__] = sorted(Watched.holds, reverse=True)[:8]
-
-    with asyncio.Runner(loop_factory=AgentLoop) as runner:
-        runner.run(main())
-    told = [f"{name}: {1e3 * hold:.1f} ms: {who}" for name, holds in found.items() for hold, who in holds]
-    assert not found, "\n".join(told)
-    assert Watched.looks > 10_000
+def test_work_on_a_thousand_services_yields_to_data(tmp_path: Path) -> None:
+    assert_yields_to_data(
+        tmp_path,
+        a_fleet_registers,
+        plans_are_reconciled,
+        somebody_looks_at_everything,
+        other_rules_hold,
+        large_calls_are_made,
+        the_link_falls_and_comes_back,
+        the_fleet_leaves,
+    )

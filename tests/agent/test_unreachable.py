@@ -71,7 +71,7 @@ async def registered_by_name(agent: Agent) -> AsyncIterator[None]:
 
 
 async def why(agent: Agent, peer: str, name: str) -> Diagnosis:
-    (found,) = await agent._why({"name": name, "peer": peer})
+    (found,) = await agent.operations.why({"name": name, "peer": peer})
     return found
 
 
@@ -80,7 +80,7 @@ async def test_it_is_told_withdrawn_and_back_when_it_can_be_reached(
 ) -> None:
     async with running(settings("a"), settings("b")) as (a, b), registered_by_name(a):
         await until(lambda: "/cam" in a.core.unreachable())
-        (info,) = a._view.snapshot().unreachable
+        (info,) = a.snapshots.build().unreachable
         assert str(info).startswith(f"/cam cannot be reached at http://{NAME}:")
         await until(lambda: a.core.unreachable()["/cam"].withdrawn)
         await until(lambda: "/image" not in b.core.state().publishers and "/shoot" not in b.core.state().services)
@@ -90,7 +90,7 @@ async def test_it_is_told_withdrawn_and_back_when_it_can_be_reached(
         text = (
             f"/cam cannot be reached at {at} (the name does not resolve here (as asked)), so peers are not offered it"
         )
-        (topic,) = [topic for topic in a._view.snapshot().topics if topic.name == "/image"]
+        (topic,) = [topic for topic in a.snapshots.build().topics if topic.name == "/image"]
         assert topic.unreachable == (text,)
         failed = (await why(b, "a", "/image")).failed
         assert failed is not None

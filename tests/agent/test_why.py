@@ -12,13 +12,14 @@ import pytest
 from rmpa.bridge import limits
 from rmpa.config.settings import PeerRule, PolicySettings, ServiceSettings, Settings
 from rmpa.core.errors import ConfigError
-from rmpa.observe.why.diagnosis import Diagnosis, StageResult
+from rmpa.observe.check import CheckLevel
 from tests.agent.test_agent import DEADLINE, node, running, settings, until  # noqa: F401 - a fixture among them
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.agent import Agent
+    from rmpa.observe.why.diagnosis import Diagnosis
 
 
 @pytest.fixture(autouse=True)
@@ -27,7 +28,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 async def ask(agent: Agent, name: str, peer: str | None = None) -> tuple[Diagnosis, ...]:
-    return await agent._why({"name": name, "peer": peer})
+    return await agent.operations.why({"name": name, "peer": peer})
 
 
 async def flowing(agent: Agent, name: str, peer: str | None = None) -> Diagnosis:
@@ -50,7 +51,7 @@ def stopped_at(found: tuple[Diagnosis, ...]) -> tuple[str, str]:
     return diagnosis.failed.name, diagnosis.failed.text
 
 
-async def test_from_no_publisher_to_a_flowing_topic(settings: Callable[..., Settings]) -> None:  # noqa: F811
+async def test_each_stage_until_a_topic_flows(settings: Callable[..., Settings]) -> None:  # noqa: F811
     async with (
         running(settings("a"), settings("b")) as (a, b),
         node("talker", a) as talker,
@@ -72,7 +73,7 @@ async def test_from_no_publisher_to_a_flowing_topic(settings: Callable[..., Sett
         publisher.publish(publisher.make({"data": "one"}))
         found = await flowing(b, "/chatter", "a")
         assert (found.peer, found.to, found.node) == ("a", "b", "/talker")
-        assert [stage.verdict for stage in found.stages] == [StageResult.OK] * len(found.stages)
+        assert [stage.level for stage in found.stages] == [CheckLevel.OK] * len(found.stages)
         assert found.stages[-1].text == "/hearer takes them"
         # Asked on the publisher's side, the subscriber's agent says the same.
         there = await flowing(a, "/chatter")
@@ -159,7 +160,7 @@ async def test_policy_for_single_peers(settings: Callable[..., Settings]) -> Non
 async def test_services(settings: Callable[..., Settings]) -> None:  # noqa: F811
     deny = ServiceSettings(deny=("/kept",))
     async with running(replace(settings("a"), services=deny), settings("b")) as (a, b), node("server", a) as server:
-        stage, text = stopped_at(await b._why({"name": "/ask", "peer": "a", "service": True}))
+        stage, text = stopped_at(await b.operations.why({"name": "/ask", "peer": "a", "service": True}))
         assert (stage, text) == ("server", "no node of a provides /ask")
 
         def answer(_: object) -> dict[str, object]:

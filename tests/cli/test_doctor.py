@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from rmpa.observe.doctor.io.checks import CHECKS
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -43,6 +45,7 @@ def test_every_check_answers(loopback: Place) -> None:
         "mtu",
         *("realtime", "files"),
     }
+    assert {check.name for check in CHECKS} <= checks
     assert answers["multicast", "lo"]["level"] == "ok"
     assert str(answers["settings", ""]["text"]).startswith("read from rmpa.toml: name ")
     assert {str(f["level"]) for f in answers.values()} <= {"ok", "warn", "skipped"}
@@ -82,7 +85,7 @@ def test_what_would_mislead_nodes_fails(loopback: Place, variable: str, value: s
     assert loopback.run("doctor")[0] == 1
 
 
-def test_settings_that_cannot_be_are_told_and_the_rest_is_looked_at(loopback: Place) -> None:
+def test_invalid_settings_are_reported_and_the_rest_is_checked(loopback: Place) -> None:
     (loopback.path / "bad.toml").write_text('[discovery]\ninterfaces = ["lo"]\n[core]\nprot = 1\n')
     loopback.environ["RMPA_INTERFACES"] = "lo"
     answers = found(loopback, "--config", "bad.toml")

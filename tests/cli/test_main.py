@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 from rmpa import __version__
-from rmpa.cli.lazy import LazyGroup
+from rmpa.cli.lazy_group import LazyGroup
 from rmpa.cli.main import cli, main
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def test_each_command_but_those_without_an_answer_has_json(path: str, command: c
 
 
 WORDS = {"values": "{}", "value": "1"}
-QUIET = {"rmpa doctor", "rmpa multicast send", "rmpa multicast receive", "rmpa experiment list"}
+QUIET = {"rmpa doctor", "rmpa multicast send", "rmpa multicast receive"}
 """These need neither an agent nor a master."""
 
 
@@ -100,6 +100,11 @@ def test_an_error_is_json_only_where_that_is_asked_for(capsys: pytest.CaptureFix
 
 def test_version() -> None:
     assert CliRunner().invoke(cli, ["--version"]).output == f"rmpa {__version__}\n"
+
+
+def test_a_command_that_moved_says_where_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["experiment", "run", "--short"]) == 2
+    assert "make experiment" in capsys.readouterr().err
 
 
 def test_a_misspelt_command_is_told_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:

@@ -46,7 +46,7 @@ def rmpa(core: RosCore, place: Place, monkeypatch: pytest.MonkeyPatch, capsys: p
 
 @pytest.fixture
 def talker(core: RosCore, background: Background) -> Iterator[str]:
-    """A node that ends when it is told to, and a proxy as a bridge has them; the node's slave API."""
+    """A node that ends at ``shutdown``, and a proxy as a bridge makes them; the node's slave API."""
     told = asyncio.Event()
     proxy = Node("/rmpa/joystick/joy", master_uri=core.uri, environment=RosEnvironment())
     made = Node("/talker", master_uri=core.uri, environment=RosEnvironment(), on_shutdown=lambda _: told.set())
@@ -75,7 +75,7 @@ def talker(core: RosCore, background: Background) -> Iterator[str]:
 
 @pytest.fixture
 def peer(core: RosCore, agent: Callable[..., None]) -> list[dict[str, Any]]:
-    """An agent with this core, whose peer joystick has a node /joy; what it was asked."""
+    """An agent with this core, whose peer joystick has a node /joy; and the questions that it got."""
     asked: list[dict[str, Any]] = []
 
     def node(args: dict[str, object]) -> object:

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import msgspec
 import pytest
 
-from rmpa.cli.master import read_topic
+from rmpa.cli.graph import read_name
 from rmpa.cli.message_text import flatten, pick, shorten, to_text
 from rmpa.cli.output import Column, duration, print_table, printable, size
-from rmpa.cli.topic_figures import facts
+from rmpa.cli.topic_crossing import facts
 from rmpa.cli.topic_pub import fill_stamps, read_values
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.observe.snapshot import RouteInfo
@@ -101,10 +101,10 @@ def test_stamps_are_filled() -> None:
 
 
 def test_topics_with_and_without_a_peer() -> None:
-    assert str(read_topic("joystick:cmd/")) == "joystick:/cmd"
+    assert str(read_name("joystick:cmd/")) == "joystick:/cmd"
     for text in ("", ":", ":/x", "a b", "~x", "base:"):
         with pytest.raises(ConfigError):
-            read_topic(text)
+            read_name(text)
 
 
 def test_a_contract_is_shown_with_the_units_of_its_keys() -> None:

@@ -110,7 +110,7 @@ def test_ping(place: Place, agent: Agent) -> None:
     ]
 
 
-def test_ping_asks_for_the_guid_because_names_may_be_given_twice(place: Place, agent: Agent) -> None:
+def test_ping_addresses_a_peer_by_guid(place: Place, agent: Agent) -> None:
     asked: list[object] = []
 
     def note(args: dict[str, object]) -> PingReply:

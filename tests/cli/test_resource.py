@@ -13,17 +13,18 @@ import pytest
 
 from rmpa.cli.main import main
 from rmpa.core.errors import ConfigError
-from rmpa.resource.declare.resource import Resource, at_least, at_most
+from rmpa.resource.declare.qos_request import at_least, at_most
+from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.client import ResourceClient
 from rmpa.resource.run.descriptor import describe
 from rmpa.resource.run.dynamic_reconfigure import read_config
-from rmpa.resource.run.member import Member
 from rmpa.resource.run.registry_writer import FILE
+from rmpa.resource.run.resource_node import ResourceNode
 from rmpa.resource.run.resource_registry import ResourceRegistry
 from rmpa.resource.run.store import ResourceStore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.node import Node
-from tests.resource.run.test_member import echo
+from tests.resource.run.test_resource_node import echo
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -74,12 +75,12 @@ def sonar() -> Resource:
 
 
 @pytest.fixture
-def running(core: RosCore, background: Background) -> Iterator[Member]:
+def running(core: RosCore, background: Background) -> Iterator[ResourceNode]:
     """The resource of this module."""
-    made: list[Member] = []
+    made: list[ResourceNode] = []
 
     async def start() -> None:
-        made.append(Member(sonar(), core.uri, window=0.2))
+        made.append(ResourceNode(sonar(), core.uri, window=0.2))
         await made[0].start()
 
     background.do(start())
@@ -138,7 +139,7 @@ def rows(rmpa: Rmpa, *words: str) -> list[list[str]]:
     return [line.split()[:3] for line in out.splitlines()]
 
 
-def test_resources_here_and_at_peers(rmpa: Rmpa, running: Member, remote: object) -> None:
+def test_resources_here_and_at_peers(rmpa: Rmpa, running: ResourceNode, remote: object) -> None:
     assert rows(rmpa, "resource", "list") == [
         ["RESOURCE", "STATE", "ROLE"],
         ["/sonar", "active", "sensing"],
@@ -160,7 +161,7 @@ def test_resources_here_and_at_peers(rmpa: Rmpa, running: Member, remote: object
     assert rmpa("resource", "info", "a b")[0] == 2
 
 
-def test_all_of_a_resource(rmpa: Rmpa, running: Member) -> None:
+def test_all_of_a_resource(rmpa: Rmpa, running: ResourceNode) -> None:
     code, out, _ = rmpa("resource", "info")
     assert code == 0
     lines = [" ".join(line.split()) for line in out.splitlines()]
@@ -194,7 +195,7 @@ def test_all_of_a_resource(rmpa: Rmpa, running: Member) -> None:
     assert "ASKS OF FOR PRIORITY /eye blur <= 2 px hard; sight.rate >= 5 Hz 3" in text
 
 
-def test_a_profile_by_hand(rmpa: Rmpa, running: Member, remote: list[dict[str, Any]]) -> None:
+def test_a_profile_by_hand(rmpa: Rmpa, running: ResourceNode, remote: list[dict[str, Any]]) -> None:
     assert as_json(rmpa, "profile", "set", "sonar", "fast") == {"resource": "/sonar", "peer": None, "chosen": "fast"}
     assert rmpa("profile", "set", "sonar", "fast") == (0, "", "")
     assert ["fast", "runs,", "by"] in rows(rmpa, "profile", "explain", "sonar")
@@ -227,10 +228,10 @@ def test_a_profile_by_hand(rmpa: Rmpa, running: Member, remote: list[dict[str, A
 
 def test_a_decision_is_explained(rmpa: Rmpa, core: RosCore, background: Background) -> None:
     driver = Node("/driver", master_uri=core.uri, environment=RosEnvironment())
-    members: list[Member] = []
+    members: list[ResourceNode] = []
 
     async def ask() -> None:
-        members.append(Member(sonar(), core.uri, window=60))  # nothing is measured meanwhile
+        members.append(ResourceNode(sonar(), core.uri, window=60))  # nothing is measured meanwhile
         await members[0].start()
         await driver.__aenter__()
         client = await ResourceClient(driver, "sonar").__aenter__()
@@ -255,7 +256,7 @@ def test_a_decision_is_explained(rmpa: Rmpa, core: RosCore, background: Backgrou
     background.do(stop())
 
 
-def test_a_context_by_hand(rmpa: Rmpa, running: Member) -> None:
+def test_a_context_by_hand(rmpa: Rmpa, running: ResourceNode) -> None:
     assert rmpa("context", "get") == (0, "\n", "")
     assert as_json(rmpa, "context", "set", "sonar", "away")["chosen"] == "away"
     assert rmpa("context", "set", "sonar", "away") == (0, "", "")
@@ -273,7 +274,7 @@ def test_a_context_by_hand(rmpa: Rmpa, running: Member) -> None:
     assert as_json(rmpa, "context", "get")["context"] == ""
 
 
-def test_alarms(rmpa: Rmpa, core: RosCore, running: Member, background: Background) -> None:
+def test_alarms(rmpa: Rmpa, core: RosCore, running: ResourceNode, background: Background) -> None:
     assert rmpa("alarm", "list")[1].split() == ["RESOURCE", "LEVEL", "MESSAGE"]
     assert rows(rmpa, "alarm", "list", "--all")[1] == ["/sonar", "OK", "profile"]
 
@@ -288,7 +289,7 @@ def test_alarms(rmpa: Rmpa, core: RosCore, running: Member, background: Backgrou
     def when_heard() -> None:
         """From a thread: the command runs in the main one."""
         deadline = time.monotonic() + 30
-        while not running.adapter._publishers["alarms"].subscribers and time.monotonic() < deadline:
+        while not running.adapter.reports.publishers["alarms"].subscribers and time.monotonic() < deadline:
             time.sleep(0.02)
         background.do(disturb())
 
@@ -300,10 +301,10 @@ def test_alarms(rmpa: Rmpa, core: RosCore, running: Member, background: Backgrou
     alarm = json.loads(out)
     assert (alarm["resource"], alarm["level"]) == ("/sonar", "ERROR")
     assert alarm["message"].startswith("non-adaptable: no profile gives accuracy as asked")
-    others: list[Member] = []
+    others: list[ResourceNode] = []
 
     async def start() -> None:
-        others.append(Member(echo(), core.uri, window=0.2))
+        others.append(ResourceNode(echo(), core.uri, window=0.2))
         await others[0].start()
 
     background.do(start())
@@ -315,7 +316,7 @@ def test_alarms(rmpa: Rmpa, core: RosCore, running: Member, background: Backgrou
     background.do(others[0].close())
 
 
-def test_nobody_is_there(rmpa: Rmpa, core: RosCore) -> None:
+def test_no_resource(rmpa: Rmpa, core: RosCore) -> None:
     assert as_json(rmpa, "resource", "list") == []
     text = "rmpa: there is no resource; `rmpa run` runs one, `rmpa resource list` shows all\n"
     assert rmpa("profile", "list") == (1, "", text)
@@ -329,7 +330,7 @@ def write_down(path: Path, *each: tuple[str, str, float]) -> None:
         await store.open()
         for name, caller, ago in sorted(each, key=lambda one: -one[2]):
             text = describe(sonar(), name).serialize()
-            for key, value in sightings.heard(name, caller, text, time.time_ns() - round(ago * 1e9)).items():
+            for key, value in sightings.record(name, caller, text, time.time_ns() - round(ago * 1e9)).items():
                 store.put(key, value)
         await store.close()
 
@@ -337,7 +338,7 @@ def write_down(path: Path, *each: tuple[str, str, float]) -> None:
 
 
 def test_resources_that_were_seen_before(
-    rmpa: Rmpa, running: Member, remote: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    rmpa: Rmpa, running: ResourceNode, remote: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "nose" / FILE
     write_down(

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import psutil
 import pytest
 
+from lab.bed.processes import Process, eventually
 from rmpa.cli.run import prepared
 from rmpa.core.errors import ConfigError
-from rmpa.experiments.bed.processes import Process, eventually
 from tests.interop.ros import free_port
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ def test_a_parameter_that_cannot_be_given_is_refused(
 
 
 class Ground:
-    """Runs files and agents on this machine's loopback, and sees what of them is left."""
+    """Runs files and agents on this machine's loopback, and checks what they leave behind."""
 
     def __init__(self, place: Place) -> None:
         self.place = place
@@ -114,7 +114,7 @@ class Ground:
         return self.rmpa("run", str(path), *words, *(("--", *self.options) if options else ()))
 
     def hears(self, volume: str) -> None:
-        """Wait until a node of this core hears what the resource says."""
+        """Wait until a node of this core receives the resource's messages."""
 
         def echo() -> bool:
             code, out, _ = self.place.run("topic", "echo", "/nose/words", "-n", "1", "--json", "--master", self.uri)
@@ -129,7 +129,7 @@ def ground(place: Place) -> Iterator[Ground]:
     yield one
     for process in one.started:
         process.end()
-    # An agent of ours is in a session of its own; by its port it is known, whoever its parent is now.
+    # The agent is in a session of its own and may have another parent by now: it is found by its port.
     left = [p for p in psutil.process_iter(["cmdline"]) if str(one.port) in (p.info["cmdline"] or [])]
     _, alive = psutil.wait_procs(left, timeout=20)
     for orphan in alive:
@@ -143,7 +143,7 @@ def agent_of(run: Process) -> psutil.Process:
     return agent
 
 
-def test_a_file_with_an_agent_of_its_own_works_and_ends_in_order(ground: Ground) -> None:
+def test_a_file_runs_with_its_own_agent_and_ends_in_order(ground: Ground) -> None:
     run = ground.run(HEAD + TALK, "--set", "volume=7")
     run.wait_for(f"nose: active on {ground.uri}", 60)
     agent = agent_of(run)
@@ -197,7 +197,7 @@ def test_a_bad_file_leaves_no_agent(ground: Ground) -> None:
     assert ground.place.run("peer", "list")[0] != 0, "no agent is left"
 
 
-def test_what_raises_harms_nobody_and_what_crashes_ends_in_order(ground: Ground) -> None:
+def test_exceptions_are_contained_and_a_crash_ends_in_order(ground: Ground) -> None:
     moody = TALK + '@nose.task(rate="2 Hz")\ndef sulk():\n    if volume.value == 5: raise OSError("no air")\n'
     crash = '@nose.task(rate="2 Hz", name="crash")\ndef crash():\n    if os.path.exists("now"): os.abort()\n'
     text = HEAD + moody + crash.replace('"now"', repr(str(ground.place.path / "now")))

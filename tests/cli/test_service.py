@@ -11,7 +11,7 @@ import pytest
 
 from rmpa.cli.main import main
 from rmpa.core.errors import RmpaError
-from rmpa.observe.snapshot import LatencySpread, ServiceInfo
+from rmpa.observe.snapshot import SampleSpread, ServiceInfo
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.service_types import ServiceType
@@ -197,7 +197,7 @@ def test_info_tells_what_crosses(
     agent: Callable[..., None],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    spread = LatencySpread(count=9, mean=0.002, sd=0, min=0.001, max=0.004, p50=0.002, p99=0.003)
+    spread = SampleSpread(count=9, mean=0.002, sd=0, min=0.001, max=0.004, p50=0.002, p99=0.003)
     services = (
         ServiceInfo(name="/add", node="/server", direction="out", policy="[services] allow", callers=("base",)),
         ServiceInfo(

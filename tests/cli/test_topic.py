@@ -216,7 +216,7 @@ def test_mistakes_are_told_before_anything_is_registered(
 
 
 def published(place: Place, *arguments: str) -> str:
-    """Publish one message, and end when it is out: what is on stderr."""
+    """Publish one message and end; return the text on stderr."""
     with place.start("topic", "pub", *arguments) as process:
         assert process.stdout is not None
         assert process.stdout.readline().startswith("published on ")

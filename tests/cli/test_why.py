@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core.errors import ConfigError
+from rmpa.observe.check import Check, CheckLevel
 from rmpa.observe.io.control_server import ControlServer, Handler
-from rmpa.observe.why.diagnosis import Diagnosis, PathStage, StageResult
+from rmpa.observe.why.diagnosis import Diagnosis
 from tests.observe.samples import SNAPSHOT
 
 if TYPE_CHECKING:
@@ -25,8 +26,8 @@ FLOWS = Diagnosis(
     node="/joy",
     flows=True,
     stages=(
-        PathStage("peer", StageResult.OK, "joystick is known"),
-        PathStage("contract", StageResult.WARN, "3 lost", "`rmpa topic info`"),
+        Check("peer", CheckLevel.OK, "joystick is known"),
+        Check("contract", CheckLevel.WARN, "3 lost", "`rmpa topic info`"),
     ),
 )
 STOPS = Diagnosis(
@@ -35,8 +36,8 @@ STOPS = Diagnosis(
     to="base",
     flows=False,
     stages=(
-        PathStage("peer", StageResult.OK, "joystick is known"),
-        PathStage("publisher", StageResult.FAIL, "no node of joystick\x1b[2J publishes /cmd", "start it"),
+        Check("peer", CheckLevel.OK, "joystick is known"),
+        Check("publisher", CheckLevel.FAIL, "no node of joystick\x1b[2J publishes /cmd", "start it"),
     ),
 )
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import psutil
 import pytest
 
-from rmpa.experiments.bed.processes import Process, eventually
+from lab.bed.processes import Process, eventually
 from rmpa.observe.io.control_client import ControlClient, choose_agent
 from rmpa.resource import ResourceClient, at_least, at_most
 from rmpa.ros.node.node import Node
@@ -129,7 +129,7 @@ def test_the_paper_s_set_up_runs_and_leaves_nothing(tidy: dict[str, str]) -> Non
     assert all(module["first_message"] > 0 for module in summary["modules"].values())
 
 
-async def test_its_modules_are_smart_resources_and_anybody_may_ask_them(tidy: dict[str, str]) -> None:
+async def test_the_demos_modules_are_smart_resources(tidy: dict[str, str]) -> None:
     async def profile(name: str, wanted: str) -> None:
         subscriber = await node.subscribe(f"/{name}/profile", "std_msgs/String")
         async with asyncio.timeout(30):
@@ -179,7 +179,7 @@ async def test_its_modules_are_smart_resources_and_anybody_may_ask_them(tidy: di
         assert await asyncio.to_thread(demo.interrupt) == 0, demo.output
 
 
-def test_a_killed_module_is_seen_gone_the_others_go_on_and_it_comes_back(tidy: dict[str, str]) -> None:
+def test_a_killed_module_is_shown_gone_and_comes_back(tidy: dict[str, str]) -> None:
     def command(*words: str) -> Process:
         return Process([sys.executable, DEMO, *words], env=tidy, name=" ".join(words))
 
@@ -253,7 +253,7 @@ def test_it_can_be_interrupted_while_it_starts(tidy: dict[str, str]) -> None:
     assert "Traceback" not in demo.output
 
 
-def test_children_die_with_a_killed_supervisor_and_the_next_demo_clears_its_files(tidy: dict[str, str]) -> None:
+def test_a_killed_demo_leaves_no_children_and_no_files(tidy: dict[str, str]) -> None:
     with Process([sys.executable, DEMO], env=tidy, name="demo") as demo:
         demo.wait_for(r"base:linked", 30)
         processes = family(demo)
@@ -261,7 +261,7 @@ def test_children_die_with_a_killed_supervisor_and_the_next_demo_clears_its_file
         os.kill(demo.pid, signal.SIGKILL)
         assert demo.wait() == -signal.SIGKILL
     assert_gone(processes, ports)
-    assert len(list(Path(tidy["TMPDIR"]).iterdir())) == 1, "nobody was left to remove it"
+    assert len(list(Path(tidy["TMPDIR"]).iterdir())) == 1, "no process was left to remove it"
     with Process([sys.executable, DEMO, "kill", "base"], env=tidy) as kill:
         assert kill.wait() == 1
         assert "no demo runs here" in kill.output
@@ -336,7 +336,7 @@ def test_wrong_flags_are_refused_plainly(tidy: dict[str, str], flags: list[str],
 
 def test_the_readme_s_commands(tidy: dict[str, str]) -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    commands = re.findall(r"^\$ make (demo\b[^#\n]*?) *(?:#.*)?$", readme, re.MULTILINE)
+    commands = list(dict.fromkeys(re.findall(r"^\$ make (demo\b[^#\n]*?) *(?:#.*)?$", readme, re.MULTILINE)))
     assert commands == ["demo", "demo-kill MODULE=base", "demo-start MODULE=base"]
     # The environment that `make` would build first is the one that these tests run in.
     make = ["make", "-C", str(ROOT), "-o", ".venv/.installed", f"BIN={Path(sys.executable).parent}"]

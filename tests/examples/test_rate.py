@@ -20,7 +20,7 @@ class Time:
         return Rate(hz, now=lambda: self.now, sleep=self.sleep)
 
 
-async def test_ticks_are_due_at_absolute_times_however_long_the_body_takes() -> None:
+async def test_ticks_are_due_at_absolute_times() -> None:
     time = Time()
     seen = []
     async for due in time.rate(10):
@@ -38,7 +38,7 @@ async def test_the_first_tick_is_at_once() -> None:
     assert time.slept == [0.0]
 
 
-async def test_a_tick_that_is_a_little_late_is_kept_and_the_next_is_on_time() -> None:
+async def test_after_a_late_tick_the_next_is_on_time() -> None:
     time = Time()
     ticks = time.rate(10)
     await anext(ticks)
@@ -49,7 +49,7 @@ async def test_a_tick_that_is_a_little_late_is_kept_and_the_next_is_on_time() ->
     assert time.now == pytest.approx(100.2)
 
 
-async def test_whole_periods_that_were_missed_are_left_out_not_made_up_in_a_burst() -> None:
+async def test_missed_periods_are_left_out() -> None:
     time = Time()
     ticks = time.rate(10)
     await anext(ticks)

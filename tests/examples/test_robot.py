@@ -24,7 +24,7 @@ def test_it_drives_from_the_moment_of_the_order() -> None:
     assert robot.pose.x == pytest.approx(0.1)
 
 
-def test_without_orders_it_stops_after_half_a_second_however_late_that_is_noticed() -> None:
+def test_it_stops_half_a_second_after_the_last_order() -> None:
     robot = Turtlebot()
     robot.order(0.4, 0.0, 10.0)
     robot.step(13.0)

@@ -80,7 +80,7 @@ def test_a_joystick_is_unplugged_and_comes_back(tmp_path: Path) -> None:
     joystick.close()
 
 
-def test_the_recorded_drive_is_a_minute_with_curves_and_ends_where_it_began() -> None:
+def test_the_recorded_drive_is_a_closed_loop_of_a_minute() -> None:
     time = [7.0]
     recording = Recording(now=lambda: time[0])
     assert len(recording.rows) == 600

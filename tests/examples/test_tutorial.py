@@ -1,4 +1,4 @@
-"""The tutorial of Smart Resources, word for word: its files, its commands, and what they print."""
+"""The tutorial of Smart Resources, word for word: its files, its commands and their output."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
+from lab.bed.processes import Process, eventually
 from rmpa.cli.run import load
 from rmpa.cli.topic_pub import read_values
-from rmpa.experiments.bed.processes import Process, eventually
 from rmpa.resource.declare.requirement_text import parse_requirement
 from tests.interop.ros import free_port
 
@@ -46,8 +46,7 @@ def test_the_readme_has_a_resource_that_can_be_run(tmp_path: Path) -> None:
     (camera,) = load(path)
     assert camera.profiles.keys() == {"small", "full"}
     sent: list[int] = []
-    outlet = SimpleNamespace(publish=lambda values, _message: sent.append(len(values["data"])))
-    camera.outputs["frames"].outlet = outlet
+    camera.outputs["frames"].on_publish = lambda values, _message: sent.append(len(values["data"]))
     for name in camera.profiles:
         camera.profiles[name].apply()
         camera.tasks["shoot"].function()
@@ -62,15 +61,15 @@ def test_the_readme_has_a_resource_that_can_be_run(tmp_path: Path) -> None:
 def test_the_keeper_says_how_close_it_keeps() -> None:
     (keeper,) = load(FILES / "keeper.py")
     seen: list[tuple[str, object]] = []
-    keeper.declared_attributes["closeness"].observer = SimpleNamespace(observe=lambda *said: seen.append(said))
-    keeper.outputs["/cmd_vel"].outlet = SimpleNamespace(publish=lambda _values, _message: None)
+    keeper.declared_attributes["closeness"].on_observation = lambda *said: seen.append(said)
+    keeper.outputs["/cmd_vel"].on_publish = lambda _values, _message: None
     for distance in (2.0, 2.05, 1.95):
         keeper.tasks["control"].function(SimpleNamespace(range=distance))
     assert seen == [("closeness", pytest.approx(jump)) for jump in (0.0, 0.05, 0.1)]
 
 
 class Terminals:
-    """A machine's terminals, in the folder of the files; its ports are free ones, its state is nobody's."""
+    """A machine's terminals, in the folder of the files; its ports are free ones, its state is empty."""
 
     def __init__(self, home: str) -> None:
         kept = {key: value for key, value in os.environ.items() if not key.startswith(("ROS_", "RMPA_", "XDG_"))}
@@ -120,7 +119,7 @@ class Terminals:
 
 
 def plain(text: str) -> str:
-    """The text without what differs from time to time: numbers, how wide columns are, empty lines."""
+    """The text without its variable parts: numbers, how wide columns are, empty lines."""
     lines = [" ".join(line.split()) for line in NUMBER.sub("N", text).splitlines()]
     return "".join(f"{line}\n" for line in lines if line)
 

@@ -52,14 +52,14 @@ def test_the_agent_tells_the_latency_of_what_has_no_header() -> None:
         assert (latency.count, latency.maximum) == (1, 0.0004)
 
 
-def test_a_silent_topic_has_no_rate_but_keeps_its_figures_in_the_summary() -> None:
+def test_a_silent_topic_keeps_its_figures_without_a_rate() -> None:
     watch = Watch(100.0)
     drive(watch, 100.0, 5.0)
     assert watch.view(108.0).topics[COMMAND].rate == 0
     assert watch.view(108.0, whole=True).topics[COMMAND].rate == pytest.approx(10)
 
 
-def test_a_lost_order_is_counted_and_the_next_one_answers_the_next_command() -> None:
+def test_a_lost_order_is_counted() -> None:
     watch = Watch(100.0)
     drive(watch, 100.0, 3.0)
     watch.message(COMMAND, 103.0)
@@ -79,7 +79,7 @@ def test_an_order_before_its_command_shifts_nothing() -> None:
     assert watch.view(104.2).command_to_velocity.maximum == pytest.approx(0.002)
 
 
-def test_a_module_is_seen_gone_and_back_and_the_outage_is_no_period() -> None:
+def test_an_outage_of_a_module_is_no_period() -> None:
     watch = Watch(100.0)
     everyone = dict.fromkeys(("joystick", "velocity", "base"), "linked")
     watch.peers(everyone, 100.2)

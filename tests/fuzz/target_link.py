@@ -6,9 +6,9 @@ from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.mesh.connection import ConnectionEvent, ConnectionProtocol, ConnectionRole, ConnectionState, HelloReceived
 from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pong
 from rmpa.mesh.handshake import Hello, Refuse
-from rmpa.mesh.link import Event, HelloReceived, LinkProtocol, LinkRole, LinkState
 
 _OURS = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")
 _THEIRS = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")
@@ -52,21 +52,21 @@ SEEDS: list[bytes] = [
 
 def fuzz(data: bytes) -> None:
     """The same bytes whole and in two pieces, to a fresh link of either role and to one that is up."""
-    for role in LinkRole:
-        for prefix in (b"", _HELLO if role is LinkRole.ACCEPTOR else _WELCOME):
+    for role in ConnectionRole:
+        for prefix in (b"", _HELLO if role is ConnectionRole.ACCEPTOR else _WELCOME):
             whole = _feed(role, [prefix + data])
             parts = _feed(role, [prefix, data[: len(data) // 2], data[len(data) // 2 :]])
             if whole != parts:
                 raise AssertionError(f"{whole} whole, but {parts} in pieces")
 
 
-def _feed(role: LinkRole, pieces: list[bytes]) -> tuple[str, int, int, list[list[object]]]:
+def _feed(role: ConnectionRole, pieces: list[bytes]) -> tuple[str, int, int, list[list[object]]]:
     """What the link says and how it ends; of parts, what they are put together."""
-    events: list[Event] = []
+    events: list[ConnectionEvent] = []
     parts: list[list[object]] = []
     data = 0
 
-    def on_event(event: Event) -> None:
+    def on_event(event: ConnectionEvent) -> None:
         events.append(event)
         if isinstance(event, HelloReceived):
             link.accept(0.0)
@@ -82,10 +82,12 @@ def _feed(role: LinkRole, pieces: list[bytes]) -> tuple[str, int, int, list[list
         else:
             parts[-1][2:] = [flags & (LAST | ABORT), bytes(parts[-1][3]) + bytes(part)]  # type: ignore[call-overload]
 
-    link = LinkProtocol(role, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event, on_data=on_data, on_part=on_part)
+    link = ConnectionProtocol(
+        role, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event, on_data=on_data, on_part=on_part
+    )
 
     def closed() -> bool:
-        return link.state is LinkState.CLOSED
+        return link.state is ConnectionState.CLOSED
 
     kept = b""
     for piece in pieces:

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rmpa.bridge.data.io.flows import ImportFlow
+from rmpa.bridge.data.io.import_flow import ImportFlow
 from rmpa.bridge.data.io.link_time import LinkTime
 from rmpa.core.contract import Contract, Reliability
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.mesh.connection import ConnectionProtocol, ConnectionRole, HelloReceived
 from rmpa.mesh.frames import WHOLE, Frame, FrameKind
 from rmpa.mesh.handshake import Hello
-from rmpa.mesh.link import HelloReceived, LinkProtocol, LinkRole
 from rmpa.ros import limits
 from tests.simulation.network import World
 from tests.simulation.process import Process
 
 if TYPE_CHECKING:
-    from rmpa.mesh.link import Event
+    from rmpa.mesh.connection import ConnectionEvent
 
 _OURS = Identity(Guid.of("10.0.0.2", 40002, 1), b"O" * 16, "ours")
 _THEIRS = Identity(Guid.of("10.0.0.1", 40001, 7), bytes(range(16)), "base")
@@ -100,7 +100,7 @@ def _fuzz(data: bytes) -> None:
     flow = ImportFlow(subscribers, contract, LinkTime(), on_ack=acknowledged.append)
     flow.begin_epoch(int(reliable), 1)
 
-    def on_event(event: Event) -> None:
+    def on_event(event: ConnectionEvent) -> None:
         if isinstance(event, HelloReceived):
             link.accept(0.0)
 
@@ -113,8 +113,8 @@ def _fuzz(data: bytes) -> None:
     def on_part(_route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
         flow.part(sequence, stamp_ns, flags, part)
 
-    link = LinkProtocol(
-        LinkRole.ACCEPTOR, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event, on_data=on_data, on_part=on_part
+    link = ConnectionProtocol(
+        ConnectionRole.ACCEPTOR, _OURS, 0.0, wall_ns=lambda: 1, on_event=on_event, on_data=on_data, on_part=on_part
     )
     link.receive(memoryview(_HELLO), 0.0)
     wire = data[1:]

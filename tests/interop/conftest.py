@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed import namespaces
-from rmpa.experiments.bed.agents import Agent
-from rmpa.experiments.bed.namespaces import MACHINE, Host, Lab
+from lab.bed import namespaces
+from lab.bed.agents import Agent
+from lab.bed.namespaces import MACHINE, Host, Lab
 from tests.interop.modules import Module
 from tests.interop.ros import Ros, free_port
 

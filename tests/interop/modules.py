@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rmpa.experiments.bed.processes import DEADLINE, Event, Process, eventually
+from lab.bed.processes import DEADLINE, Event, Process, eventually
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.agents import Agent
-    from rmpa.experiments.bed.namespaces import Host
+    from lab.bed.agents import Agent
+    from lab.bed.namespaces import Host
     from tests.interop.ros import Ros
 
 

@@ -6,7 +6,7 @@ import itertools
 import struct
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from rmpa.experiments.bed.processes import DEADLINE, Process, eventually
+from lab.bed.processes import DEADLINE, Process, eventually
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""A ROS user's shell whose nodes are those of the tests; see ``rmpa.experiments.bed.ros``."""
+"""A ROS user's shell whose nodes are those of the tests; see ``lab.bed.ros``."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import ClassVar, Final
 
-from rmpa.experiments.bed import ros
-from rmpa.experiments.bed.ros import PYTHON, environment, free_port, lacks, why_not
+from lab.bed import ros
+from lab.bed.ros import PYTHON, environment, free_port, lacks, why_not
 
 __all__ = ["NODES", "PYTHON", "Ros", "compiled", "environment", "free_port", "lacks", "why_not"]
 

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually
+from lab.bed.processes import eventually
 from tests.interop.ros import lacks
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.processes import Event, Process
+    from lab.bed.processes import Event, Process
     from tests.interop.conftest import ModuleFactory
     from tests.interop.modules import Module
 
@@ -66,7 +66,7 @@ def fed_in_order(client: Process, goal: int, *, connected: bool, since: int = 0)
 
 
 def client_in(module: Module, kind: str, name: str = "client") -> Process:
-    """An action client that is told what to do."""
+    """An action client that follows the commands of a test."""
     return module.ros.node(kind, "action_client", name=name, commands=True)
 
 
@@ -130,7 +130,7 @@ def _found_at_once(client: Process) -> bool:
     return bool(client.wait_event("server", since=since)["found"])
 
 
-def test_clients_of_several_modules_share_one_server_and_each_hears_its_own(modules: ModuleFactory) -> None:
+def test_each_of_several_clients_gets_its_own_result(modules: ModuleFactory) -> None:
     a, b, c = modules("a", "b", "c")
     clients = [client_in(a, "rospy"), client_in(c, "roscpp")]  # nodes of one name in two modules
     server = b.ros.roscpp("action_server", name="server")
@@ -147,7 +147,7 @@ def test_clients_of_several_modules_share_one_server_and_each_hears_its_own(modu
     assert "to: /rmpa/b/server" in a.ros.tool("rosnode", "info", "/client")
 
 
-def test_one_computer_gives_goals_to_two_robots_that_are_alike(modules: ModuleFactory) -> None:
+def test_one_computer_gives_goals_to_two_identical_robots(modules: ModuleFactory) -> None:
     pc, *robots = modules("pc", "r1", "r2", config='[[peer]]\nname = "r*"\nprefix = "/{peer}"\n')
     servers = [robot.ros.roscpp("action_server", name="server") for robot in robots]
     clients = [pc.ros.node(k, "action_client", name=n, action=f"/{n}/count", commands=True) for k, n in ROBOTS]

@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.experiments.bed.processes import CommandFailed, eventually
+from lab.bed.processes import CommandFailed, eventually
 from tests.interop.modules import Module, flows
 from tests.interop.ros import PYTHON
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rmpa.experiments.bed.namespaces import Host, Lab
+    from lab.bed.namespaces import Host, Lab
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
@@ -60,7 +60,7 @@ with rosbag.Bag(sys.argv[1]) as bag:
 
 
 @pytest.mark.complaint(1, 19, 20)
-def test_names_that_only_their_own_machine_knows_and_a_bag_from_the_first_message_on(
+def test_local_host_names_work_and_a_bag_has_the_first_message(
     lab: Lab, agent: AgentFactory, shell: ShellFactory
 ) -> None:
     hosts = lab.hosts("a", "b")
@@ -83,7 +83,7 @@ def test_names_that_only_their_own_machine_knows_and_a_bag_from_the_first_messag
 
 
 @pytest.mark.complaint(7)
-def test_a_bad_link_moves_no_peer_and_after_a_lost_one_it_is_back_by_itself(modules: ModuleFactory) -> None:
+def test_a_bad_link_keeps_the_peer_and_a_lost_one_comes_back(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     a.ros.roscpp("talker", topic="/chatter", rate=100)
     heard = b.ros.rospy("listener", topic="/chatter")
@@ -97,13 +97,13 @@ def test_a_bad_link_moves_no_peer_and_after_a_lost_one_it_is_back_by_itself(modu
     assert "= - publisher /chatter" not in b.agent.process.output, "it came and went"
     for _ in range(2):
         b.host.outage(3.0)
-        flows(heard, 30)  # by the same listener: nobody started anything again
+        flows(heard, 30)  # by the same listener: nothing was restarted
     assert "= - publisher /chatter" in b.agent.process.output
     assert list(b.agent.peers()) == ["a"]
 
 
 @pytest.mark.complaint(10, 13, 14)
-def test_seven_robots_of_the_same_nodes_all_hear_each_other_and_cost_nothing_at_rest(modules: ModuleFactory) -> None:
+def test_seven_identical_robots_share_topics_and_idle_cheaply(modules: ModuleFactory) -> None:
     robots = modules(*(f"r{number}" for number in range(1, ROBOTS + 1)), linked=False, log_level="info")
     for robot in robots:
         _linked_with_all(robot)

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
-from rmpa.experiments.bed.agents import RMPA
-from rmpa.experiments.bed.processes import Process, eventually
+from lab.bed.agents import RMPA
+from lab.bed.processes import Process, eventually
 from tests.interop.ros import PYTHON, lacks
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.experiments.bed.processes import Event
+    from lab.bed.processes import Event
     from tests.interop.conftest import ModuleFactory
     from tests.interop.modules import Module
 
@@ -54,7 +54,7 @@ def rmpa(module: Module, *words: str) -> str:
     return out
 
 
-def test_the_tools_of_dynamic_reconfigure_configure_it_from_another_module(pair: list[Module]) -> None:
+def test_dynamic_reconfigure_works_from_another_module(pair: list[Module]) -> None:
     robot, pc = pair
     client = pc.ros.rospy("configurer", name="far", commands=True)
     up = client.wait_event("up", LONG)

@@ -1,4 +1,4 @@
-"""What ``rmpa.toml`` says of topics holds between real nodes, and what was broken is seen by the CLI."""
+"""Contracts of ``rmpa.toml`` hold between real nodes, and the commands show what breaks them."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually
+from lab.bed.processes import eventually
 from tests.interop.modules import flows
 from tests.interop.recordings import recorded, wait_last
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rmpa.experiments.bed.processes import Process
+    from lab.bed.processes import Process
     from tests.interop.conftest import ModuleFactory
     from tests.interop.modules import Module
 
@@ -146,9 +146,7 @@ def test_transient_local_gives_late_joiners_the_last_ones(modules: ModuleFactory
 
 
 @pytest.mark.parametrize("kind", ["roscpp", "rospy"])
-def test_keep_last_depth_bounds_what_waits_for_a_stopped_subscriber(
-    modules: ModuleFactory, tmp_path: Path, kind: str
-) -> None:
+def test_depth_bounds_the_queue_of_a_stopped_subscriber(modules: ModuleFactory, tmp_path: Path, kind: str) -> None:
     a, b = modules("a", "b", config=rule("/scan", history="keep_last", depth=DEPTH))
     other = b.ros.roscpp("recorder", "__name:=other", topic="/scan", commands=True)
     stuck = b.ros.node(kind, "recorder", topic="/scan", commands=True)

@@ -25,7 +25,7 @@ Call = tuple[str, tuple[XmlRpcValue, ...]]
 
 
 class Slave:
-    """Records what a master calls; ``name`` is what it says its node's name is."""
+    """Records a master's calls; ``name`` is its answer to ``getName``."""
 
     def __init__(self) -> None:
         self.name = ""
@@ -213,7 +213,7 @@ def script(a: str, b: str, n: str) -> list[Call]:
         c("searchParam", "/ns/x", "~private"),
         c("searchParam", "no_slash", "p"),
         c("searchParam", "/", "p"),
-        # parameters that somebody follows
+        # parameters with a subscriber
         c("subscribeParam", "/a", a, "/p"),
         c("subscribeParam", "/sub", b, "/tree/below"),
         c("subscribeParam", "/sub", b, "/tree"),
@@ -272,7 +272,7 @@ def script(a: str, b: str, n: str) -> list[Call]:
 
 
 def _judged(method: str, reply: XmlRpcValue) -> XmlRpcValue:
-    """A reply without what may differ: status texts, and the texts and numbers of faults."""
+    """A reply without its variable parts: status texts, and the texts and numbers of faults."""
     match reply:
         case [int(code), str(), value]:
             return [code, value]
@@ -282,7 +282,7 @@ def _judged(method: str, reply: XmlRpcValue) -> XmlRpcValue:
 
 
 async def play(uri: str, slaves: dict[str, Slave], uris: dict[str, str]) -> tuple[list[XmlRpcValue], list[object]]:
-    """Play the script against one master; its answers, and what the slaves were called with after each step."""
+    """Play the script against one master; return its answers, and the calls of the slaves after each step."""
     for letter, slave in slaves.items():
         slave.calls, slave.fence, slave.name = [], -1, "/twin"
         await call(uri, "subscribeParam", f"/fence_{letter.lower()}", uris[letter], "/fence")
@@ -338,8 +338,8 @@ async def test_answers_and_callbacks_are_those_of_rosmaster(shell: ShellFactory)
 
 
 @pytest.mark.trap(33)
-async def test_a_parameter_kills_the_newer_node_at_rosmaster_and_not_at_ours(shell: ShellFactory) -> None:
-    """The one difference by intent: what a pushed-out roscpp node does while it ends must not hit its successor."""
+async def test_a_parameter_kills_the_newer_node_only_at_rosmaster(shell: ShellFactory) -> None:
+    """The one intended difference: a replaced roscpp node that ends must not affect its successor."""
     real = shell(port=free_port())
     real.master()
     core = RosCore(port=0, rosout=False)

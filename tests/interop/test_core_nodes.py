@@ -67,9 +67,7 @@ async def test_a_killed_node_is_gone_at_a_hint(kind: str, shell: ShellFactory) -
 
 @pytest.mark.trap(18, 31)
 @KINDS
-async def test_a_stopped_node_is_not_purged_and_hears_the_latest_when_it_goes_on(
-    kind: str, shell: ShellFactory
-) -> None:
+async def test_a_stopped_node_is_kept_and_gets_the_latest_update(kind: str, shell: ShellFactory) -> None:
     core = RosCore(port=0)
     await core.start()
     ros = shell(port=core.port)

@@ -1,4 +1,4 @@
-"""The stock tools against a core: what they print beside our core is what they print beside the real one."""
+"""The stock tools print the same with our core as with a real roscore."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.experiments.bed.processes import Process, eventually
+from lab.bed.processes import Process, eventually
 from tests.interop.ros import PYTHON, Ros, free_port
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def start_real(ros: Ros) -> Process:
 
 
 def normal(text: str) -> list[str]:
-    """A tool's lines, without what differs from run to run."""
+    """A tool's lines, without the parts that differ from run to run."""
     text = re.sub(r"\(\d+ - [^)]*\) \[\d+\]", "#", text)
     text = re.sub(r"127\.0\.0\.1:\d+|localhost:\d+", "HOST:PORT", text)
     text = re.sub(r"(?i)pid: \d+|\bport \d+|\[[^ ]*:\d+\]|time=[\d.]+ms|average: [\d.]+ms", "#", text)

@@ -7,18 +7,17 @@ from __future__ import annotations
 
 import json
 import subprocess
-from typing import TYPE_CHECKING, Final
+import sys
+from pathlib import Path
+from typing import Final
 
 import pytest
 
-from rmpa.experiments.bed.agents import RMPA
-from rmpa.experiments.registry import EXPERIMENTS
-from rmpa.experiments.store import Store
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from lab.experiments.registry import EXPERIMENTS
+from lab.experiments.store import Store
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(300)]
+ROOT: Final = Path(__file__).parents[2]
 _ONLY: Final = {"control": ("mode=event",), "scaling": ("modules=2",)}
 """What is enough to see that it works, where the short form has more."""
 _ROWS: Final = {
@@ -29,10 +28,14 @@ _ROWS: Final = {
 """Tables that must have something in them; of the others, each that there is."""
 
 
-def rmpa(*words: str | Path) -> None:
+def run(*words: str | Path) -> None:
     """Run it to a good end; none of the hosts that it made is there afterwards."""
     command = subprocess.Popen(
-        [RMPA, "experiment", *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        [sys.executable, "-m", "lab", "experiment", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=ROOT,
     )
     with command:
         try:
@@ -48,7 +51,7 @@ def rmpa(*words: str | Path) -> None:
 def test_an_experiment_measures_both_systems_and_reports(name: str, tmp_path: Path) -> None:
     out = tmp_path / "run"
     only = [word for setting in _ONLY.get(name, ()) for word in ("--only", setting)]
-    rmpa("run", name, "--short", "--client", "roscpp", "--bed", "namespaces", "--out", out, *only)
+    run("run", name, "--short", "--client", "roscpp", "--bed", "namespaces", "--out", out, *only)
 
     store = Store.load(out)
     assert store.names == [name]
@@ -57,9 +60,9 @@ def test_an_experiment_measures_both_systems_and_reports(name: str, tmp_path: Pa
     assert {cell.settings["system"] for cell, _ in results.cells} == {"classic", "rmpa"}
     for cell, measured in results.cells:
         for table in _ROWS.get(name, tuple(measured.tables)):
-            assert measured.tables[table].rows, f"{cell.key}: nothing in {table}"
+            assert not measured.tables[table].empty, f"{cell.key}: nothing in {table}"
             assert (out / name / cell.key / f"{table}.csv").is_file()
-        assert measured.tables["lateness"].rows
+        assert not measured.tables["lateness"].empty
     manifest = json.loads((out / "manifest.json").read_text(encoding="utf-8"))
     assert manifest["plan"]["size"] == "short"
     assert {"kernel", "cores", "rmpa"} <= manifest["machine"].keys()

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually
+from lab.bed.processes import eventually
 from tests.interop.modules import Module, flows
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.experiments.bed.agents import Agent
-    from rmpa.experiments.bed.namespaces import Lab
-    from rmpa.experiments.bed.processes import Process
+    from lab.bed.agents import Agent
+    from lab.bed.namespaces import Lab
+    from lab.bed.processes import Process
     from tests.interop.conftest import AgentFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
@@ -55,7 +55,7 @@ def notes(agent: Agent) -> str:
     return output
 
 
-def test_nodes_of_a_roscore_and_of_an_embedded_core_hear_each_other_and_it_is_left_clean(
+def test_roscore_and_embedded_core_exchange_topics_and_the_roscore_is_left_clean(
     joined: Callable[..., Joined],
 ) -> None:
     a, b, _ = joined()
@@ -85,7 +85,7 @@ def test_nodes_of_a_roscore_and_of_an_embedded_core_hear_each_other_and_it_is_le
     assert "/from_b" not in a.ros.tool("rostopic", "list", "-p").split()
 
 
-def test_a_new_node_is_seen_within_a_second_and_a_dead_one_crosses_no_more(joined: Callable[..., Joined]) -> None:
+def test_a_new_node_is_seen_within_a_second_and_a_dead_one_hidden(joined: Callable[..., Joined]) -> None:
     a, b, _ = joined()
     talker = a.ros.roscpp("talker", topic="/chatter", rate=100)
     a.wait_topic("/chatter")
@@ -96,10 +96,12 @@ def test_a_new_node_is_seen_within_a_second_and_a_dead_one_crosses_no_more(joine
     talker.kill()
     # The listener's subscription to the proxy goes with the proxy: only then is the topic's last name gone there.
     eventually(lambda: "/rmpa/a/talker" not in b.ros.tool("rostopic", "info", "/chatter"), what="no proxy at b")
-    assert "/chatter" in a.topics(), "rosmaster keeps what nobody unregisters, and it is not ours to change"
+    assert "/chatter" in a.topics(), (
+        "rosmaster keeps registrations, and these are not the agent's"
+    )
 
 
-def test_what_flows_outlives_the_roscore_and_the_next_one_gets_all_of_ours(joined: Callable[..., Joined]) -> None:
+def test_flows_outlive_the_roscore_and_the_next_one_gets_our_nodes(joined: Callable[..., Joined]) -> None:
     a, b, master = joined(whole=True)
     a.ros.roscpp("talker", topic="/chatter", rate=100)
     b.ros.roscpp("talker", "__name:=other", topic="/from_b", rate=10)
@@ -120,7 +122,7 @@ def test_what_flows_outlives_the_roscore_and_the_next_one_gets_all_of_ours(joine
     assert (report["gaps"], report["doubled"]) == (0, 0)
 
 
-def test_services_and_parameters_cross_and_a_local_provider_wins(joined: Callable[..., Joined]) -> None:
+def test_a_local_provider_has_precedence(joined: Callable[..., Joined]) -> None:
     a, b, _ = joined()
     a.ros.rospy("worker", "__name:=at_a", service="/work").wait_event("up")
     b.ros.roscpp("worker", "__name:=at_b", service="/far").wait_event("up")
@@ -147,7 +149,7 @@ def test_services_and_parameters_cross_and_a_local_provider_wins(joined: Callabl
     assert a.ros.tool("rosparam", "get", "/gain/p").strip() == "2.5"
 
 
-def test_one_agent_a_roscore_and_what_a_killed_one_left_is_purged(
+def test_a_second_agent_is_refused_and_a_killed_one_is_purged(
     joined: Callable[..., Joined], agent: AgentFactory
 ) -> None:
     a, b, _ = joined()

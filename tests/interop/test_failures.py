@@ -1,4 +1,4 @@
-"""Agents, nodes, cores and cables fail; everything else goes on, and what comes back is found again."""
+"""Agents, nodes, cores and cables fail; everything else goes on, and a returning part is found again."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually
+from lab.bed.processes import eventually
 from tests.interop.modules import Module, flows
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
 
 
-def test_killed_agent_is_retracted_and_its_nodes_go_on_among_themselves(modules: ModuleFactory) -> None:
+def test_a_killed_agent_is_retracted_and_its_nodes_go_on(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     a.ros.roscpp("talker", topic="/chatter", rate=100)
     at_home = a.ros.roscpp("listener", topic="/chatter")
@@ -29,7 +29,7 @@ def test_killed_agent_is_retracted_and_its_nodes_go_on_among_themselves(modules:
     assert (report["gaps"], report["doubled"]) == (0, 0)
 
 
-def test_restarted_agent_with_its_core_serves_new_nodes_and_its_peer_hears_them(modules: ModuleFactory) -> None:
+def test_a_restarted_agent_serves_new_nodes_and_its_peer(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     a.ros.roscpp("talker", "__name:=before", topic="/chatter", rate=100)
     abroad = b.ros.roscpp("listener", topic="/chatter")
@@ -85,7 +85,7 @@ def test_killed_listener_ends_the_demand(modules: ModuleFactory) -> None:
     assert "Subscribers: None" not in a.ros.tool("rostopic", "info", "/chatter")
     heard.kill()
     eventually(
-        lambda: "Subscribers: None" in a.ros.tool("rostopic", "info", "/chatter"), what="nobody listens to the talker"
+        lambda: "Subscribers: None" in a.ros.tool("rostopic", "info", "/chatter"), what="the talker has no listener"
     )
 
 
@@ -169,7 +169,7 @@ def test_mismatched_types_are_refused_loudly_on_both_sides(modules: ModuleFactor
 
 
 def _wait_no_publisher(module: Module, topic: str) -> None:
-    """Wait until nobody publishes a topic in a module's graph (a listener there may keep its name alive)."""
+    """Wait until a topic has no publisher in a module's graph (a listener there may keep its name alive)."""
 
     def gone() -> bool:
         with module.ros.start("rostopic", "info", topic) as info:

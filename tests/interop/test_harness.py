@@ -1,4 +1,4 @@
-"""The harness itself: nodes, shells and labs do what the other tests take for granted."""
+"""The harness itself: nodes, shells and labs behave as the other tests expect."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed import namespaces
-from rmpa.experiments.bed.agents import NotifySocket
-from rmpa.experiments.bed.namespaces import Lab
-from rmpa.experiments.bed.processes import Deadline, Process, eventually, run
+from lab.bed import namespaces
+from lab.bed.agents import NotifySocket
+from lab.bed.namespaces import Lab
+from lab.bed.processes import Deadline, Process, eventually, run
 
 if TYPE_CHECKING:
     from collections.abc import Callable

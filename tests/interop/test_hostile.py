@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.bed.processes import Process, eventually, run
 from rmpa.core import limits
-from rmpa.experiments.bed.processes import Process, eventually, run
 from rmpa.observe.io.control_client import ControlClient
 from tests.interop.modules import Module, flows
 from tests.interop.ros import NODES
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.namespaces import Lab
+    from lab.bed.namespaces import Lab
     from rmpa.observe.snapshot import Snapshot
     from tests.interop.conftest import ModuleFactory
 
@@ -117,7 +117,7 @@ def test_forged_beacons_from_another_host(modules: ModuleFactory, lab: Lab) -> N
     siege.held()
 
 
-def test_a_peer_that_breaks_the_protocol_behind_a_good_handshake(modules: ModuleFactory, lab: Lab) -> None:
+def test_a_peer_that_breaks_the_protocol_is_dropped(modules: ModuleFactory, lab: Lab) -> None:
     siege = Siege(modules)
     evil = siege.a.ros.rospy("listener", topic="/evil", type="String")
     evil.wait_event("up")

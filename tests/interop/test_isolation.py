@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.experiments.bed.ros import NODES
+from lab.bed.ros import NODES
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rmpa.experiments.bed.processes import Event, Process
+    from lab.bed.processes import Event, Process
     from tests.interop.conftest import ModuleFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]

@@ -1,4 +1,4 @@
-"""Messages of tens of megabytes between real nodes: each byte right, and never a half one, whoever dies meanwhile."""
+"""Messages of tens of megabytes between real nodes: whole, or not at all if a process dies."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually
+from lab.bed.processes import eventually
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.namespaces import Host
-    from rmpa.experiments.bed.processes import Event, Process
+    from lab.bed.namespaces import Host
+    from lab.bed.processes import Event, Process
     from tests.interop.conftest import ModuleFactory
     from tests.interop.modules import Module
 
@@ -107,7 +107,7 @@ def test_each_byte_arrives(modules: ModuleFactory, tmp_path: Path, sending: str)
         assert len(md5s(folder)) == 2
 
 
-def test_a_publisher_that_dies_in_the_middle_leaves_no_half_message(modules: ModuleFactory, tmp_path: Path) -> None:
+def test_a_publisher_that_dies_leaves_no_half_message(modules: ModuleFactory, tmp_path: Path) -> None:
     a, b = modules("a", "b")
     heard = listeners_at(b, tmp_path)
     dying = a.ros.roscpp("teller", topic="/large", wait=1, commands=True)
@@ -119,7 +119,7 @@ def test_a_publisher_that_dies_in_the_middle_leaves_no_half_message(modules: Mod
     follows(a, heard, told)
 
 
-def test_an_agent_that_dies_in_the_middle_leaves_no_half_message(modules: ModuleFactory, tmp_path: Path) -> None:
+def test_an_agent_that_dies_leaves_no_half_message(modules: ModuleFactory, tmp_path: Path) -> None:
     a, b = modules("a", "b")
     heard = listeners_at(b, tmp_path)
     sender = a.ros.roscpp("teller", topic="/large", wait=1, commands=True)

@@ -1,4 +1,4 @@
-"""Latched topics (/tf_static, a map): kept for each source, replayed to who comes late, never lost or doubled."""
+"""Latched topics (/tf_static, a map): kept for each source, replayed to late subscribers, never lost or doubled."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually
+from lab.bed.processes import eventually
 from tests.interop.modules import Module, flows
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.namespaces import Lab
-    from rmpa.experiments.bed.processes import Event, Process
+    from lab.bed.namespaces import Lab
+    from lab.bed.processes import Event, Process
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
@@ -36,7 +36,7 @@ def once(report: Event) -> None:
 
 
 def last(listener: Process) -> Event:
-    """What a listener has said last."""
+    """The last output of a listener."""
     return listener.events("report")[-1]
 
 
@@ -61,12 +61,12 @@ def test_all_latched_sources_reach_each_late_joiner_once(
     once(got(hears(d, "roscpp")))
     # The stock tool, which joins late by nature.
     assert a.ros.tool("rostopic", "echo", "-n4", TF).count("layout:") == 4
-    # Whoever came first was not told again.
+    # The first subscribers did not get it again.
     for listener in (early, *late):
         once(last(listener))
 
 
-def test_who_has_a_latched_message_does_not_get_it_again_when_the_link_is_back(modules: ModuleFactory) -> None:
+def test_a_latched_message_is_not_repeated_when_the_link_is_back(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     for kind, source, size in (("rospy", 1, 300), ("roscpp", 2, 2_000_000)):
         a.ros.node(kind, "talker", topic=TF, count=1, latch=True, source=source, size=size).wait_event("done")

@@ -1,4 +1,4 @@
-"""Who comes later finds what is there, whatever the order of agents and nodes."""
+"""Late agents and nodes find the earlier ones, in any order of starting."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from tests.interop.modules import Module, flows, whole
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.namespaces import Lab
+    from lab.bed.namespaces import Lab
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
@@ -44,9 +44,7 @@ def test_nodes_that_wait_for_their_master_find_the_agent(
     assert flows(programs["listener"], 5)["bad"] == 0
 
 
-def test_a_seed_reaches_across_a_router_where_multicast_does_not(
-    lab: Lab, agent: AgentFactory, shell: ShellFactory
-) -> None:
+def test_a_seed_reaches_across_a_router(lab: Lab, agent: AgentFactory, shell: ShellFactory) -> None:
     near, far = lab.host("near", 0), lab.host("far", 1)
     router = lab.router(0, 1)
     lab.route(near, router)

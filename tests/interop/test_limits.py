@@ -1,4 +1,4 @@
-"""Limits with real nodes and stock tools: what is beyond them is told, and nothing else suffers."""
+"""Limits with real nodes and stock tools: what exceeds them is reported, and nothing else is affected."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually
+from lab.bed.processes import eventually
 from tests.interop.ros import PYTHON
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from rmpa.experiments.bed.agents import Agent
+    from lab.bed.agents import Agent
     from tests.interop.conftest import AgentFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
@@ -39,9 +39,7 @@ def beyond(agent: Agent, peer: str) -> list[dict[str, Any]]:
     return found
 
 
-def test_nodes_beyond_the_limit_are_told_at_both_ends_and_come_with_a_reload(
-    agent: AgentFactory, shell: ShellFactory
-) -> None:
+def test_nodes_beyond_the_limit_are_reported_at_both_ends(agent: AgentFactory, shell: ShellFactory) -> None:
     far = agent(name="far")
     near = agent(name="near", config="[limits]\nnodes = 2\n")
     far.wait_peer("near")

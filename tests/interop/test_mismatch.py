@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually
+from lab.bed.processes import eventually
 from tests.interop.modules import flows
 from tests.interop.ros import lacks
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.processes import Process
+    from lab.bed.processes import Process
     from tests.interop.conftest import ModuleFactory
     from tests.interop.modules import Module
 
@@ -46,7 +46,7 @@ def mismatches(module: Module) -> list[str]:
 
 
 def mended(module: Module) -> None:
-    """Wait until nothing is said any more."""
+    """Wait until the mismatch is no longer reported."""
     eventually(lambda: not mismatches(module), what=f"nothing wrong at {module.name}")
 
 
@@ -57,7 +57,7 @@ def diagnostics(module: Module) -> Process:
 
 @pytest.mark.trap(1)
 @pytest.mark.parametrize("kind", ["rospy", "roscpp"])
-def test_another_md5_is_refused_at_both_ends_until_it_is_mended(modules: ModuleFactory, kind: str) -> None:
+def test_another_md5_is_refused_at_both_ends(modules: ModuleFactory, kind: str) -> None:
     a, b = modules("a", "b")
     steady = b.ros.roscpp("listener", topic="/steady")
     a.ros.roscpp("talker", topic="/steady", rate=100, wait=1)
@@ -77,7 +77,7 @@ def test_another_md5_is_refused_at_both_ends_until_it_is_mended(modules: ModuleF
     assert (report["gaps"], report["doubled"], report["bad"]) == (0, 0, 0)
 
 
-def test_another_type_is_refused_at_both_ends_until_it_is_mended(modules: ModuleFactory) -> None:
+def test_another_type_is_refused_at_both_ends(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     steady = b.ros.roscpp("listener", topic="/steady")
     a.ros.roscpp("talker", topic="/steady", rate=100, wait=1)

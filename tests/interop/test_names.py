@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually
+from lab.bed.processes import eventually
 from tests.interop.modules import Module, flows
 from tests.interop.ros import lacks
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.namespaces import Lab
+    from lab.bed.namespaces import Lab
     from tests.interop.conftest import AgentFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
@@ -50,9 +50,7 @@ def fleet(lab: Lab, agent: AgentFactory, shell: ShellFactory, *names: str) -> li
 
 
 @pytest.mark.skipif(bool(lacks("actionlib")), reason=lacks("actionlib"))
-def test_one_computer_works_with_two_robots_that_are_all_alike(
-    lab: Lab, agent: AgentFactory, shell: ShellFactory
-) -> None:
+def test_one_computer_works_with_two_identical_robots(lab: Lab, agent: AgentFactory, shell: ShellFactory) -> None:
     pc, *robots = fleet(lab, agent, shell, "pc", "robot1", "robot2")
     hearing = {}
     for number, robot in enumerate(robots, 1):

@@ -1,4 +1,4 @@
-"""Nodes that are killed, cannot be reached, or live behind somebody else's address, and what users see of it."""
+"""Nodes that are killed, cannot be reached, or have another node's address, and what users see of it."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually
+from lab.bed.processes import eventually
 from rmpa.observe.io.control_client import ControlClient
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.namespaces import Lab
+    from lab.bed.namespaces import Lab
     from rmpa.observe.snapshot import PeerInfo
     from tests.interop.conftest import AgentFactory, ModuleFactory
 

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.agents import RMPA
-from rmpa.experiments.bed.processes import Process, eventually
+from lab.bed.agents import RMPA
+from lab.bed.processes import Process, eventually
 from tests.interop.modules import Module
 from tests.interop.ros import free_port
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rmpa.experiments.bed.namespaces import Lab
+    from lab.bed.namespaces import Lab
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
     from tests.interop.ros import Ros
 
@@ -169,7 +169,7 @@ def test_followed_parameters(configured: Configured, tmp_path: Path) -> None:
     (tmp_path / "big").write_text("<x a='1'/>\n" * 300_000)
     a.ros.tool("rosparam", "set", "/big", "-t", str(tmp_path / "big"))
     eventually(lambda: "/big" in b.ros.tool("rosparam", "list").split(), what="the large one")
-    # One owner: what is set here is put back, and said; nobody else sets it either.
+    # One owner: a value that is set here or by another peer is put back, with a warning.
     b.ros.tool("rosparam", "set", description, "mine")
     b.agent.process.wait_for(f"{description} was changed here, and is put back: it belongs to a")
     has(b, description, "one")
@@ -201,7 +201,7 @@ def test_time_comes_from_one_simulator(configured: Configured) -> None:
     assert float(str(told["now"])) < 2000, "the simulator's time, not the wall's"
     # Half a second of it is an eighth of one here.
     sleeper.wait_event("time", where=lambda e: float(str(e["took"])) < 0.4)
-    # Nobody else has it: not who asks one that does not share, whatever that one has itself.
+    # A module that does not share its time gives it to no follower, even if it follows another one.
     assert "/clock" not in other.topics()
     assert "time comes from sim here" in json.loads(param(other, "followed", "--json"))[0]["problem"]
     assert "/use_sim_time is not followed: time comes from sim here" in other.agent.rmpa("peer", "list")[1]
@@ -213,7 +213,7 @@ def test_time_comes_from_one_simulator(configured: Configured) -> None:
     assert [end["remote_node"] for end in json.loads(output)["publishers"]] == ["/simulator"]
     now = sleeper.wait_event("time", since=sleeper.mark_events())
     assert float(str(now["now"])) < 9000
-    # Whom to follow may change while the agent runs.
+    # The module that is followed may change while the agent runs.
     path = other.agent.home / f"{other.name}.toml"
     path.write_text(path.read_text().replace('"robot"', '"sim"'))
     code, output = other.agent.rmpa("reload")

@@ -1,4 +1,4 @@
-"""A path that drops large packets without a word: images arrive all the same, and the user is told."""
+"""A path that silently drops large packets: images still arrive, and the user is informed."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually
-from rmpa.experiments.bed.ros import PYTHON
+from lab.bed.processes import eventually
+from lab.bed.ros import PYTHON
 from tests.interop.modules import Module, flows
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.namespaces import Host, Lab
+    from lab.bed.namespaces import Host, Lab
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [
@@ -39,7 +39,7 @@ HEALED = 15.0
 
 
 def drop_large(host: Host, above: int = 1400) -> None:
-    """Drop what comes by the cable in larger packets, as a tunnel does whose ICMP messages are lost."""
+    """Drop larger packets from the cable, as a tunnel does whose ICMP messages are lost."""
     chain = "type filter hook input priority 0"
     rules = f"table inet hole {{\n chain in {{\n {chain}\n iifname eth0 meta length > {above} drop\n }}\n }}\n"
     subprocess.run(host.command(["nft", rules]), check=True, capture_output=True, timeout=20)
@@ -95,7 +95,7 @@ def told(a: Module, b: Module) -> None:
 
 
 def test_a_path_that_becomes_narrow_takes_images_on(modules: ModuleFactory) -> None:
-    """A route that changes to a tunnel: what flowed in large packets goes on in small ones."""
+    """A route that changes to a tunnel: topics that flowed in large packets go on in small ones."""
     a, b = modules("a", "b", log_level="info")
     eye = b.ros.roscpp("listener", "__name:=eye", topic="/image")
     a.ros.roscpp("talker", "__name:=camera", topic="/image", size=IMAGE, rate=5)

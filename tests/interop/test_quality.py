@@ -1,4 +1,4 @@
-"""What the agent measures of topics that cross, between real nodes; and what the stock tools read of it."""
+"""The agent's figures of topics between real nodes, and the stock tools' view of them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually
+from lab.bed.processes import eventually
 from tests.interop.modules import flows
 from tests.interop.ros import PYTHON
 
@@ -86,7 +86,7 @@ def test_hz_bw_and_delay_tell_them_too_without_a_header(modules: ModuleFactory) 
     assert f"by the link's clock, from {a.name} " in output
 
 
-def test_an_outage_of_a_reliable_topic_is_seen_while_it_lasts_and_after(modules: ModuleFactory) -> None:
+def test_an_outage_of_a_reliable_topic_is_reported(modules: ModuleFactory) -> None:
     rule = '[[contract]]\ntopics = ["/chatter"]\nreliability = "reliable"\ndeadline = "300 ms"\n'
     a, b = streaming(modules, rule)
     assert route_of(b, "/chatter")["contract"] == {"reliability": "reliable", "deadline": 0.3}

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.experiments.bed.agents import RMPA
-from rmpa.experiments.bed.processes import Process
+from lab.bed.agents import RMPA
+from lab.bed.processes import Process
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.agents import Agent
-    from rmpa.experiments.bed.namespaces import Lab
+    from lab.bed.agents import Agent
+    from lab.bed.namespaces import Lab
     from tests.interop.conftest import AgentFactory, ShellFactory
 
 pytestmark = [pytest.mark.netns, pytest.mark.timeout(120)]

@@ -1,4 +1,4 @@
-"""``rmpa up --realtime``: what the kernel says of the process, with the rights and without."""
+"""``rmpa up --realtime``: the kernel's view of the process, with the rights and without."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.experiments.bed.namespaces import Host
-from rmpa.experiments.bed.processes import eventually
+from lab.bed.namespaces import Host
+from lab.bed.processes import eventually
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rmpa.experiments.bed.agents import Agent
+    from lab.bed.agents import Agent
     from tests.interop.conftest import AgentFactory
 
 FIFO: Final = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
@@ -77,7 +77,7 @@ def runs(prefix: Sequence[str]) -> bool:
 
 
 needs_rights = pytest.mark.skipif(not may(23, 14), reason="takes CAP_SYS_NICE and CAP_IPC_LOCK")
-needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="takes root, to become somebody else")
+needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to become another user")
 
 
 @pytest.fixture
@@ -128,13 +128,13 @@ def test_the_file_says_how_much_of_it(agent: AgentFactory) -> None:
 
 
 @needs_root
-def test_root_without_the_capabilities_is_told_and_the_agent_runs_on(agent: AgentFactory) -> None:
+def test_root_without_capabilities_gets_a_warning(agent: AgentFactory) -> None:
     if not runs(WITHOUT_RIGHTS):
         pytest.skip("capabilities cannot be dropped here")
     made = agent(Prefixed("bare", "", prefix=WITHOUT_RIGHTS), flags=["--realtime"])
     told_what_to_do(made, "root")
     made.wait_peer(agent().name)
-    # Their own words are said once; whoever asks is reminded of them.
+    # The log says it once; the commands repeat it.
     assert len(said(made, "warning")) == 2
     code, output = made.rmpa("peer", "list")
     assert code == 0
@@ -144,7 +144,7 @@ def test_root_without_the_capabilities_is_told_and_the_agent_runs_on(agent: Agen
 @needs_root
 def test_any_user_is_told_and_the_agent_runs_on(agent: AgentFactory, home_of_nobody: Path) -> None:
     if not runs(AS_NOBODY):
-        pytest.skip("nobody but root can run this rmpa")
+        pytest.skip("only root can run this rmpa")
     made = agent(
         Prefixed("user", "", prefix=AS_NOBODY), ready=False, flags=["--realtime"], runtime_dir=home_of_nobody
     )

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually
+from lab.bed.processes import eventually
 from tests.interop.recordings import recorded, wait_last
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rmpa.experiments.bed.processes import Process
+    from lab.bed.processes import Process
     from tests.interop.conftest import ModuleFactory
     from tests.interop.modules import Module
 
@@ -111,9 +111,7 @@ def test_large_reliable_messages_survive_too(modules: ModuleFactory, tmp_path: P
         assert sequences == list(range(last - 59, last + 1)), jumps(sequences)
 
 
-def test_an_outage_longer_than_the_buffer_is_told_with_the_exact_count(
-    modules: ModuleFactory, tmp_path: Path
-) -> None:
+def test_losses_beyond_the_buffer_are_counted_exactly(modules: ModuleFactory, tmp_path: Path) -> None:
     a, b = modules("a", "b", config=contract(depth=500))
     heard = recorders(b)
     teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)
@@ -140,9 +138,7 @@ def test_an_outage_longer_than_the_buffer_is_told_with_the_exact_count(
     b.agent.process.wait_for(rf"(?i)warning.*/chatter.*\b{missing[0]} messages lost")
 
 
-def test_an_outage_longer_than_the_contracts_is_told_exactly_at_both_ends(
-    modules: ModuleFactory, tmp_path: Path
-) -> None:
+def test_losses_of_a_long_outage_are_exact_at_both_ends(modules: ModuleFactory, tmp_path: Path) -> None:
     a, b = modules("a", "b", config=contract(100_000, 'outage = "2 s"\n'))
     heard = recorders(b)
     teller = a.ros.roscpp("teller", topic="/chatter", nodelay=True, wait=1, commands=True)

@@ -1,4 +1,4 @@
-"""Settings that are read again while data flows: what they are about changes, and nothing else notices."""
+"""Settings that are read again while data flows: only what they concern changes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.interop.modules import Module, flows, whole
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rmpa.experiments.bed.namespaces import Lab
+    from lab.bed.namespaces import Lab
     from tests.interop.conftest import AgentFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
@@ -48,7 +48,7 @@ def connection(module: Module, node: str) -> str:
     return str(found)
 
 
-def test_rules_change_under_a_stream_at_100_hz_that_loses_nothing(
+def test_a_reload_loses_no_message_of_a_stream(
     lab: Lab, agent: AgentFactory, shell: ShellFactory, tmp_path: Path
 ) -> None:
     a, b = (

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.experiments.bed.agents import RMPA, Agent
-from rmpa.experiments.bed.processes import Event, Process, eventually
+from lab.bed.agents import RMPA, Agent
+from lab.bed.processes import Event, Process, eventually
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.experiments.bed.namespaces import Host, Lab
+    from lab.bed.namespaces import Host, Lab
     from tests.interop.conftest import ShellFactory
     from tests.interop.ros import Ros
 
@@ -26,7 +26,7 @@ pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
 RESOURCES: Final = Path(__file__).parent / "resources"
 OK, WARN, ERROR, STALE = range(4)
 LONG: Final = 40.0
-"""Seconds for what takes windows, cool-downs and routes, on a machine that is shared."""
+"""Seconds for windows, cool-downs and routes on a shared machine."""
 
 
 @dataclass
@@ -47,7 +47,7 @@ class Running:
         return self.process
 
     def end(self) -> None:
-        """Make sure that it is gone; what it said is shown where the test fails."""
+        """Make sure that it is gone; a failing test shows its output."""
         if self.process is not None:
             self.process.end()
             print(self.process.output[-8000:])
@@ -89,7 +89,7 @@ def runs(node: Process, profile: str, since: int = 0) -> None:
     node.wait_event("profile", LONG, where=lambda e: e["name"] == profile, since=since)
 
 
-def test_a_degraded_link_is_adapted_to_and_what_cannot_be_is_said(pair: tuple[Running, Running]) -> None:
+def test_a_resource_adapts_to_a_degraded_link(pair: tuple[Running, Running]) -> None:
     camera, viewer = pair
     camera.start()
     viewer.start()

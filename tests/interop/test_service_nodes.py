@@ -18,7 +18,7 @@ from tests.interop.nodes.payload import Pattern
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from rmpa.experiments.bed.processes import Process
+    from lab.bed.processes import Process
     from tests.interop.conftest import ShellFactory
     from tests.interop.ros import Ros
 
@@ -61,7 +61,7 @@ async def work(request: Any) -> Any:
 
 
 async def order(caller: Process, words: str) -> dict[str, Any]:
-    """Have a caller call; what came of it."""
+    """Make a caller call, and return the outcome."""
     since = caller.mark_events()
     caller.tell(words)
     return dict(await caller.expect_event("done", DEADLINE, since=since))

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.processes import CommandFailed, eventually
+from lab.bed.processes import CommandFailed, eventually
 from tests.interop.ros import PYTHON
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.namespaces import Lab
-    from rmpa.experiments.bed.processes import Event, Process
+    from lab.bed.namespaces import Lab
+    from lab.bed.processes import Event, Process
     from tests.interop.conftest import ModuleFactory, ShellFactory
     from tests.interop.modules import Module
     from tests.interop.ros import Ros
@@ -49,7 +49,7 @@ def _caller(module: Module, kind: str, service: str, **options: object) -> Proce
 
 
 def _calls(caller: Process, line: str, timeout: float = 20.0) -> Event:
-    """Let a caller make calls as of its line; what came of them."""
+    """Make a caller make the calls of its line, and return the outcomes."""
     since = caller.mark_events()
     caller.tell(line)
     return caller.wait_event("done", timeout, since=since)
@@ -111,7 +111,7 @@ def test_a_server_that_is_killed_in_the_middle_of_a_call(modules: ModuleFactory)
     assert _calls(caller, "echo 0 10 2 persistent")["same"] == 2
 
 
-def test_a_killed_server_is_gone_everywhere_within_a_second_though_nobody_calls(modules: ModuleFactory) -> None:
+def test_a_killed_server_is_gone_everywhere_within_a_second(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     worker = _worker(a, "roscpp", "/work")
     _wait_services(b.ros, "/work")
@@ -146,7 +146,7 @@ def test_a_server_that_hangs_costs_one_deadline(modules: ModuleFactory) -> None:
     assert _calls(caller, "echo 0 10 2 once")["same"] == 2
 
 
-def test_a_lost_link_fails_calls_at_once_and_one_that_is_back_brings_services(modules: ModuleFactory) -> None:
+def test_a_lost_link_fails_calls_and_its_return_restores_services(modules: ModuleFactory) -> None:
     a, b = modules("a", "b")
     worker = _worker(a, "rospy", "/work", quiet=False)
     caller = _caller(b, "rospy", "/work")

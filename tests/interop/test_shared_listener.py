@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.bed.agents import Agent
+from lab.bed.processes import DEADLINE, eventually, run
 from rmpa.core.counters import Counters
-from rmpa.experiments.bed.agents import Agent
-from rmpa.experiments.bed.processes import DEADLINE, eventually, run
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.node.shared_listener import SharedListener
@@ -25,7 +25,7 @@ from tests.interop.ros import PYTHON
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rmpa.experiments.bed.namespaces import Host, Lab
+    from lab.bed.namespaces import Host, Lab
     from tests.interop.conftest import AgentFactory, ShellFactory
     from tests.interop.ros import Ros
 
@@ -62,7 +62,7 @@ class Proxy:
         self.node.add_publication(self.publication)
 
     async def appear(self, subscribers: int) -> None:
-        """Be in the graph, and wait for who listens."""
+        """Register in the graph, and wait for subscribers."""
         await self.node.start()
         self._core.call("registerPublisher", "/proxy", "/chatter", BYTES, self.node.uri)
         async with asyncio.timeout(DEADLINE):
@@ -151,9 +151,7 @@ def addresses(ros: Ros, *nodes: str) -> list[tuple[str, int]]:
 @pytest.mark.ros
 @pytest.mark.netns
 @pytest.mark.timeout(120)
-def test_proxies_share_two_sockets_that_only_their_own_machine_reaches(
-    lab: Lab, agent: AgentFactory, shell: ShellFactory, tmp_path: Path
-) -> None:
+def test_proxies_share_two_local_sockets(lab: Lab, agent: AgentFactory, shell: ShellFactory, tmp_path: Path) -> None:
     a, b, c = lab.hosts("a", "b", "c")
     c.ip("address", "replace", "127.0.0.1/32", "dev", "lo")
     c.ip("address", "del", "127.0.0.1/8", "dev", "lo")

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually
+from lab.bed.processes import eventually
 from tests.interop.modules import flows
 from tests.interop.recordings import recorded, wait_last
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.processes import Process
+    from lab.bed.processes import Process
     from tests.interop.conftest import ModuleFactory
     from tests.interop.modules import Module
 

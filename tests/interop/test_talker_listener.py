@@ -1,4 +1,4 @@
-"""The main job: a node publishes on one machine, a node receives on another, and nobody configured an address."""
+"""The main job: a node publishes on one machine, a node receives on another, without a configured address."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from tests.interop.modules import flows, whole
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.processes import Event
+    from lab.bed.processes import Event
     from tests.interop.conftest import ModuleFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(120)]
@@ -37,7 +37,7 @@ def test_both_directions_at_once(modules: ModuleFactory, client: str) -> None:
 
 
 @pytest.mark.trap(37)
-def test_one_topic_published_and_heard_everywhere_neither_loops_nor_doubles(modules: ModuleFactory) -> None:
+def test_a_topic_that_is_published_everywhere_does_not_loop(modules: ModuleFactory) -> None:
     everyone = modules("a", "b", "c")
     hears = [module.ros.roscpp("listener", topic="/shared") for module in everyone]
     for source, module in enumerate(everyone, start=1):

@@ -27,7 +27,7 @@ from tests.interop.ros import PYTHON
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from rmpa.experiments.bed.processes import Process
+    from lab.bed.processes import Process
     from rmpa.ros.node.node import Publisher, Received
     from tests.interop.conftest import ShellFactory
     from tests.interop.ros import Ros
@@ -205,9 +205,7 @@ async def test_trap_2_rosbag_records_our_definition_byte_for_byte(node: Node, ro
 
 @pytest.mark.trap(5)
 @libraries
-async def test_trap_5_a_listener_of_another_type_is_refused_and_gets_nothing(
-    node: Node, ros: Ros, library: str
-) -> None:
+async def test_trap_5_a_listener_of_another_type_is_refused(node: Node, ros: Ros, library: str) -> None:
     publisher = await node.advertise("/chatter", "std_msgs/Int32", latch=True)
     publisher.publish(publisher.make(7))
     listener = ros.node(library, "listener", name="wrong")
@@ -243,7 +241,7 @@ async def test_a_real_listener_waits_while_the_type_is_not_known(core: RosCore, 
 
 @pytest.mark.trap(16)
 @libraries
-async def test_trap_16_a_withdrawn_topic_is_left_by_real_listeners_and_found_again(
+async def test_trap_16_listeners_leave_a_withdrawn_topic_and_find_it_again(
     node: Node, ros: Ros, library: str
 ) -> None:
     publisher = await node.advertise("/chatter", BYTES)
@@ -340,7 +338,7 @@ async def test_rosnode_kill_ends_our_node(core: RosCore, ros: Ros) -> None:
         assert "/t" not in core.state().publishers
 
 
-async def test_definitions_and_sums_are_those_of_the_installed_packages(ros: Ros) -> None:
+async def test_definitions_and_sums_match_the_installed_packages(ros: Ros) -> None:
     program = (
         "import glob, importlib, json\n"
         "found = {}\n"

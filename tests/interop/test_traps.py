@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from lab.bed.processes import eventually
 from rmpa.bridge.actions import Describe, Publish
 from rmpa.bridge.messages import Description as About
 from rmpa.bridge.messages import Source
 from rmpa.bridge.topics.io.proxies import PeerProxies
 from rmpa.core.contract import Contract
 from rmpa.core.outbox import ABORT, FIRST, LAST
-from rmpa.experiments.bed.processes import eventually
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
 from rmpa.ros.http.client import call_api
@@ -33,8 +33,8 @@ from tests.ros.node.peers import RawSubscriber
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from rmpa.experiments.bed.agents import Agent
-    from rmpa.experiments.bed.processes import Process
+    from lab.bed.agents import Agent
+    from lab.bed.processes import Process
     from tests.interop.conftest import AgentFactory, ShellFactory
     from tests.interop.ros import Ros
 
@@ -84,7 +84,7 @@ async def until(condition: Callable[[], object]) -> None:
 
 @pytest.mark.trap(3)
 @libraries
-async def test_only_rospy_sends_a_definition_along_and_both_are_served(core: RosCore, ros: Ros, library: str) -> None:
+async def test_only_rospy_subscribers_send_a_definition(core: RosCore, ros: Ros, library: str) -> None:
     async with node("ours", core) as ours:
         publisher = await ours.advertise("/chatter", BYTES, latch=True)
         publisher.publish_raw(framed(Pattern(64).payload(1, 1)))
@@ -98,7 +98,7 @@ async def test_only_rospy_sends_a_definition_along_and_both_are_served(core: Ros
 
 @pytest.mark.trap(12)
 @libraries
-async def test_a_second_connection_of_one_caller_id_closes_the_first_at_rospy(
+async def test_rospy_closes_the_first_of_two_connections_of_one_caller_id(
     core: RosCore, ros: Ros, library: str
 ) -> None:
     ros.node(library, "talker", name="talker", rate=50)
@@ -127,7 +127,7 @@ async def test_a_second_connection_of_one_caller_id_closes_the_first_at_rospy(
 
 
 @pytest.mark.trap("16a")
-async def test_publishers_that_come_at_one_moment_are_all_heard_and_nothing_is_refused(
+async def test_publishers_that_start_at_once_are_all_heard(
     core: RosCore, ros: Ros, caplog: pytest.LogCaptureFixture
 ) -> None:
     """rospy answers the two lists by connecting twice to one publisher, and hangs one up, perhaps headerless."""
@@ -172,7 +172,7 @@ async def test_messages_of_no_bytes_go_both_ways(core: RosCore, ros: Ros) -> Non
 
 @pytest.mark.trap(14)
 @libraries
-async def test_listeners_come_back_when_a_remote_publisher_has_another_header(
+async def test_listeners_follow_a_remote_publisher_with_a_new_header(
     core: RosCore, ros: Ros, library: str, closing: AsyncExitStack
 ) -> None:
     """They are promised another definition by hanging up; rospy comes again only if the master names the proxy."""
@@ -185,7 +185,7 @@ async def test_listeners_come_back_when_a_remote_publisher_has_another_header(
 
 @pytest.mark.trap(14)
 @libraries
-async def test_listeners_that_were_hung_up_on_in_the_middle_of_a_message_come_back(
+async def test_listeners_cut_off_within_a_message_come_back(
     core: RosCore, ros: Ros, library: str, closing: AsyncExitStack
 ) -> None:
     """A remote publisher was killed in the middle of an image: TCPROS cannot take half of it back."""
@@ -273,7 +273,7 @@ def topics(ros: Ros) -> set[str]:
 
 
 @pytest.mark.trap(12)
-def test_two_peers_and_two_listeners_each_are_one_connection_to_a_rospy_talker(
+def test_many_remote_listeners_are_one_connection_to_a_rospy_talker(
     two: Two, agent: AgentFactory, shell: ShellFactory
 ) -> None:
     c = agent(name="c")
@@ -294,8 +294,8 @@ def test_two_peers_and_two_listeners_each_are_one_connection_to_a_rospy_talker(
 
 @pytest.mark.trap(14)
 @libraries
-def test_a_listener_stays_connected_when_another_node_takes_the_talkers_name(two: Two, library: str) -> None:
-    """Its header differs (it latches), so the subscribers must be hung up on; rospy comes again only if told to."""
+def test_a_listener_stays_when_another_node_takes_the_talkers_name(two: Two, library: str) -> None:
+    """Its header differs (it latches), so subscribers must be disconnected; rospy reconnects only when notified."""
     heard = two.at_b.node(library, "listener")
     older = two.at_a.roscpp("talker", "__name:=speaker", rate=100)
     flows(heard)
@@ -333,7 +333,7 @@ def test_logs_time_and_logger_services_stay_home(two: Two) -> None:
 
 @pytest.mark.trap(37)
 @libraries
-def test_a_topic_published_and_heard_on_both_sides_is_heard_once_each(two: Two, library: str) -> None:
+def test_a_topic_of_both_sides_is_heard_once_each(two: Two, library: str) -> None:
     hears = [ros.node(library, "listener", topic="/shared") for ros in (two.at_a, two.at_b)]
     for heard in hears:
         heard.wait_event("up")
@@ -354,7 +354,7 @@ def test_a_topic_published_and_heard_on_both_sides_is_heard_once_each(two: Two, 
 
 @pytest.mark.trap(38)
 @libraries
-def test_who_subscribes_before_anybody_publishes_loses_nothing(two: Two, library: str) -> None:
+def test_an_early_subscriber_loses_nothing(two: Two, library: str) -> None:
     first = two.at_b.node(library, "listener", "__name:=first", count=100)
     anything = two.at_b.start("rostopic", "echo", "-n", "1", "/other", name="echo")
     first.wait_event("up")
@@ -369,7 +369,7 @@ def test_who_subscribes_before_anybody_publishes_loses_nothing(two: Two, library
 
 
 @pytest.mark.trap(38)
-def test_a_listener_of_another_type_that_was_first_gets_nothing_and_both_sides_say_why(two: Two) -> None:
+def test_an_early_listener_of_another_type_is_refused_at_both_ends(two: Two) -> None:
     wrong = two.at_b.rospy("listener", "__name:=wrong", topic="/mixed")
     wrong.wait_event("up")
     two.at_a.rospy("talker", "__name:=speaker", topic="/mixed", type="String", rate=50)
@@ -380,7 +380,7 @@ def test_a_listener_of_another_type_that_was_first_gets_nothing_and_both_sides_s
 
 
 @pytest.mark.trap(17, 39)
-async def test_header_seq_and_every_other_byte_arrive_as_they_were_sent(two: Two) -> None:
+async def test_every_byte_of_a_message_arrives_unchanged(two: Two) -> None:
     kind = MessageType("sensor_msgs/Joy")
     sequences = (4711, 3, 4294967295)
     values = [{"header": {"seq": seq, "frame_id": "pad"}, "axes": [0.5]} for seq in sequences]

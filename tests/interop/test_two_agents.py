@@ -1,4 +1,4 @@
-"""Two agents on one machine: each with its own core; who asks for what another has is told so."""
+"""Two agents on one machine: each with its own core; a conflict over a port or a name is reported."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rmpa.experiments.bed.agents import Agent
-from rmpa.experiments.bed.namespaces import MACHINE
+from lab.bed.agents import Agent
+from lab.bed.namespaces import MACHINE
 from tests.interop.modules import whole
 
 if TYPE_CHECKING:
@@ -65,8 +65,8 @@ def test_a_socket_left_by_a_killed_agent_does_not_stop_the_next(agent: AgentFact
 
 
 def test_commands_say_so_when_no_agent_answers(tmp_path: Path) -> None:
-    nobody = Agent(MACHINE, tmp_path)
-    code, output = nobody.rmpa("peer", "list")
+    stranger = Agent(MACHINE, tmp_path)
+    code, output = stranger.rmpa("peer", "list")
     assert code == 1
     assert "rmpa up" in output
     assert "Traceback" not in output

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from rmpa.experiments.bed.agents import RMPA
-from rmpa.experiments.bed.processes import run
+from lab.bed.agents import RMPA
+from lab.bed.processes import run
 from rmpa.ros.types.definitions import known_text
 from tests.interop.ros import PYTHON
 from tests.ros.types.workspaces import package
@@ -63,7 +63,7 @@ def hears(module: Module, topic: str, text: str, env: dict[str, str]) -> None:
     assert re.search(text, echo.output), echo.output
 
 
-def test_a_computer_without_the_package_works_with_the_robots_types(modules: ModuleFactory, tmp_path: Path) -> None:
+def test_types_of_the_robot_work_without_its_package(modules: ModuleFactory, tmp_path: Path) -> None:
     robot, pc = modules("robot", "pc")
     env = workspace(tmp_path / "ws")
     said = "{header: auto, poses: [{x: 1.5, name: dock}]}"
@@ -71,7 +71,7 @@ def test_a_computer_without_the_package_works_with_the_robots_types(modules: Mod
     assert code == 1
     assert "message type my_msgs/Path: is not known here; looked in ROS_PACKAGE_PATH (not set)" in output
 
-    # A file of the computer waits until somebody, here or at a peer, publishes the type.
+    # A file on the computer waits until a node, here or at a peer, publishes the type.
     file = tmp_path / "twice.py"
     file.write_text(TWICE)
     resource = pc.ros.start(RMPA, "run", file, "--master", pc.ros.uri, "--no-state", env=pc.agent.env)

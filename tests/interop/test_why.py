@@ -1,4 +1,4 @@
-"""``rmpa why`` and ``rmpa doctor`` between real nodes on several hosts: what only those can bring about."""
+"""``rmpa why`` and ``rmpa doctor`` between real nodes on several hosts: the cases that need those."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rmpa.experiments.bed.processes import eventually, run
+from lab.bed.processes import eventually, run
 from tests.interop.modules import Module, flows
 
 if TYPE_CHECKING:
-    from rmpa.experiments.bed.agents import Agent
-    from rmpa.experiments.bed.namespaces import Lab
+    from lab.bed.agents import Agent
+    from lab.bed.namespaces import Lab
     from tests.interop.conftest import AgentFactory, ModuleFactory, ShellFactory
 
 pytestmark = [pytest.mark.ros, pytest.mark.netns, pytest.mark.timeout(180)]
@@ -47,7 +47,7 @@ def until(module: Module, begins: str, *words: str) -> str:
     return found[-1]
 
 
-def test_a_topic_from_its_publisher_to_its_reader_and_each_that_fails(modules: ModuleFactory) -> None:
+def test_why_names_each_stage_of_a_topic_that_fails(modules: ModuleFactory) -> None:
     a, b = modules("a", "b", config="[services]\nloggers = true\n")
     topic = f"{a.name}:/chatter"
     assert stop(b.agent, topic) == f"publisher: no node of {a.name} publishes /chatter"
@@ -173,6 +173,6 @@ def test_the_doctor_finds_the_firewall_of_a_host(lab: Lab, agent: AgentFactory) 
 
 
 def _rmpa() -> list[str]:
-    from rmpa.experiments.bed.agents import RMPA
+    from lab.bed.agents import RMPA
 
     return [str(RMPA)]

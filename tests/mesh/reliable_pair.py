@@ -125,7 +125,7 @@ class Pair:
     def hesitate(self) -> None:
         """One is taken, and cannot go now."""
         if self.sender.take(1):
-            self.sender.untake()
+            self.sender.put_back()
 
     def lose_lane(self) -> None:
         """What is under way is lost, but not the link; acknowledgements go on."""
@@ -198,12 +198,12 @@ class Pair:
         assert sender.pending <= bounds.depth
         assert sender.pending_bytes <= max(bounds.max_bytes, self.newest)
         assert sender.next_sequence == self.sequence(self.published)
-        assert sender.under_way <= bounds.window_messages
-        assert len(sender._doubtful) <= bounds.window_messages
-        under_way = [s for _, s in sender._doubtful] + [len(m.payload) for m in sender._sent]
-        assert sender._under_way_bytes == (sum(under_way) if self.linked else 0)
+        assert sender.in_flight <= bounds.window_messages
+        assert len(sender._dropped_in_flight) <= bounds.window_messages
+        under_way = [s for _, s in sender._dropped_in_flight] + [len(m.payload) for m in sender._sent]
+        assert sender._in_flight_bytes == (sum(under_way) if self.linked else 0)
         assert sum(under_way) <= bounds.window_bytes or len(under_way) == 1 or not self.linked
-        assert self.linked or (sender.under_way == 0 and sender.take() == [])
+        assert self.linked or (sender.in_flight == 0 and sender.take() == [])
         assert all(a < b for a, b in pairwise(self.delivered))
 
     def drain(self) -> None:

@@ -13,7 +13,7 @@ from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.mesh import limits
 from rmpa.mesh.handshake import Hello, Refusal, Refuse
-from rmpa.mesh.peering import CloseLink, Dial, LinkDown, LinkRefused, LinkUp, Output, Peering
+from rmpa.mesh.peering import CloseLink, Dial, LinkDown, LinkDownCause, LinkRefused, LinkUp, Peering, PeeringOutput
 from tests.mesh.worlds import HIGH, LOW
 
 DUAL = replace(HIGH, addresses=(IPv4Address("192.168.0.2"),))
@@ -24,7 +24,7 @@ def of(ours: Identity, *, alive: bool = True) -> Peering:
     return Peering(ours, rng=lambda: 0.999999, alive=lambda _: alive)
 
 
-def dials(outputs: list[Output]) -> list[tuple[str, int]]:
+def dials(outputs: list[PeeringOutput]) -> list[tuple[str, int]]:
     return [o.endpoints[0] for o in outputs if isinstance(o, Dial)]
 
 
@@ -130,7 +130,7 @@ def test_a_link_from_an_unknown_peer_is_up_and_is_forgotten_a_while_after_it_fel
     low.link_up(7, HIGH, 0.0, dialled=False)
     assert low.take() == [LinkUp(7, HIGH)]
     low.link_down(7, "lost", 10.0)
-    assert low.take() == [LinkDown(7, HIGH, "lost")]
+    assert low.take() == [LinkDown(7, HIGH, LinkDownCause.ENDED, "lost")]
     now = 10.0
     while (due := low.next_timer()) is not None:
         now = due
@@ -187,7 +187,7 @@ def test_a_new_instance_replaces_its_ghost() -> None:
     low.peer_found(AGAIN, 1.0)
     assert low.take() == [
         CloseLink(1, "the peer restarted"),
-        LinkDown(1, HIGH, "the peer restarted"),
+        LinkDown(1, HIGH, LinkDownCause.RESTARTED, "the peer restarted"),
         Dial(AGAIN.guid, AGAIN.endpoints),
     ]
     low.link_up(2, AGAIN, 1.1, dialled=True, endpoint=AGAIN.guid.endpoint)
@@ -206,7 +206,7 @@ def test_a_new_instance_that_links_before_its_beacon_comes() -> None:
     low.link_up(2, AGAIN, 1.0, dialled=False)
     assert low.take()[1:] == [
         CloseLink(1, "the peer restarted"),
-        LinkDown(1, HIGH, "the peer restarted"),
+        LinkDown(1, HIGH, LinkDownCause.RESTARTED, "the peer restarted"),
         LinkUp(2, AGAIN),
     ]
 
@@ -225,7 +225,12 @@ def test_of_one_direction_the_newer_stays() -> None:
     assert low.judge(Hello.of(HIGH, lease=1.0, expected=None)) is None
     low.link_up(2, HIGH, 1.0, dialled=False)
     reason = "replaced by a newer link"
-    assert low.take() == [LinkUp(1, HIGH), CloseLink(1, reason), LinkDown(1, HIGH, reason), LinkUp(2, HIGH)]
+    assert low.take() == [
+        LinkUp(1, HIGH),
+        CloseLink(1, reason),
+        LinkDown(1, HIGH, LinkDownCause.REPLACED, reason),
+        LinkUp(2, HIGH),
+    ]
 
 
 def test_invented_identities_do_not_fill_the_memory() -> None:

@@ -12,7 +12,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
 from rmpa.mesh import limits
-from rmpa.mesh.reliable import DELIVER, DUPLICATE, ReceiveResult, ReliableReceiver, ReliableSender, ResumeTable
+from rmpa.mesh.reliable import DELIVER, DUPLICATE, ReceiveResult, ReliableReceiver, ReliableSender
+from rmpa.mesh.resume_table import ResumeTable
 from tests.mesh.reliable_pair import MASK, Bounds, Pair, number_of, payload
 
 FIRSTS = (1, 0, MASK, MASK - 5, (1 << 31) - 3)
@@ -43,7 +44,7 @@ def test_messages_are_numbered_from_one_and_sent_in_order() -> None:
     assert machine.take() == [(1, 5, b"a"), (2, 6, b"b")]
     assert machine.take() == []
     assert (machine.epoch, machine.first, machine.next_sequence) == (7, 1, 3)
-    assert (machine.pending, machine.pending_bytes, machine.under_way) == (2, 2, 2)
+    assert (machine.pending, machine.pending_bytes, machine.in_flight) == (2, 2, 2)
 
 
 def test_the_window_bounds_what_is_under_way() -> None:
@@ -53,7 +54,7 @@ def test_the_window_bounds_what_is_under_way() -> None:
     machine.acknowledged(2)
     assert numbers(machine, 1) == [3]
     assert numbers(machine) == [4]
-    assert machine.under_way == 3
+    assert machine.in_flight == 3
 
 
 def test_the_window_counts_bytes_and_lets_one_large_message_through() -> None:
@@ -76,7 +77,7 @@ def test_acknowledged_messages_are_let_go() -> None:
     fill(machine, 5)
     machine.take()
     machine.acknowledged(3)
-    assert (machine.pending, machine.pending_bytes, machine.under_way) == (2, 8, 2)
+    assert (machine.pending, machine.pending_bytes, machine.in_flight) == (2, 8, 2)
     machine.acknowledged(3)
     machine.acknowledged(1)
     assert (machine.pending, machine.idle) == (2, False)
@@ -103,7 +104,7 @@ def test_a_suspended_sender_keeps_all_and_sends_nothing() -> None:
     machine.suspend()
     machine.acknowledged(2)
     assert machine.take() == []
-    assert (machine.pending, machine.under_way) == (3, 0)
+    assert (machine.pending, machine.in_flight) == (3, 0)
 
 
 @pytest.mark.parametrize(("after", "again"), [(0, [0, 1, 2, 3]), (2, [2, 3]), (3, [3])])
@@ -167,7 +168,7 @@ def test_a_message_dropped_under_way_is_lost_only_if_it_did_not_arrive() -> None
     machine.take()
     machine.offer(payload(2), 0)
     machine.offer(payload(3), 0)
-    assert (machine.pending, machine.under_way, machine.overflowed) == (2, 2, 0)
+    assert (machine.pending, machine.in_flight, machine.overflowed) == (2, 2, 0)
     machine.take()
     machine.acknowledged(1)
     machine.suspend()
@@ -196,7 +197,7 @@ def test_what_is_dropped_under_way_still_fills_the_window(window: int, window_by
     for number in range(10):
         machine.offer(payload(number, 1), 0)
         machine.take()
-    assert machine.under_way == 2
+    assert machine.in_flight == 2
     assert machine.pending_bytes == 5
     machine.acknowledged(2)
     assert numbers(machine) == [9]
@@ -218,12 +219,12 @@ def test_what_cannot_go_after_all_is_the_next_one_again() -> None:
     machine = sender(window_bytes=8)
     fill(machine, 3)
     assert numbers(machine) == [0, 1]
-    machine.untake()
-    assert machine.under_way == 1
+    machine.put_back()
+    assert machine.in_flight == 1
     assert numbers(machine) == [1]
     machine.acknowledged(2)
     with pytest.raises(LocalProtocolError):
-        machine.untake()
+        machine.put_back()
 
 
 def test_what_a_lane_lost_is_sent_again_behind_the_last_acknowledgement() -> None:
@@ -413,7 +414,7 @@ def test_a_parked_sender_is_suspended_and_given_back() -> None:
     table: ResumeTable[str] = ResumeTable()
     machine, gone = parked(table, "a")
     assert gone == []
-    assert (len(table), table.pending_bytes, machine.under_way) == (1, 8, 0)
+    assert (len(table), table.pending_bytes, machine.in_flight) == (1, 8, 0)
     assert table.claim("b", 7) is None
     assert table.claim("a", 7) is machine
     assert table.claim("a", 7) is None
@@ -440,10 +441,10 @@ def test_each_keeps_for_a_time_of_its_own_and_then_only_counts() -> None:
     for key in ("long", "short"):
         assert table.offer(key, payload(3), 0) == []
     assert (long.pending, long.lost) == (3, 0)
-    assert (short.pending, short.lost, short.forgone) == (0, 3, True)
+    assert (short.pending, short.lost, short.counting) == (0, 3, True)
     assert table.claim("short", 7) is short
     short.resume(0)
-    assert (short.following, short.lost, short.forgone) == (4, 3, False)
+    assert (short.following, short.lost, short.counting) == (4, 3, False)
 
 
 def test_parking_again_begins_a_new_time() -> None:
@@ -519,7 +520,7 @@ def test_what_is_offered_while_parked_is_kept_within_the_senders_own_bounds() ->
 def test_only_a_sender_without_a_link_lets_go_of_its_messages() -> None:
     machine = sender()
     with pytest.raises(LocalProtocolError):
-        machine.forgo()
+        machine.stop_keeping()
 
 
 def test_what_was_under_way_when_all_was_let_go_of_may_have_come() -> None:
@@ -527,7 +528,7 @@ def test_what_was_under_way_when_all_was_let_go_of_may_have_come() -> None:
     fill(machine, 5)
     machine.take(3)
     machine.suspend()
-    machine.forgo()
+    machine.stop_keeping()
     fill(machine, 2)
     assert (machine.pending, machine.pending_bytes, machine.lost) == (0, 0, 7)
     machine.resume(2)
@@ -538,9 +539,9 @@ def test_what_was_under_way_when_all_was_let_go_of_may_have_come() -> None:
 
 def test_a_count_that_no_receiver_could_tell_from_an_old_message_stays_below(monkeypatch: pytest.MonkeyPatch) -> None:
     machine = sender()
-    monkeypatch.setattr("rmpa.mesh.reliable._HALF", 100)
+    monkeypatch.setattr("rmpa.mesh.reliable.SERIAL_HALF", 100)
     machine.suspend()
-    machine.forgo()
+    machine.stop_keeping()
     fill(machine, 250)
     assert machine.lost == 250
     machine.resume(0)
@@ -570,7 +571,7 @@ def test_an_ended_numbering_knows_what_it_cost_wherever_its_receiver_was(data: s
             receiver.skip(machine.following)
         elif step == "forgo":
             machine.suspend()
-            machine.forgo()
+            machine.stop_keeping()
             for _ in range(3):
                 machine.offer(b"", 0)
             offered += 3
@@ -578,7 +579,7 @@ def test_an_ended_numbering_knows_what_it_cost_wherever_its_receiver_was(data: s
             receiver.skip(machine.following)
     ended, position = machine.ended(), receiver.position()
     after = position[1] if position is not None else None
-    assert came + receiver.gap_total + ended.untold(after) == offered
+    assert came + receiver.gap_total + ended.unseen(after) == offered
     assert came + ended.lost(after) == offered
     assert ended.lost() >= ended.lost(after)
 

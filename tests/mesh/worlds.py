@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from rmpa.core.guid import Guid
 from rmpa.core.identity import Identity
 from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.mesh.connection import ConnectionEvent, ConnectionProtocol, ConnectionRole, ConnectionState
 from rmpa.mesh.handshake import Lane
-from rmpa.mesh.link import Event, LinkProtocol, LinkRole, LinkState
 
 LOW = Identity(Guid.of("10.0.0.1", 40001, 1), b"L" * 16, "low")
 HIGH = Identity(Guid.of("10.0.0.2", 40002, 1), b"H" * 16, "high")
@@ -20,12 +20,12 @@ WALL = 1_700_000_000_000_000_000
 class Side:
     """One link machine and what it said."""
 
-    link: LinkProtocol
-    events: list[Event] = field(default_factory=list)
+    link: ConnectionProtocol
+    events: list[ConnectionEvent] = field(default_factory=list)
     data: list[tuple[int, int, int, bytes]] = field(default_factory=list)
     parts: list[tuple[int, int, int, int, bytes]] = field(default_factory=list)
 
-    def last(self) -> Event:
+    def last(self) -> ConnectionEvent:
         return self.events[-1]
 
     def messages(self) -> list[tuple[int, int, int, bytes]]:
@@ -57,7 +57,7 @@ class Time:
         return WALL + round(self.now * 1e9) + self.offset_ns
 
 
-def pass_time(link: LinkProtocol, time: Time, seconds: float) -> None:
+def pass_time(link: ConnectionProtocol, time: Time, seconds: float) -> None:
     """Let time go by as a driver has it: the link's timers are handled when they are due."""
     end = time.now + seconds
     while (due := link.next_timer()) is not None and due <= end:
@@ -67,7 +67,7 @@ def pass_time(link: LinkProtocol, time: Time, seconds: float) -> None:
 
 
 def side(
-    role: LinkRole,
+    role: ConnectionRole,
     ours: Identity,
     time: Time,
     *,
@@ -75,10 +75,10 @@ def side(
     lease: float = 1.0,
     lane: Lane = Lane.EXPRESS,
 ) -> Side:
-    events: list[Event] = []
+    events: list[ConnectionEvent] = []
     data: list[tuple[int, int, int, bytes]] = []
     parts: list[tuple[int, int, int, int, bytes]] = []
-    link = LinkProtocol(
+    link = ConnectionProtocol(
         role,
         ours,
         time.now,
@@ -93,7 +93,7 @@ def side(
     return Side(link, events, data, parts)
 
 
-def deliver(data: bytes, target: LinkProtocol, now: float, chunk: int = 1 << 30) -> None:
+def deliver(data: bytes, target: ConnectionProtocol, now: float, chunk: int = 1 << 30) -> None:
     """Bring bytes as a driver would: what is not consumed is kept and offered again with more."""
     kept = b""
     for start in range(0, len(data), chunk):
@@ -104,13 +104,13 @@ def deliver(data: bytes, target: LinkProtocol, now: float, chunk: int = 1 << 30)
 
 def pair(time: Time, *, lease: float = 1.0, lane: Lane = Lane.EXPRESS) -> tuple[Side, Side]:
     """A dialler and an acceptor, both up."""
-    dialler = side(LinkRole.DIALLER, LOW, time, expected=HIGH.guid, lease=lease, lane=lane)
-    acceptor = side(LinkRole.ACCEPTOR, HIGH, time, lease=lease)
+    dialler = side(ConnectionRole.DIALLER, LOW, time, expected=HIGH.guid, lease=lease, lane=lane)
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time, lease=lease)
     deliver(dialler.link.take_output(), acceptor.link, time.now)
     acceptor.link.accept(time.now)
     exchange(dialler, acceptor, time)
-    assert dialler.link.state is LinkState.UP
-    assert acceptor.link.state is LinkState.UP
+    assert dialler.link.state is ConnectionState.UP
+    assert acceptor.link.state is ConnectionState.UP
     return dialler, acceptor
 
 

@@ -8,10 +8,10 @@ from rmpa.observe.snapshot import (
     EventInfo,
     FilesInfo,
     LatencyInfo,
-    LatencySpread,
     LinkInfo,
     PeerInfo,
     RouteInfo,
+    SampleSpread,
     Snapshot,
     TopicInfo,
 )
@@ -104,7 +104,7 @@ SNAPSHOT = Snapshot(
                     age=0.05,
                     rate=10.0,
                     bandwidth=1_000.0,
-                    period=LatencySpread(
+                    period=SampleSpread(
                         count=511, mean=0.1, sd=0.00031, min=0.0988, max=0.1012, p50=0.1, p99=0.10082
                     ),
                     jitter=0.00082,

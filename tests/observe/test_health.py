@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from rmpa.observe import limits
-from rmpa.observe.health import HERE, Health
+from rmpa.observe.health import HERE, Health, diagnostic_status
 from rmpa.observe.snapshot import EventInfo, FilesInfo, PeerInfo, RouteInfo, ServiceInfo, Snapshot, UnreachableInfo
 from rmpa.ros.types.diagnostic_array import DiagnosticLevel, DiagnosticStatus
 from tests.observe.samples import SNAPSHOT
@@ -23,7 +23,7 @@ def with_routes(*routes: RouteInfo, peers: tuple[PeerInfo, ...] = SNAPSHOT.peers
 
 
 def judged(health: Health, snapshot: Snapshot, now: float = 0.0) -> dict[str, DiagnosticStatus]:
-    statuses = list(health.judge(snapshot, now))
+    statuses = [diagnostic_status(check, snapshot.agent.name) for check in health.judge(snapshot, now)]
     found = {status.name: status for status in statuses}
     assert len(found) == len(statuses), "names are unique"
     return found
@@ -34,7 +34,7 @@ def level(snapshot: Snapshot, name: str = CMD) -> tuple[DiagnosticLevel, str]:
     return status.level, status.message
 
 
-def test_one_status_for_the_agent_each_peer_and_each_topic_from_a_peer() -> None:
+def test_agent_peers_and_incoming_topics_have_a_status() -> None:
     found = judged(Health(), with_routes(HEALTHY))
     assert list(found) == [HERE, "rmpa: joystick", "rmpa: pc", CMD]
     assert {status.hardware_id for status in found.values()} == {"base"}
@@ -52,7 +52,7 @@ def test_one_status_for_the_agent_each_peer_and_each_topic_from_a_peer() -> None
     assert all(found[name].values[key] for name in found for key in found[name].values)
 
 
-def test_a_path_that_drops_large_packets_is_a_warning() -> None:
+def test_a_path_problem_is_a_warning() -> None:
     assert JOYSTICK.link is not None
     link = msgspec.structs.replace(JOYSTICK.link, packet=1252, path_problem="a hole", path_remedy="mend it")
     found = judged(Health(), with_routes(HEALTHY, peers=(msgspec.structs.replace(JOYSTICK, link=link), PC)))
@@ -61,7 +61,7 @@ def test_a_path_that_drops_large_packets_is_a_warning() -> None:
     assert (status.values["packet (B)"], status.values["path"]) == ("1252", "a hole")
 
 
-def test_what_goes_out_is_the_receivers_to_judge() -> None:
+def test_outgoing_topics_have_no_status() -> None:
     assert list(judged(Health(), msgspec.structs.replace(SNAPSHOT, topics=SNAPSHOT.topics[1:]))) == [
         HERE,
         "rmpa: joystick",
@@ -130,7 +130,7 @@ def test_a_node_that_cannot_be_reached_is_a_warning() -> None:
     assert status.values == {"unreachable for (s)": "20"}
 
 
-def test_our_topic_that_was_refused_elsewhere_is_an_error_here_too() -> None:
+def test_a_refused_outgoing_topic_is_an_error() -> None:
     outgoing = msgspec.structs.replace(HEALTHY, direction="out")
     for routes in ((), (outgoing,)):
         snapshot = with_routes(*routes, mismatches=("pc/viewer wants another md5",))
@@ -138,7 +138,7 @@ def test_our_topic_that_was_refused_elsewhere_is_an_error_here_too() -> None:
     assert "rmpa: /cmd" not in judged(Health(), with_routes(HEALTHY, mismatches=("another md5",)))
 
 
-def test_what_went_missing_is_told_when_it_does_and_only_then() -> None:
+def test_new_losses_are_a_warning_once() -> None:
     health = Health()
     assert (
         judged(health, with_routes(HEALTHY))[CMD].level is DiagnosticLevel.OK
@@ -154,7 +154,7 @@ def test_what_went_missing_is_told_when_it_does_and_only_then() -> None:
     assert judged(health, with_routes(again))[CMD].level is DiagnosticLevel.OK
 
 
-def test_messages_that_are_too_long_are_told_at_both_ends_while_they_come() -> None:
+def test_oversized_messages_warn_at_both_ends() -> None:
     to_it = msgspec.structs.replace(HEALTHY, direction="out", oversized=0)
     name = "rmpa: to joystick: /cmd (/joy_node)"
     health = Health()
@@ -170,7 +170,7 @@ def test_messages_that_are_too_long_are_told_at_both_ends_while_they_come() -> N
     assert (again[name].level, again[CMD].level) == (DiagnosticLevel.OK, DiagnosticLevel.OK)
 
 
-def test_a_reliable_route_whose_peer_is_away_is_told_at_the_sender() -> None:
+def test_a_reliable_route_to_an_absent_peer() -> None:
     away = msgspec.structs.replace(
         HEALTHY, direction="out", state="away", problem="joystick is away for 12 s", lost=0, oversized=0, kept=7
     )
@@ -192,14 +192,14 @@ def test_a_reliable_route_whose_peer_is_away_is_told_at_the_sender() -> None:
     assert (status.level, status.message) == (DiagnosticLevel.OK, "7046 messages lost to it until now")
 
 
-def test_a_loss_that_nobody_can_count_is_told() -> None:
+def test_an_unknown_loss_is_a_warning() -> None:
     health = Health()
     judged(health, with_routes(HEALTHY))
     status = judged(health, with_routes(msgspec.structs.replace(HEALTHY, events={"loss_unknown": 1})))[CMD]
     assert (status.level, status.message) == (DiagnosticLevel.WARN, "1 times an unknown number lost")
 
 
-def test_sources_of_one_topic_have_names_of_their_own() -> None:
+def test_sources_of_one_topic_have_unique_names() -> None:
     other = msgspec.structs.replace(HEALTHY, node="/other")
     found = judged(Health(), with_routes(HEALTHY, other, HEALTHY))
     assert [name for name in found if "/cmd" in name] == [
@@ -235,7 +235,7 @@ def test_a_link_that_drops_is_a_warning() -> None:
     )
 
 
-def test_who_was_there_is_stale_for_a_while_with_all_that_came_from_it() -> None:
+def test_a_lost_peer_and_its_topics_are_stale_for_a_while() -> None:
     health = Health()
     judged(health, with_routes(HEALTHY, peers=(JOYSTICK,)), 0.0)
     lost = msgspec.structs.replace(JOYSTICK, state="linking", link=None, last_error="silent")
@@ -262,7 +262,7 @@ def test_a_topic_whose_publisher_ended_is_forgotten_at_once() -> None:
     assert CMD not in judged(health, with_routes())
 
 
-def test_the_ghost_of_a_peer_that_is_back_is_left_out() -> None:
+def test_the_old_entry_of_a_restarted_peer_is_left_out() -> None:
     ghost = msgspec.structs.replace(JOYSTICK, guid="10.0.0.2:40002#0", state="linking", link=None)
     twin = msgspec.structs.replace(JOYSTICK, guid="10.0.0.9:40002#1")
     found = judged(Health(), with_routes(peers=(ghost, JOYSTICK, twin)))
@@ -272,7 +272,7 @@ def test_the_ghost_of_a_peer_that_is_back_is_left_out() -> None:
     }
 
 
-def test_services_that_were_called_tell_their_failures_once() -> None:
+def test_failed_calls_are_a_warning_once() -> None:
     idle = ServiceInfo(name="/add", node="/adder", direction="in", peer="joystick")
     used = msgspec.structs.replace(idle, calls=3, type="a/Add", state="open")
     failed = msgspec.structs.replace(used, calls=5, failed=1, problem="it sticks")

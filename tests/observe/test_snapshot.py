@@ -31,4 +31,5 @@ def test_every_field_is_explained() -> None:
         if not isinstance(struct, type) or not issubclass(struct, msgspec.Struct):
             continue
         for name in struct.__struct_fields__:
-            assert f"        {name}: " in (struct.__doc__ or ""), (struct, name)
+            said = "".join(base.__doc__ or "" for base in struct.__mro__)
+            assert f"        {name}: " in said, (struct, name)

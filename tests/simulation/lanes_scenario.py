@@ -37,7 +37,8 @@ class LanesScenario(MeshScenario):
         """And topics change their lanes after a few messages."""
         with (
             super().simulated(),
-            mock.patch("rmpa.bridge.data.io.flows.time", self.world),
+            mock.patch("rmpa.bridge.data.io.export_flow.time", self.world),
+            mock.patch("rmpa.bridge.data.io.import_flow.time", self.world),
             mock.patch.multiple(limits, EXPRESS_AGAIN_MESSAGES=3, EXPRESS_AGAIN_AFTER=0.1),
         ):
             yield
@@ -72,7 +73,7 @@ class LanesScenario(MeshScenario):
             for other in living:
                 if other is not peer:
                     self._check_messages(other, peer)
-            for link in peer.mesh._links.values():
+            for link in peer.mesh.links():
                 assert not link.queue_bytes, f"{peer.name} has not sent all"
 
     def _check_messages(self, source: Courier, peer: Courier) -> None:

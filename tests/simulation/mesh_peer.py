@@ -5,7 +5,10 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, cast
 
+from rmpa.config.settings import LaneSettings
+from rmpa.core.counters import Counters
 from rmpa.discovery.events import PeerChanged, PeerFound, PeerLost, PeerRestarted
+from rmpa.mesh.io.dialler import Dialler
 from rmpa.mesh.io.link import LinkHandlers
 from rmpa.mesh.io.mesh import Mesh
 from tests.simulation.process import Process
@@ -20,7 +23,8 @@ if TYPE_CHECKING:
     from rmpa.discovery.events import Event as RosterEvent
     from rmpa.mesh.frames import FrameKind
     from rmpa.mesh.handshake import Lane
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
+    from rmpa.mesh.peering import LinkDown
     from tests.simulation.network import Address, World
 
 
@@ -39,14 +43,16 @@ class SimClock:
         return round(self._world.now * 1e9)
 
 
-class SimMesh(Mesh):
-    """The mesh, but for how it connects."""
+class SimDialler(Dialler):
+    """Connects through the simulated network."""
 
-    peer: MeshPeer
+    def __init__(self, peer: MeshPeer) -> None:
+        super().__init__(LaneSettings(), Counters())
+        self._peer = peer
 
-    async def _connect(self, endpoint: Address, lane: Lane, within: float = 2.0) -> socket.socket:
-        """Connect through the simulated network."""
-        made = await asyncio.wait_for(self.peer.connect(endpoint), within)
+    async def connect(self, endpoint: Address, lane: Lane, within: float = 2.0) -> socket.socket:
+        """Connect to the simulated listener at an address."""
+        made = await asyncio.wait_for(self._peer.connect(endpoint), within)
         made.lane = lane
         return cast("socket.socket", made)
 
@@ -67,19 +73,19 @@ class MeshPeer(RosterPeer):
             """What a run that is over still says has nothing to do with the next one."""
             return lambda *values: action(*values) if self.alive and self.run == run else None
 
-        self.mesh = SimMesh(
+        self.mesh = Mesh(
             self.identity,
             cast("socket.socket", SimListener(self.network, self.address, self.process)),
             on_link_up=ours(self.link_up),
             on_link_down=ours(self.link_down),
             on_control=ours(self.control),
-            takers=LinkHandlers(
+            handlers=LinkHandlers(
                 ours(self.data), ours(self.part), ours(self.mark), ours(self.clock_known), ours(self.lane_lost)
             ),
             clock=SimClock(self.world),
             rng=rng.random,
+            dialler=SimDialler(self),
         )
-        self.mesh.peer = self
         self.process.create_task(self.mesh.start())
 
     async def connect(self, endpoint: Address) -> SimSocket:
@@ -116,7 +122,7 @@ class MeshPeer(RosterPeer):
         super().end()
         self.process.run(lambda: self.process.create_task(self._leave(self.mesh, self.process)))
 
-    async def _leave(self, mesh: SimMesh, process: Process) -> None:
+    async def _leave(self, mesh: Mesh, process: Process) -> None:
         await mesh.close()
         process.kill()
 
@@ -126,34 +132,34 @@ class MeshPeer(RosterPeer):
 
     # --- what the mesh says ---------------------------------------------------------------------------------
 
-    def link_up(self, link: MeshLink) -> None:
+    def link_up(self, link: PeerLink) -> None:
         """A peer is linked."""
         self.note(f"= link {link.id} up {link.identity}")
         self.roster.link_up(link.identity, self.world.now)
         self.flush()
 
-    def link_down(self, link: MeshLink, reason: str) -> None:
-        """It is no more."""
-        self.note(f"= link {link.id} down {link.identity}: {reason}")
+    def link_down(self, link: PeerLink, down: LinkDown) -> None:
+        """Its link is not used any more."""
+        self.note(f"= link {link.id} down {link.identity}: {down.reason}")
         self.roster.link_down(link.guid, self.world.now, link.identity.instance)
         self.flush()
 
-    def control(self, link: MeshLink, payload: bytes) -> None:
+    def control(self, link: PeerLink, payload: bytes) -> None:
         """A control frame; nothing here."""
 
-    def data(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
+    def data(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
         """A message; nothing here."""
 
-    def part(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
+    def part(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
         """A part of one; nothing here."""
 
-    def mark(self, link: MeshLink, kind: FrameKind, route: int, sequence: int) -> None:
+    def mark(self, link: PeerLink, kind: FrameKind, route: int, sequence: int) -> None:
         """An acknowledgement or the answer to a fence; nothing here."""
 
-    def clock_known(self, link: MeshLink) -> None:
+    def clock_known(self, link: PeerLink) -> None:
         """The peer's clock is known better; nothing here."""
 
-    def lane_lost(self, link: MeshLink) -> None:
+    def lane_lost(self, link: PeerLink) -> None:
         """The bulk lane fell; nothing here."""
 
     # --- what discovery says --------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from tests.simulation.scenario import Outcome, Scenario
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.connection import Connection
     from tests.simulation.sockets import SimSocket
 
 _MANY = 10
@@ -22,9 +22,9 @@ _SLOWER = 5
 """With many peers the keepalives of a second's lease would be most of the work."""
 
 
-def socket_of(link: MeshLink) -> SimSocket:
-    """The simulated socket of a link."""
-    return link.sock  # type: ignore[return-value]
+def socket_of(connection: Connection) -> SimSocket:
+    """The simulated socket of a connection."""
+    return connection.sock  # type: ignore[return-value]
 
 
 class MeshScenario(Scenario):
@@ -103,10 +103,10 @@ class MeshScenario(Scenario):
             assert not any(process.failures for process in peer.processes), [p.failures for p in peer.processes]
             others = sorted(living.keys() - {peer.identity.instance})
             for bulk in (False, True):
-                up = [link for link in peer.mesh._links.values() if link.up and (link.lane == Lane.BULK) == bulk]
-                found = sorted(link.identity.instance for link in up)
+                up = [c for c in peer.mesh.connections() if c.up and (c.lane == Lane.BULK) == bulk]
+                found = sorted(connection.identity.instance for connection in up)
                 assert found == others, f"{peer.name}, bulk {bulk}: {self._names(found)}"
-            assert len(peer.mesh._links) == 2 * len(others), f"{peer.name} has connections that are not up"
+            assert len(peer.mesh.connections()) == 2 * len(others), f"{peer.name} has connections that are not up"
             for other in (living[instance] for instance in others):
                 self._check_pair(peer, other)
             assert all(view.linked for view in peer.roster.peers()), f"{peer.name}'s roster does not know its links"
@@ -115,8 +115,10 @@ class MeshScenario(Scenario):
         link, twin = peer.mesh.link(other.identity.guid), other.mesh.link(peer.identity.guid)
         assert link is not None, f"{peer.name} does not use its link to {other.name}"
         assert twin is not None, f"{other.name} does not use its link to {peer.name}"
-        assert socket_of(link).other is socket_of(twin), f"{peer.name} and {other.name} mean different links"
-        bulk, bulk_twin = link.bulk_link, twin.bulk_link
+        assert socket_of(link.connection).other is socket_of(twin.connection), (
+            f"{peer.name} and {other.name} mean different links"
+        )
+        bulk, bulk_twin = link.bulk_connection, twin.bulk_connection
         assert bulk is not None, f"{peer.name} has no bulk lane to {other.name}"
         assert bulk_twin is not None, f"{other.name} has no bulk lane to {peer.name}"
         assert socket_of(bulk).other is socket_of(bulk_twin), f"{peer.name} and {other.name} mean different lanes"

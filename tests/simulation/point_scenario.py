@@ -18,7 +18,7 @@ from tests.simulation.mesh_scenario import socket_of
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.connection import Connection
     from tests.simulation.traffic import Courier
 
 TROUBLES: Final = ("break", "swallow", "part", "kill receiver", "kill sender", "abort")
@@ -128,7 +128,7 @@ class PointScenario(LanesScenario):
     def _publish_one(self, sender: Courier, receiver: Courier) -> None:
         link = sender.mesh.link(receiver.identity.guid)
         assert link is not None
-        lane: MeshLink | None = link if self.course.priority is Priority.HIGH else link.bulk_link
+        lane = link.connection if self.course.priority is Priority.HIGH else link.bulk_connection
         assert lane is not None
         sock = socket_of(lane)
         sock.trap = (self.point, partial(self._happen, sender, receiver, lane))
@@ -141,7 +141,7 @@ class PointScenario(LanesScenario):
         self.carried = link.bytes_out - before
         sock.trap = None
 
-    def _happen(self, sender: Courier, receiver: Courier, lane: MeshLink) -> None:
+    def _happen(self, sender: Courier, receiver: Courier, lane: Connection) -> None:
         self.happened = True
         match self.trouble:
             case "break":

@@ -11,7 +11,8 @@ from rmpa.core.outbox import FIRST, LAST
 from rmpa.mesh import frames
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.frames import Frame, FrameKind
-from rmpa.mesh.reliable import ReliableReceiver, ReliableSender, ResumeTable
+from rmpa.mesh.reliable import ReliableReceiver, ReliableSender
+from rmpa.mesh.resume_table import ResumeTable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -150,7 +151,7 @@ class Exporter:
             self._pump()
         if self.sender is not None:
             assert self.sender.pending <= self._bounds.depth
-            assert self.sender.under_way <= self._bounds.window_messages
+            assert self.sender.in_flight <= self._bounds.window_messages
             assert self.sender.pending_bytes <= max(self._bounds.max_bytes, len(payload))
 
     def _accept(self, end: End) -> None:

@@ -10,7 +10,8 @@ import json
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from rmpa.bridge.data.io.flows import ExportFlow, ImportFlow
+from rmpa.bridge.data.io.export_flow import ExportFlow
+from rmpa.bridge.data.io.import_flow import ImportFlow
 from rmpa.bridge.data.io.link_time import LinkTime
 from rmpa.bridge.data.io.route_sender import ReliableRouteSender
 from rmpa.core.contract import Contract, Priority, Reliability
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
     import random
 
     from rmpa.bridge.data.io.route_sender import RouteSender
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
+    from rmpa.mesh.peering import LinkDown
 
 _RING: Final = bytes(range(256))
 _SIZES: Final = (20, 300, 300, 5000, 9000, 40_000, 150_000, 400_000)
@@ -112,9 +114,9 @@ class Courier(MeshPeer):
         self.first: dict[bytes, int] = {}
         """By instance: the number of the first message that this reliable receiver must have."""
         self.inboxes: dict[bytes, Inbox] = {}
-        self.legs: dict[tuple[MeshLink, int], RouteSender] = {}
-        self.flows: dict[tuple[MeshLink, int], ImportFlow] = {}
-        self.times: dict[MeshLink, LinkTime] = {}
+        self.legs: dict[tuple[PeerLink, int], RouteSender] = {}
+        self.flows: dict[tuple[PeerLink, int], ImportFlow] = {}
+        self.times: dict[PeerLink, LinkTime] = {}
         self._peers: dict[bytes, int] = {}
         self._place: dict[bytes, int] = {}
         self._epoch = 0
@@ -180,7 +182,7 @@ class Courier(MeshPeer):
 
     # --- links ----------------------------------------------------------------------------------------------
 
-    def link_up(self, link: MeshLink) -> None:
+    def link_up(self, link: PeerLink) -> None:
         """Ask for the peer's source; one that restarted is not waited for any more."""
         super().link_up(link)
         instance = link.identity.instance
@@ -196,9 +198,9 @@ class Courier(MeshPeer):
         epoch, after = position or (0, 0)
         self._say(link, op="open", epoch=epoch, after=after)
 
-    def link_down(self, link: MeshLink, reason: str) -> None:
+    def link_down(self, link: PeerLink, down: LinkDown) -> None:
         """Half messages are dropped; what is reliable waits."""
-        super().link_down(link, reason)
+        super().link_down(link, down)
         self.times.pop(link, None)
         for key in [key for key in self.flows if key[0] is link]:
             self.flows.pop(key).torn()
@@ -214,7 +216,7 @@ class Courier(MeshPeer):
             else:
                 self.exports.remove(peer)
 
-    def lane_lost(self, link: MeshLink) -> None:
+    def lane_lost(self, link: PeerLink) -> None:
         """As the bridge."""
         self.note(f"= link {link.id} lost its bulk lane")
         for (of, _), flow in self.flows.items():
@@ -224,14 +226,14 @@ class Courier(MeshPeer):
             if of is link:
                 leg.lane_lost()
 
-    def clock_known(self, link: MeshLink) -> None:
+    def clock_known(self, link: PeerLink) -> None:
         """As the bridge."""
         if link in self.times:
             self.times[link].set(link.clock_offset, link.clock_error)
 
     # --- what comes -----------------------------------------------------------------------------------------
 
-    def control(self, link: MeshLink, payload: bytes) -> None:
+    def control(self, link: PeerLink, payload: bytes) -> None:
         """The two words."""
         said: dict[str, Any] = json.loads(payload)
         if said["op"] == "open":
@@ -239,19 +241,19 @@ class Courier(MeshPeer):
         else:
             self._begin(link, said)
 
-    def data(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
+    def data(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
         """A message."""
         flow = self.flows.get((link, route))
         if flow is not None:
             flow.message(sequence, stamp_ns, payload)
 
-    def part(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
+    def part(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
         """A part of one."""
         flow = self.flows.get((link, route))
         if flow is not None:
             flow.part(sequence, stamp_ns, flags, part)
 
-    def mark(self, link: MeshLink, kind: FrameKind, route: int, sequence: int) -> None:
+    def mark(self, link: PeerLink, kind: FrameKind, route: int, sequence: int) -> None:
         """An acknowledgement, or a fence's answer."""
         leg = self.legs.get((link, route))
         if leg is not None and kind is FrameKind.ACK:
@@ -261,11 +263,11 @@ class Courier(MeshPeer):
 
     # --- inside ---------------------------------------------------------------------------------------------
 
-    def _say(self, link: MeshLink, **what: object) -> None:
+    def _say(self, link: PeerLink, **what: object) -> None:
         self.note(f"> link {link.id} {what}")
         link.send_control(json.dumps(what).encode())
 
-    def _opened(self, link: MeshLink, epoch: int, after: int) -> None:
+    def _opened(self, link: PeerLink, epoch: int, after: int) -> None:
         """Somebody wants our source, by the only route of this link."""
         peer = self._peers[link.identity.instance]
         leg = self.exports.by_peer.get(peer)
@@ -280,7 +282,7 @@ class Courier(MeshPeer):
             leg = self.exports.add(peer, link, 1, self.contract, self._epoch)
         self.legs[link, 1] = leg
 
-    def _begin(self, link: MeshLink, said: dict[str, Any]) -> None:
+    def _begin(self, link: PeerLink, said: dict[str, Any]) -> None:
         inbox = self.inboxes[link.identity.instance]
         inbox.contract = Contract(
             reliability=Reliability(said["reliability"]), priority=Priority(said["priority"]), depth=1000

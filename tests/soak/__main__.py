@@ -14,8 +14,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from rmpa.experiments.bed import namespaces
-from rmpa.experiments.bed.processes import BedError
+from lab.bed import namespaces
+from lab.bed.processes import BedError
 from tests.interop import ros
 from tests.soak import chaos
 from tests.soak.held import MB, Held, growth, left, look, too_much

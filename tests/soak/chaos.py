@@ -6,7 +6,7 @@ import signal
 import time
 from typing import TYPE_CHECKING, Final
 
-from rmpa.experiments.bed.agents import Agent
+from lab.bed.agents import Agent
 from tests.soak.stage import EARS, MOUTHS, STEADY
 
 if TYPE_CHECKING:

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 
+from lab.bed.processes import BedError, eventually
 from rmpa.core.errors import UnreachableError
-from rmpa.experiments.bed.processes import BedError, eventually
 from rmpa.observe.io.control_client import ControlClient
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rmpa.experiments.bed.agents import Agent
+    from lab.bed.agents import Agent
     from rmpa.observe.snapshot import Snapshot
 
 MB: Final = 1 << 20

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Final, Self
 
 import msgspec
 
-from rmpa.experiments.bed.agents import Agent
-from rmpa.experiments.bed.namespaces import Lab
+from lab.bed.agents import Agent
+from lab.bed.namespaces import Lab
 from tests.interop.modules import Module
 from tests.interop.ros import Ros
 from tests.soak.held import ask, held_path
@@ -25,7 +25,7 @@ from tests.soak.held import ask, held_path
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.experiments.bed.processes import Process
+    from lab.bed.processes import Process
 
 CONFIG: Final = """
 [[contract]]

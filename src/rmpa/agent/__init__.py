@@ -1,4 +1,4 @@
-"""The agent: builds the rooms and wires them (design: every module runs one)."""
+"""The agent that every module runs: builds the rooms and wires them."""
 
 from __future__ import annotations
 

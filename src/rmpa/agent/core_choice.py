@@ -1,4 +1,4 @@
-"""Which ROS core an agent works with: its own, or a roscore that runs already."""
+"""Chooses the ROS core of an agent: an embedded one, or a roscore that runs already."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _log = logging.getLogger(__name__)
 
 
 def make_core(settings: Settings) -> Core:
-    """The core that the settings ask for, not started.
+    """The core that the settings ask for, not yet started.
 
     Raises:
         ConfigError: A ROS variable cannot be used.
@@ -39,9 +39,9 @@ def make_core(settings: Settings) -> Core:
             temporary=is_own,
         )
     uri = settings.core_master or DEFAULT_MASTER_URI
-    # The proxies are nodes like any other, and are where a node that was started here would be: where nobody asked
-    # for an address, at loopback beside a master that is only there, and under the machine's name if the master is
-    # known by it (other nodes have that, too, and it works without a network).
+    # Proxies have the address that a node started in this shell would have. Where the shell asks for none, it is that
+    # of the master: loopback if the master is only there, or the machine's name if the master goes by it, as that
+    # works without a network.
     variables = {name: os.environ.get(name, "") for name in ("ROS_HOSTNAME", "ROS_IP")}
     environment = RosEnvironment.read(variables, (), local_addresses())
     address, master = environment.host, host_of(uri)

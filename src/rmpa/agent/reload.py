@@ -1,4 +1,4 @@
-"""Reads the settings again while the agent runs, and lets those take effect that can (SIGHUP, ``rmpa reload``)."""
+"""Reads the settings again while the agent runs, and applies those that it can (SIGHUP, ``rmpa reload``)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 LIVE: Final = frozenset(
     {"policy", "peers", "contracts", "services", "nodes", "params", "time", "limits", "log_level"}
 )
-"""The settings that a running agent takes; all others need a restart."""
+"""The settings that a running agent applies; all others need a restart."""
 _KEYS: Final = {
     "core_mode": "core.mode",
     "core_fresh": "core.fresh",
@@ -47,18 +47,18 @@ _KEYS: Final = {
     "log_level": "log.level",
     "log_json": "log.json",
 }
-"""What users call a setting, where that is not its own name."""
+"""The users' names of settings, where they differ from the fields'."""
 _VALUE_SHOWN: Final = 60
-"""Characters of a value that are shown."""
+"""Characters of a value that a text has."""
 
 
 class Reloader:
-    """Reads the settings again, one request after the other.
+    """Reads the settings again; requests are served one after the other.
 
     Args:
         settings: Those that the agent runs with.
         load: Reads all sources again; may take long and raise ``ConfigError``.
-        apply: Takes the settings that hold from now on; only what is in ``LIVE`` differs.
+        apply: Called with the settings that hold from now on; only those of ``LIVE`` differ.
     """
 
     def __init__(
@@ -69,13 +69,13 @@ class Reloader:
         self._apply = apply
         self._one = asyncio.Lock()
         self.waiting: tuple[str, ...] = ()
-        """What the settings say and only a restart brings, as of the last time that they were read."""
+        """The settings that wait for a restart, as of the last time that they were read."""
 
     async def reload(self, *, check: bool = False) -> ReloadReply:
-        """Read the settings and let take effect what can; settings that cannot be used change nothing.
+        """Read the settings and apply those of ``LIVE``. Settings with an error change nothing.
 
         Args:
-            check: Only say what would come of it.
+            check: Say only what would change.
 
         Raises:
             ConfigError: This agent was started from a program, without a file to read again.
@@ -84,7 +84,7 @@ class Reloader:
             raise ConfigError("the settings", "this agent was given them by a program", "change them there")
         async with self._one:
             try:
-                # A long file takes long to read, and longer to find a mistake's line in.
+                # In a thread: a long file takes long to read, and longer to find an error's line in.
                 loaded = await asyncio.to_thread(self._load)
             except ConfigError as error:
                 if not check:
@@ -124,8 +124,8 @@ class Reloader:
             _log.warning("! %s only holds after a restart", key)
 
 
-class Hangups:
-    """What SIGHUP does: read the settings again; but where our terminal was closed, end, as every program there does.
+class SighupHandler:
+    """Reads the settings again at SIGHUP; ends the agent if its terminal was closed, as that ends any program.
 
     Args:
         reloader: Reads them.
@@ -139,18 +139,18 @@ class Hangups:
         self._running: set[asyncio.Task[None]] = set()
 
     def start(self) -> None:
-        """Listen, unless the signal is ignored: then somebody wants it so (``nohup``)."""
+        """Handle the signal from now on, unless it is ignored (``nohup``)."""
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-            asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._came)
+            asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._on_signal)
 
     async def close(self) -> None:
-        """Listen no more."""
+        """Handle the signal no more."""
         asyncio.get_running_loop().remove_signal_handler(signal.SIGHUP)
         for task in self._running:
             task.cancel()
         await asyncio.gather(*self._running, return_exceptions=True)
 
-    def _came(self) -> None:
+    def _on_signal(self) -> None:
         if self._had_terminal and not _has_terminal():
             _log.info("= the terminal is gone")
             self._stop()

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from rmpa.core.sizes import UINT32_MAX
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
@@ -60,7 +62,7 @@ def from_json(args: Mapping[str, Any]) -> tuple[Beyond, ...]:
 
 
 def _is_count(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 32
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= UINT32_MAX
 
 
 class NodePlaces(Generic[_Thing]):

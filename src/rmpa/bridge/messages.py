@@ -19,6 +19,7 @@ from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.guid import Guid
 from rmpa.core.identity import peer_name_problem
 from rmpa.core.names import is_global_name, is_type_name
+from rmpa.core.sizes import UINT32_MAX
 from rmpa.mesh import limits as mesh_limits
 
 
@@ -333,7 +334,6 @@ _ENCODER: Final = msgspec.json.Encoder()
 _DECODER: Final = msgspec.json.Decoder(Message)
 _MD5: Final = re.compile(r"[0-9a-f]{32}")
 _INSTANCE: Final = re.compile(r"[0-9a-f]{32}")
-_ROUTE_MAX: Final = (1 << 32) - 1
 
 
 def is_crossing_name(name: str) -> bool:
@@ -458,8 +458,8 @@ def _validate_service(message: ServiceMessage) -> None:
 
 
 def _check_service_route(route: int) -> None:
-    if not limits.SERVICE_ROUTES <= route <= _ROUTE_MAX:
-        raise RemoteProtocolError(f"route {route} of a service is not from {limits.SERVICE_ROUTES} to {_ROUTE_MAX}")
+    if not limits.SERVICE_ROUTES <= route <= UINT32_MAX:
+        raise RemoteProtocolError(f"route {route} of a service is not from {limits.SERVICE_ROUTES} to {UINT32_MAX}")
 
 
 def _validate_agent(message: AgentMessage) -> None:
@@ -468,7 +468,7 @@ def _validate_agent(message: AgentMessage) -> None:
         _check_text(message.remedy)
     elif len(message.what) > limits.ASK_NAME_MAX:
         raise LimitExceeded("name of a question", len(message.what), limits.ASK_NAME_MAX)
-    if isinstance(message, Request | Response) and not 0 < message.number <= _ROUTE_MAX:
+    if isinstance(message, Request | Response) and not 0 < message.number <= UINT32_MAX:
         raise RemoteProtocolError(f"question {message.number} is not a 32-bit number above 0")
 
 
@@ -489,7 +489,7 @@ def _check_terms(message: OpenRoute | RouteOpened) -> None:
         problem = f"a rate of {contract.max_rate}"
     elif not config_limits.OUTAGE_MIN <= contract.outage <= config_limits.OUTAGE_MAX:
         problem = f"an outage of {contract.outage} seconds"
-    elif any(not 0 <= number <= _ROUTE_MAX for number in numbers):
+    elif any(not 0 <= number <= UINT32_MAX for number in numbers):
         problem = f"the numbers {numbers}"
     else:
         return

@@ -1,4 +1,4 @@
-"""``rmpa completion``: shell completion by click's own scripts."""
+"""``rmpa completion``: prints click's own scripts for shell completion."""
 
 from __future__ import annotations
 
@@ -22,6 +22,6 @@ def completion(shell: str) -> None:
 
     kind = get_completion_class(shell)
     assert kind is not None  # noqa: S101 - each of the choices has one
-    # ``source()`` of bash's class runs bash to check its version; the template alone needs no shell here.
+    # ``source()`` of bash's class would run bash to check its version; the template needs no shell.
     complete = kind(cli, {}, "rmpa", "_RMPA_COMPLETE")
     click.echo(complete.source_template % complete.source_vars())

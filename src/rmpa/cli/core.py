@@ -14,7 +14,7 @@ from rmpa.core.errors import UnreachableError
 
 
 def _default_port() -> int:
-    """The port of ``ROS_MASTER_URI`` if that names this machine, as roscore has it; else ROS's own."""
+    """The port of ``ROS_MASTER_URI`` if its host is this machine, as for roscore; else 11311."""
     from rmpa.ros.core.embedded import DEFAULT_PORT
     from rmpa.ros.http.client import is_own_name, split_uri
 
@@ -36,7 +36,7 @@ def _default_port() -> int:
 @click.option(
     "--host", default="127.0.0.1", show_default=True, help="Address to listen at; 0.0.0.0 opens it to the network."
 )
-@click.option("--advertise", default="", metavar="NAME", help="Host name or address to tell nodes, if not --host.")
+@click.option("--advertise", default="", metavar="NAME", help="Host name or address that nodes get, if not --host.")
 @click.option(
     "--fresh",
     is_flag=True,

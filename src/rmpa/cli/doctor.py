@@ -1,28 +1,22 @@
-"""``rmpa doctor``: what on this machine would keep modules apart."""
+"""``rmpa doctor``: checks this machine for what would keep modules apart."""
 
 from __future__ import annotations
 
 import os
 from collections import Counter
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import click
 
 from rmpa.cli.options import json_option
-from rmpa.cli.output import coloured, print_json, print_line, printable
-from rmpa.observe.doctor.finding import FindingLevel, exit_code
+from rmpa.cli.output import LEVEL_COLOURS, print_json, printable
+from rmpa.observe.check import FAIL, WARN, CheckLevel, exit_code
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rmpa.observe.doctor.finding import Finding
+    from rmpa.observe.check import Check
 
-_COLOURS: Final = {
-    FindingLevel.OK: "green",
-    FindingLevel.WARN: "yellow",
-    FindingLevel.FAIL: "red",
-    FindingLevel.SKIPPED: "cyan",
-}
 EPILOG = """\
 \b
 Exit codes: 0 nothing fails (there may be warnings); 1 something does.
@@ -42,39 +36,41 @@ Examples:
 def doctor(config: str | None, quiet: bool, as_json: bool) -> int:
     """Check this machine: settings, agents, network, ROS environment, clock and rights.
 
-    It changes nothing. It sends one packet on each interface to the agents' multicast group, which agents pass over,
-    and looks whether it is heard. A firewall on another machine, or a switch between, shows only there: run it on
-    both sides, and `rmpa multicast` between them.
+    It changes nothing. It sends one packet on each interface to the agents' multicast group, which agents ignore, and
+    checks that it comes back. It cannot see a firewall on another machine or a switch in between: run it on both
+    machines, and `rmpa multicast` between them.
     """
     from rmpa.observe.doctor.io.checks import examine, look_at
 
-    found = []
-    for finding in examine(look_at(os.environ, config)):
-        found.append(finding)
-        if not as_json and (not quiet or finding.level in (FindingLevel.WARN, FindingLevel.FAIL)):
-            for line in _lines(finding):
-                print_line(line)
+    found, shown = [], []
+    for check in examine(look_at(os.environ, config)):
+        found.append(check)
+        if not quiet or check.level in (WARN, FAIL):
+            shown.append(check)
+            if not as_json:
+                click.echo("\n".join(_lines(check)))
     if as_json:
-        print_json(
-            [finding for finding in found if not quiet or finding.level in (FindingLevel.WARN, FindingLevel.FAIL)]
-        )
+        print_json([*map(_json, shown)])
     else:
-        print_line(_summary(found))
+        click.echo(_summary(found))
     return exit_code(found)
 
 
-def _lines(finding: Finding) -> list[str]:
-    mark = f"{finding.level.value:<7}"
-    if coloured():
-        mark = click.style(mark, fg=_COLOURS[finding.level])
-    what = f"{finding.check} {finding.subject}".strip()
-    lines = [f"{mark}  {printable(what)}: {printable(finding.text)}"]
-    if finding.remedy:
-        lines.append(f"{'':<9}{printable(finding.remedy)}")
+def _json(check: Check) -> dict[str, str]:
+    keys = {"check": check.name, "subject": check.where, "level": check.level, "text": check.text}
+    return keys | ({"remedy": check.remedy} if check.remedy else {})
+
+
+def _lines(check: Check) -> list[str]:
+    mark = click.style(f"{check.level.value:<7}", fg=LEVEL_COLOURS[check.level])
+    what = f"{check.name} {check.where}".strip()
+    lines = [f"{mark}  {printable(what)}: {printable(check.text)}"]
+    if check.remedy:
+        lines.append(f"{'':<9}{printable(check.remedy)}")
     return lines
 
 
-def _summary(found: Sequence[Finding]) -> str:
-    counts = Counter(finding.level for finding in found)
-    words = [f"{counts[level]} {level.value}" for level in FindingLevel if counts[level]]
+def _summary(found: Sequence[Check]) -> str:
+    counts = Counter(check.level for check in found)
+    words = [f"{counts[level]} {level.value}" for level in CheckLevel if counts[level]]
     return f"{len(found)} answers: {', '.join(words)}"

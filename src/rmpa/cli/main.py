@@ -1,7 +1,7 @@
-"""The program ``rmpa``: finds the command, and turns its end into an exit code.
+"""The program ``rmpa``: finds the command, runs it, and turns its result into an exit code.
 
-Exit codes: 0 done; 1 it could not be done, and why is on stderr; 2 it was asked in a way that cannot be
-(a flag, a variable, a line of ``rmpa.toml``); 130 and 141 as shells have them for Ctrl-C and a closed pipe.
+Exit codes: 0 success; 1 failure, with the reason on stderr; 2 a usage error (a flag, a variable, a line of
+``rmpa.toml``); 130 after Ctrl-C and 141 after a closed pipe, as in shells.
 
 With ``--json`` an error is also one JSON object on stdout, ``{"error": text}``, so that a program that reads stdout
 never finds it empty.
@@ -17,32 +17,37 @@ from typing import TYPE_CHECKING
 import click
 
 from rmpa import __version__
-from rmpa.cli.lazy import LazyGroup, PipeClosed
+from rmpa.cli.lazy_group import LazyGroup, PipeClosed
 from rmpa.core.errors import ConfigError, RmpaError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+_GROUPS = "rmpa.cli.groups"
 COMMANDS = {
     "up": ("rmpa.cli.up", "Run this machine's agent: ROS core, discovery, mesh and bridge."),
     "core": ("rmpa.cli.core", "Run the ROS core alone: a drop-in for roscore."),
     "run": ("rmpa.cli.run", "Run the Smart Resources of a Python file, with the agent of their module."),
-    "peer": ("rmpa.cli.peer", "See the peers that the agent knows."),
-    "topic": ("rmpa.cli.topic", "See topics, listen to them, publish on them."),
-    "service": ("rmpa.cli.service", "See services, and call them."),
-    "node": ("rmpa.cli.node", "See nodes, here and in other modules; ping and end them."),
-    "param": ("rmpa.cli.param", "See and set parameters, here or at a peer."),
-    "resource": ("rmpa.cli.resource", "See Smart Resources, here or at a peer."),
-    "profile": ("rmpa.cli.profile", "See and choose the System Profile of a resource."),
-    "context": ("rmpa.cli.context", "See and choose the context of a resource."),
-    "alarm": ("rmpa.cli.alarm", "See the alarms of resources."),
+    "peer": (_GROUPS, "See the peers that the agent knows."),
+    "topic": (_GROUPS, "See topics, listen to them, publish on them."),
+    "service": (_GROUPS, "See services, and call them."),
+    "node": (_GROUPS, "See nodes, here and in other modules; ping and end them."),
+    "param": (_GROUPS, "See and set parameters, here or at a peer."),
+    "resource": (_GROUPS, "See Smart Resources, here or at a peer."),
+    "profile": (_GROUPS, "See and choose the System Profile of a resource."),
+    "context": (_GROUPS, "See and choose the context of a resource."),
+    "alarm": (_GROUPS, "See the alarms of resources."),
     "why": ("rmpa.cli.why", "Say why a topic of a peer does not arrive, and what to do."),
     "doctor": ("rmpa.cli.doctor", "Check this machine: network, clock, rights, ROS environment."),
-    "multicast": ("rmpa.cli.multicast", "Send and receive multicast packets by hand."),
-    "experiment": ("rmpa.cli.experiment", "Measure RMPA and classic ROS side by side: the paper's evaluation."),
+    "multicast": (_GROUPS, "Send and receive multicast packets by hand."),
     "reload": ("rmpa.cli.reload", "Let the agent read its settings again."),
     "completion": ("rmpa.cli.completion", "Print the script that completes rmpa's commands in a shell."),
 }
+MOVED = {
+    "experiment": "is not part of rmpa any more; in a clone of its repository: make experiment, "
+    "or python -m lab experiment (docs/experiments.md)",
+}
+"""Commands of releases before this one, and where they are now; to be dropped after one release."""
 EPILOG = """\
 \b
 Examples:
@@ -57,16 +62,19 @@ Examples:
 @click.group(
     cls=LazyGroup,
     commands_at=COMMANDS,
+    moved=MOVED,
     epilog=EPILOG,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.version_option(__version__, "--version", "-V", message="rmpa %(version)s")
 def cli() -> None:
     """ROS 1 modules with a core of their own that share topics, with no master between them."""
+    if os.environ.get("NO_COLOR"):  # no-color.org; without it click colours what a terminal shows
+        click.get_current_context().color = False
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command line; the console script's entry.
+    """Run a command line: the entry point of the console script. Returns the exit code.
 
     Args:
         arguments: Without the program's name; ``sys.argv`` by default.
@@ -75,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code = _run(arguments)
         sys.stdout.flush()
     except (BrokenPipeError, PipeClosed):
-        # The reader has enough (`| head`). What is left in the buffer must not fail again at the interpreter's end.
+        # The reader has closed the pipe (`| head`). The rest of the buffer must not fail again when Python exits.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     return code
@@ -96,18 +104,17 @@ def _run(arguments: Sequence[str] | None) -> int:
 
 
 def _failed(arguments: Sequence[str] | None, text: str, code: int) -> int:
-    """Say an error in JSON too, where JSON was asked for; return the exit code."""
+    """Print an error as JSON too if ``--json`` was given; return the exit code."""
     if wants_json(sys.argv[1:] if arguments is None else arguments):
-        from rmpa.cli.output import print_json  # it brings msgspec, which --help does without
+        from rmpa.cli.output import print_json  # it imports msgspec, which --help does without
 
-        print_json({"error": text}, flush=True)
+        print_json({"error": text})
     return code
 
 
 def wants_json(arguments: Sequence[str]) -> bool:
-    """Whether a command line has ``--json``: it may have failed before click had read it."""
-    options = takewhile(lambda argument: argument != "--", arguments)
-    return "--json" in options
+    """Whether a command line has ``--json``; click may have failed before it parsed that."""
+    return "--json" in takewhile(lambda argument: argument != "--", arguments)
 
 
 if __name__ == "__main__":

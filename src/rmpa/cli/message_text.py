@@ -1,4 +1,4 @@
-"""Messages as text: the YAML-like form of ``rostopic echo``, its CSV form, and fields picked out of a message."""
+"""Messages as text: the YAML-like form and the CSV form of ``rostopic echo``, and single fields of a message."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _TIME: Final = {"secs", "nsecs"}
 
 
 def pick(plain: Plain, path: list[str]) -> Plain:
-    """One field of a message.
+    """Return one field of a message.
 
     Args:
         plain: The message.
@@ -43,7 +43,7 @@ def pick(plain: Plain, path: list[str]) -> Plain:
 
 
 def shorten(plain: Plain, *, arrays: bool, strings: bool) -> Plain:
-    """A message without its long parts: arrays and strings give way to a note of their length, where asked."""
+    """A copy of a message in which a note of the length replaces each array, and each string, if wanted."""
     if isinstance(plain, dict):
         return {name: shorten(value, arrays=arrays, strings=strings) for name, value in plain.items()}
     if isinstance(plain, list):
@@ -56,13 +56,13 @@ def shorten(plain: Plain, *, arrays: bool, strings: bool) -> Plain:
 
 
 class _Note(str):
-    """Text of ours that stands for a value, and needs no quotes."""
+    """A text in place of a value, printed without quotes."""
 
     __slots__ = ()
 
 
 def to_text(plain: Plain, indent: str = "") -> str:
-    """As ``rostopic echo`` shows a message; control characters escaped."""
+    """A message in the format of ``rostopic echo``, with control characters escaped."""
     if isinstance(plain, dict):
         return "\n".join(_field(name, value, indent) for name, value in plain.items())
     if isinstance(plain, list):
@@ -94,7 +94,7 @@ def _scalar(value: Plain) -> str:
 
 
 def flatten(plain: Plain, name: str = "field") -> Iterator[tuple[str, str]]:
-    """Columns and cells as ``rostopic echo -p`` has them: times in nanoseconds, elements of arrays numbered."""
+    """Columns and cells in the format of ``rostopic echo -p``: times in nanoseconds, elements of arrays numbered."""
     if isinstance(plain, dict) and plain.keys() == _TIME:
         secs, nsecs = plain["secs"], plain["nsecs"]
         assert isinstance(secs, int)  # noqa: S101 - as to_plain makes them

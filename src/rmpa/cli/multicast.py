@@ -1,15 +1,14 @@
-"""``rmpa multicast``: whether multicast gets from one machine to another, with nothing else in the way."""
+"""``rmpa multicast``: sends and receives single packets, to test multicast between two machines."""
 
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.cli.lazy import LazyGroup
 from rmpa.cli.options import json_option
-from rmpa.cli.output import print_json, print_line, printable, warn
+from rmpa.cli.output import print_json, print_line, warn
 from rmpa.config import limits as config_limits
 from rmpa.core.errors import ConfigError, RmpaError
 from rmpa.discovery import limits as discovery_limits
@@ -17,25 +16,6 @@ from rmpa.discovery.io.interfaces import choose, list_interfaces
 
 if TYPE_CHECKING:
     from rmpa.discovery.io.interfaces import Interface
-
-_HERE: Final = "rmpa.cli.multicast"
-
-
-@click.group(
-    cls=LazyGroup,
-    commands_at={
-        "send": (_HERE, "Send packets to the group."),
-        "receive": (_HERE, "Wait for packets of the group."),
-    },
-    epilog="""\
-\b
-Start `rmpa multicast receive` on one machine and `rmpa multicast send` on the other, then the other way round.
-The agents' own port is left alone; --port 11411 is theirs (plus the domain), for where a firewall knows ports.
-""",
-)
-def multicast() -> None:
-    """Send and receive multicast packets by hand."""
-
 
 _interface = click.option(
     "--interface",
@@ -56,8 +36,8 @@ _port = click.option(
 )
 
 
-def chosen(names: tuple[str, ...]) -> tuple[Interface, ...]:
-    """The interfaces that are meant.
+def choose_interfaces(names: tuple[str, ...]) -> tuple[Interface, ...]:
+    """The interfaces to use: the named ones, or all that can carry multicast.
 
     Raises:
         ConfigError: One that was named is not here, or cannot carry multicast.
@@ -95,7 +75,7 @@ def send(interfaces: tuple[str, ...], group: str, port: int, count: int, interva
     """
     from rmpa.observe.doctor.io.multicast import GroupSender
 
-    wanted = chosen(interfaces)
+    wanted = choose_interfaces(interfaces)
     failed: dict[str, str] = {}
     with GroupSender(group, port) as sender:
         for number in range(1, count + 1):
@@ -106,15 +86,8 @@ def send(interfaces: tuple[str, ...], group: str, port: int, count: int, interva
                 if problem:
                     failed[interface.name] = problem
                 if as_json:
-                    print_json(
-                        {
-                            "interface": interface.name,
-                            "number": number,
-                            "sent": not problem,
-                            "error": problem or None,
-                        },
-                        flush=True,
-                    )
+                    about = {"interface": interface.name, "number": number, "sent": not problem}
+                    print_json(about | {"error": problem or None})
                 elif not problem:
                     print_line(f"sent on {interface} to {group}:{port}")
     for name, problem in failed.items():
@@ -140,7 +113,7 @@ def receive(
     """
     from rmpa.observe.doctor.io.multicast import GroupReceiver
 
-    wanted = chosen(interfaces)
+    wanted = choose_interfaces(interfaces)
     until = None if timeout is None else time.monotonic() + timeout
     came = 0
     with GroupReceiver(group, port) as receiver:
@@ -158,9 +131,9 @@ def receive(
                 text = packet.data.decode("utf-8", "replace")
                 if as_json:
                     fields = {"source": packet.source, "interface": packet.interface, "text": text}
-                    print_json(fields, flush=True)
+                    print_json(fields)
                 else:
-                    print_line(printable(f"from {packet.source} on {packet.interface}: {text!r}"))
+                    print_line(f"from {packet.source} on {packet.interface}: {text!r}")
         except KeyboardInterrupt:
             pass
     if came < count:

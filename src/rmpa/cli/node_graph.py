@@ -1,18 +1,16 @@
-"""``rmpa node list|info``: which nodes there are, in all modules."""
+"""``rmpa node list|info``: the nodes of all modules."""
 
 from __future__ import annotations
 
 import asyncio
-import os
 from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.bridge.proxy_names import proxied_node
-from rmpa.cli.master import choose_master, read_graph, read_topic
-from rmpa.cli.node_names import ask_peer, find_uri, module_of, peers_nodes, read_node, troubles, uris_of
-from rmpa.cli.options import agent_option, json_option, master_option
-from rmpa.cli.output import Column, coloured, print_json, print_table, printable, warn
+from rmpa.cli.graph import GraphName, peer_of, read_graph, read_namespace
+from rmpa.cli.node_names import ask_peer, find_uri, module_of, peers_nodes, read_node, unreachable_nodes, uris_of
+from rmpa.cli.options import GraphOptions, graph_options
+from rmpa.cli.output import Column, print_json, print_line, print_table, warn
 from rmpa.core.errors import RmpaError
 from rmpa.ros.core.node_calls import ping_node
 from rmpa.ros.node_info import NodeFacts, NodeLine, describe_node, list_nodes
@@ -20,7 +18,8 @@ from rmpa.ros.node_info import NodeFacts, NodeLine, describe_node, list_nodes
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rmpa.cli.master import Graph, Master
+    from rmpa.cli.graph import Graph
+    from rmpa.cli.master import Master
 
 CALLER_ID = "/rmpa_node"
 _COLUMNS = (
@@ -38,57 +37,42 @@ _COLUMNS = (
 )
 @click.argument("namespace", default="")
 @click.option("-v", "--verbose", is_flag=True, help="With module, counts of topics and services, and address.")
-@json_option
-@agent_option
-@master_option
-def list_(namespace: str, verbose: bool, as_json: bool, agent: str | None, master: str | None) -> None:
+@graph_options
+def list_(namespace: str, verbose: bool, options: GraphOptions) -> None:
     """List the nodes of this module and of its peers, all or those of a NAMESPACE.
 
-    Each linked peer is asked for its nodes, those too of which nothing crosses. A node of a peer is PEER:/node. One
-    that cannot be reached is named on stderr.
+    Each linked peer is asked for its nodes, including those of which nothing crosses. A node of a peer is written
+    PEER:/node. A node that cannot be reached is named on stderr.
     """
-    chosen = choose_master(master, agent, os.environ)
-    graph = asyncio.run(read_graph(chosen))
-    wanted = read_topic(namespace, "node") if namespace else None
-    peer = wanted.peer if wanted is not None else None
+    master, graph = options.graph()
+    wanted = read_namespace(namespace, "node")
     found: list[tuple[str | None, NodeLine]] = []
-    if peer is None:
-        found += [(None, line) for line in _own(chosen, graph, with_uris=verbose or as_json)]
-    found += peers_nodes(chosen, graph, peer)
-    if wanted is not None and wanted.topic != "/":
-        found = [(whose, line) for whose, line in found if f"{line.name}/".startswith(f"{wanted.topic}/")]
-    if as_json or verbose:
-        here = module_of(chosen)
-        if as_json:
-            print_json([_line_json(whose, line, here) for whose, line in found])
+    if wanted.peer is None:
+        found += [(None, line) for line in _own(master, graph, with_uris=verbose or options.as_json)]
+    found += peers_nodes(master, graph, wanted.peer)
+    found = [(peer, line) for peer, line in found if wanted.contains(line.name, (peer,))]
+    if options.as_json or verbose:
+        here = module_of(master)
+        if options.as_json:
+            print_json([_line_json(peer, line, here) for peer, line in found])
         else:
-            print_table(_COLUMNS, [_row(whose, line, here) for whose, line in found])
+            print_table(_COLUMNS, [_row(peer, line, here) for peer, line in found])
     else:
-        for whose, line in found:
-            click.echo(_painted(whose, line.name))
-    for whose, line in found:
+        for peer, line in found:
+            print_line(str(GraphName(line.name, peer)), "cyan" if peer is not None else None)
+    for peer, line in found:
         if line.problem:
-            warn(printable(f"{_written(whose, line.name)} cannot be reached at {line.uri}: {line.problem}"))
+            warn(f"{GraphName(line.name, peer)} cannot be reached at {line.uri}: {line.problem}")
 
 
 def _own(master: Master, graph: Graph, *, with_uris: bool) -> list[NodeLine]:
-    """The nodes of the graph without the proxies; addresses are asked for where they are wanted."""
-    problems = {info.node: info.problem for info in troubles(master)}
-    lines = list_nodes(graph.publishers, graph.subscribers, graph.services, {}, problems)
-    names = [line.name for line in lines if proxied_node(line.name) is None]
+    """The nodes of the graph without the proxies; the master is asked for addresses only where they are shown."""
+    problems = {info.node: info.problem for info in unreachable_nodes(master)}
+    names = [node for node in graph.nodes if peer_of(node) is None]
     asked = names if with_uris else [name for name in names if name in problems]
     uris = asyncio.run(uris_of(master, asked)) if asked else {}
     lines = list_nodes(graph.publishers, graph.subscribers, graph.services, uris, problems)
-    return [line for line in lines if proxied_node(line.name) is None]
-
-
-def _written(peer: str | None, name: str) -> str:
-    return name if peer is None else f"{peer}:{name}"
-
-
-def _painted(peer: str | None, name: str) -> str:
-    text = printable(_written(peer, name))
-    return click.style(text, fg="cyan") if peer is not None and coloured() else text
+    return [line for line in lines if peer_of(line.name) is None]
 
 
 def _line_json(peer: str | None, line: NodeLine, here: str | None) -> dict[str, object]:
@@ -105,31 +89,23 @@ def _line_json(peer: str | None, line: NodeLine, here: str | None) -> dict[str, 
 
 
 def _row(peer: str | None, line: NodeLine, here: str | None) -> Sequence[str]:
-    return [
-        printable(_written(peer, line.name)),
-        printable(peer or here or "-"),
-        str(line.publications),
-        str(line.subscriptions),
-        str(line.services),
-        printable(line.uri or "-"),
-    ]
+    counts = map(str, (line.publications, line.subscriptions, line.services))
+    return [str(GraphName(line.name, peer)), peer or here or "-", *counts, line.uri or "-"]
 
 
 @click.command(epilog="\b\nExamples:\n  rmpa node info /talker\n  rmpa node info joystick:/joy_node --json\n")
 @click.argument("node")
-@json_option
-@agent_option
-@master_option
-def info(node: str, as_json: bool, agent: str | None, master: str | None) -> None:
+@graph_options
+def info(node: str, options: GraphOptions) -> None:
     """Show a node's module, address, process, topics and services, and whether it answers."""
-    chosen = choose_master(master, agent, os.environ)
+    master = options.master()
     wanted = read_node(node)
     if wanted.peer is not None:
-        facts = ask_peer(chosen, wanted, "node.info", NodeFacts)
+        facts = ask_peer(master, wanted, "node.info", NodeFacts)
     else:
-        facts = asyncio.run(_facts(chosen, wanted.topic))
-    module = wanted.peer or module_of(chosen)
-    if as_json:
+        facts = asyncio.run(_facts(master, wanted.name))
+    module = wanted.peer or module_of(master)
+    if options.as_json:
         about: dict[str, object] = {
             "name": facts.name,
             "peer": wanted.peer,
@@ -141,19 +117,19 @@ def info(node: str, as_json: bool, agent: str | None, master: str | None) -> Non
         about |= {"publications": facts.publications, "subscriptions": facts.subscriptions}
         print_json(about | {"services": facts.services})
         return
-    click.echo(f"Node: {printable(str(wanted))}")
-    click.echo(f"Module: {printable(module or 'none, for no agent runs at this master')}")
-    click.echo(f"URI: {printable(facts.uri)}")
+    print_line(f"Node: {wanted}")
+    print_line(f"Module: {module or 'none, for no agent runs at this master'}")
+    print_line(f"URI: {facts.uri}")
     click.echo(f"Pid: {facts.pid if facts.pid is not None else 'it does not answer'}")
     for title, topics in (("Publications", facts.publications), ("Subscriptions", facts.subscriptions)):
         click.echo(f"\n{title}:" + ("" if topics else " none"))
         for topic, kind in topics.items():
-            click.echo(printable(f" * {topic} [{kind if kind != '*' else 'unknown type'}]"))
+            print_line(f" * {topic} [{kind if kind != '*' else 'unknown type'}]")
     click.echo("\nServices:" + ("" if facts.services else " none"))
     for service in facts.services:
-        click.echo(printable(f" * {service}"))
+        print_line(f" * {service}")
     if facts.problem:
-        warn(printable(facts.problem))
+        warn(facts.problem)
 
 
 async def _facts(master: Master, name: str) -> NodeFacts:

@@ -2,12 +2,66 @@
 
 from __future__ import annotations
 
+import functools
+import os
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
+
 import click
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.cli.graph import Graph
+    from rmpa.cli.master import Master
+
+_T = TypeVar("_T")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON; a stream prints one object a line.")
 agent_option = click.option(
     "--agent", metavar="NAME", help="Which agent of this machine to ask, if several run. [env: RMPA_AGENT]"
 )
-master_option = click.option(
+_master_option = click.option(
     "--master", metavar="URI", help="The ROS master to ask. [default: see rmpa topic --help]"
 )
+
+
+@dataclass(frozen=True, slots=True)
+class GraphOptions:
+    """The values of ``--json``, ``--agent`` and ``--master`` of one command line."""
+
+    as_json: bool
+    agent: str | None
+    master_uri: str | None
+
+    def master(self) -> Master:
+        """The master that is meant.
+
+        Raises:
+            RmpaError: As ``choose_master``.
+        """
+        from rmpa.cli.master import choose_master
+
+        return choose_master(self.master_uri, self.agent, os.environ)
+
+    def graph(self) -> tuple[Master, Graph]:
+        """The master that is meant, and its graph.
+
+        Raises:
+            RmpaError: As ``choose_master`` and ``read_graph``.
+        """
+        import asyncio
+
+        from rmpa.cli.graph import read_graph
+
+        master = self.master()
+        return master, asyncio.run(read_graph(master))
+
+
+def graph_options(function: Callable[..., _T]) -> Callable[..., _T]:
+    """Decorate a command with ``--json``, ``--agent`` and ``--master``: it gets them as its argument ``options``."""
+
+    @functools.wraps(function)
+    def command(*, as_json: bool, agent: str | None, master: str | None, **arguments: object) -> _T:
+        return function(**arguments, options=GraphOptions(as_json, agent, master))
+
+    return json_option(agent_option(_master_option(command)))

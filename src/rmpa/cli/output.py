@@ -1,74 +1,72 @@
-"""What commands print: aligned columns in a pipe, a coloured table on a terminal, JSON where it was asked for."""
+"""What commands print: lines, tables, JSON, and numbers with units.
+
+Colours are click's: it drops them where standard output is no terminal, and everywhere with ``NO_COLOR``.
+"""
 
 from __future__ import annotations
 
 import math
 import sys
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Final
 
 import click
 import msgspec
 
+from rmpa.observe.check import CheckLevel
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 _UNITS: Final = ("B", "kB", "MB", "GB", "TB")
+LEVEL_COLOURS: Final = {
+    CheckLevel.OK: "green",
+    CheckLevel.WARN: "yellow",
+    CheckLevel.FAIL: "red",
+    CheckLevel.SKIPPED: "cyan",
+    CheckLevel.UNKNOWN: "yellow",
+    CheckLevel.STALE: "yellow",
+}
+"""Of the results of ``rmpa doctor`` and ``rmpa why``, on a terminal."""
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column of a table.
-
-    Args:
-        title: Its heading.
-        right: Whether numbers stand in it, to be aligned at their ends.
-    """
+    """One column of a table: its heading, and whether its cells are aligned to the right, as numbers are."""
 
     title: str
     right: bool = False
 
 
-def print_json(value: object, *, flush: bool = False) -> None:
-    """One JSON document on one line; msgspec structs and figures that are not numbers (as null) included."""
-    sys.stdout.write(msgspec.json.encode(value).decode() + "\n")
-    if flush:
-        sys.stdout.flush()
+def json_text(value: object) -> str:
+    """A value as JSON; msgspec structs are objects, NaN and infinity are null."""
+    return msgspec.json.encode(value).decode()
 
 
-def print_line(text: str = "") -> None:
-    """One line at once, so that a pipe sees it when it happens."""
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
+def print_json(value: object) -> None:
+    """One JSON document on one line of standard output, at once."""
+    click.echo(json_text(value))
 
 
 def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]], *, colours: Sequence[str] = ()) -> None:
-    """A table under its headings.
+    """Print a table under its headings: by rich on a terminal, as aligned plain text elsewhere.
 
     Args:
         columns: From left to right.
-        rows: One text a column.
-        colours: One name of a colour a row, for terminals; empty for none.
+        rows: One text a column; control characters are escaped here.
+        colours: One name of a colour a row, for the second column on terminals; empty for none.
     """
+    rows = [[printable(cell) for cell in row] for row in rows]
     if sys.stdout.isatty():
         _print_rich(columns, rows, colours)
         return
-    width = widths(columns, rows)  # once: a peer may have ten thousand topics
-    for row in ([column.title for column in columns], *rows):
-        sys.stdout.write(align(columns, row, width) + "\n")
-
-
-def widths(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> list[int]:
-    """How wide each column is."""
-    return [
-        max(len(c.title), *(len(row[i]) for row in rows)) if rows else len(c.title) for i, c in enumerate(columns)
-    ]
-
-
-def align(columns: Sequence[Column], row: Sequence[str], width: Sequence[int]) -> str:
-    """One row in plain text, two spaces between columns, none at its end."""
-    cells = (t.rjust(w) if c.right else t.ljust(w) for c, t, w in zip(columns, row, width, strict=True))
-    return "  ".join(cells).rstrip()
+    # Not by rich: it takes seconds over the ten thousand topics that a peer may have.
+    lines = [[column.title for column in columns], *rows]
+    width = [max(map(len, cells)) for cells in zip(*lines, strict=True)]
+    for line in lines:
+        cells = (t.rjust(w) if c.right else t.ljust(w) for c, t, w in zip(columns, line, width, strict=True))
+        sys.stdout.write("  ".join(cells).rstrip() + "\n")
 
 
 def _print_rich(columns: Sequence[Column], rows: Sequence[Sequence[str]], colours: Sequence[str]) -> None:
@@ -79,31 +77,30 @@ def _print_rich(columns: Sequence[Column], rows: Sequence[Sequence[str]], colour
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
     for column in columns:
         table.add_column(column.title, justify="right" if column.right else "left", no_wrap=True)
-    for number, row in enumerate(rows):
-        style = colours[number] if number < len(colours) else ""
+    for row, style in zip_longest(rows, colours, fillvalue=""):
         table.add_row(*(Text(cell, style=style if index == 1 else "") for index, cell in enumerate(row)))
     Console().print(table)
 
 
 def warn(text: str) -> None:
-    """One line on stderr, yellow on a terminal."""
-    click.secho(f"! {text}", err=True, fg="yellow" if coloured(err=True) else None)
+    """One line on stderr, yellow on a terminal; control characters are escaped."""
+    click.secho(f"! {printable(text)}", err=True, fg="yellow")
 
 
-def coloured(*, err: bool = False) -> bool:
-    """Whether colours are wanted: a terminal, and no NO_COLOR (no-color.org)."""
-    import os
-
-    return (sys.stderr if err else sys.stdout).isatty() and not os.environ.get("NO_COLOR")
+def print_line(text: str = "", colour: str | None = None) -> None:
+    """One line on standard output at once; control characters are escaped, and terminals show the colour."""
+    click.secho(printable(text), fg=colour)
 
 
 def printable(text: str) -> str:
-    """Text from the network, without what would move a terminal's cursor."""
+    """Text from the network without characters that move a terminal's cursor: each is escaped."""
+    if text.isprintable():
+        return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 def duration(seconds: float | None) -> str:
-    """How long: ``432 µs``, ``12.3 ms``, ``4.2 s``, ``3 min 20 s``, ``2 h 5 min``, ``3 d 4 h``; ``-`` for none."""
+    """A time: ``432 µs``, ``12.3 ms``, ``4.2 s``, ``3 min 20 s``, ``2 h 5 min``, ``3 d 4 h``; ``-`` for none."""
     if seconds is None or math.isnan(seconds):
         return "-"
     length = abs(seconds)
@@ -125,7 +122,7 @@ def duration(seconds: float | None) -> str:
 
 
 def size(count: float | None) -> str:
-    """How many bytes: ``17 B``, ``1.23 kB``, ``45.6 MB`` (powers of 1000); ``-`` for none."""
+    """A number of bytes: ``17 B``, ``1.23 kB``, ``45.6 MB`` (powers of 1000); ``-`` for none."""
     if count is None or math.isnan(count):
         return "-"
     power = 0

@@ -1,4 +1,4 @@
-"""Where ``rmpa param`` reads and writes: a ROS master, or a peer through this machine's agent."""
+"""The parameters that ``rmpa param`` reads and writes: a ROS master's, or a peer's through this machine's agent."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from rmpa.bridge.params import transfer
 from rmpa.bridge.params.rules import key_problem, leaves
-from rmpa.cli.master import Master, choose_master
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, LocalProtocolError, PeerRefused, RmpaError, UnreachableError
 from rmpa.core.names import is_legal_name
@@ -20,11 +19,13 @@ from rmpa.observe.io.control_client import ControlClient, choose_agent
 if TYPE_CHECKING:
     from collections.abc import Generator, Mapping
 
+    from rmpa.cli.master import Master
+    from rmpa.cli.options import GraphOptions
     from rmpa.ros.wire.xmlrpc import RosReply, XmlRpcValue
 
 _CALLER: Final = "/rmpa_param"
 _FOR_ALL: Final = 30.0
-"""Seconds for one call of a master: megabytes of XML, on a busy machine."""
+"""Seconds for one call of a master: it may bring megabytes of XML, from a busy machine."""
 
 
 class ParamStore(Protocol):
@@ -32,14 +33,14 @@ class ParamStore(Protocol):
 
     @property
     def title(self) -> str:
-        """Whose they are, for texts."""
+        """The master or peer, for error texts."""
         ...
 
     def get(self, key: str) -> XmlRpcValue:
         """A value, or a namespace.
 
         Raises:
-            RmpaError: There is none; the nearest name is offered.
+            RmpaError: There is none; the text offers the nearest name.
         """
         ...
 
@@ -48,11 +49,11 @@ class ParamStore(Protocol):
         ...
 
     def set(self, key: str, value: XmlRpcValue) -> int:
-        """Set a parameter, or each member of a namespace; return how many. Nothing is set where one cannot be."""
+        """Set a parameter, or each member of a namespace; return the number. If one cannot be set, none is."""
         ...
 
     def delete(self, key: str) -> None:
-        """Take a parameter or namespace away.
+        """Delete a parameter or namespace.
 
         Raises:
             RmpaError: There is none.
@@ -60,25 +61,35 @@ class ParamStore(Protocol):
         ...
 
 
-def open_store(peer: str | None, master: str | None, agent: str | None) -> ParamStore:
-    """The store that the flags name.
+def open_store(peer: str | None, options: GraphOptions) -> ParamStore:
+    """The parameters that the options name.
+
+    Args:
+        peer: The peer whose module is meant; ``None``: a master's parameters.
+        options: Master and agent.
 
     Raises:
-        ConfigError: Flags that exclude each other.
+        ConfigError: Both ``--peer`` and ``--master`` are given.
         RmpaError: There is no such agent.
     """
     if peer is None:
-        return MasterStore(choose_master(master, agent, os.environ))
-    if master is not None:
+        return _MasterStore(options.master())
+    if options.master_uri is not None:
         raise ConfigError("--peer", "a peer is asked through this machine's agent, not at a master", "leave one out")
-    return PeerStore(ControlClient(choose_agent(os.environ, agent).path, limits.CONTROL_HANDLER_TIMEOUT), peer)
+    agent = choose_agent(os.environ, options.agent)
+    return _PeerStore(ControlClient(agent.path, limits.CONTROL_HANDLER_TIMEOUT), peer)
 
 
 def read_key(text: str, environ: Mapping[str, str], *, root: bool = False) -> str:
-    """A parameter's global name from what a user writes; a relative one is of ROS_NAMESPACE.
+    """The global name of a parameter; a relative one is resolved in ROS_NAMESPACE.
+
+    Args:
+        text: What the user wrote.
+        environ: The environment.
+        root: Whether an empty text means the whole namespace.
 
     Raises:
-        ConfigError: It is none.
+        ConfigError: It is no parameter's name.
     """
     from rmpa.core.names import resolve_name
 
@@ -95,10 +106,10 @@ def read_key(text: str, environ: Mapping[str, str], *, root: bool = False) -> st
 
 
 def check(key: str, value: XmlRpcValue) -> list[tuple[str, XmlRpcValue]]:
-    """The parameters that a value makes.
+    """The parameters in a value, each with its name.
 
     Raises:
-        RmpaError: A name in it cannot be one.
+        RmpaError: A name in it is not a parameter's.
     """
     found = list(leaves(key, value))
     for name, one in found:
@@ -122,34 +133,30 @@ def _with_namespaces(name: str) -> list[str]:
 
 
 @dataclass
-class MasterStore:
-    """The parameters of a ROS master, whichever it is."""
+class _MasterStore:
+    """The parameters of a ROS master, an agent's core or any other."""
 
     master: Master
 
     @property
     def title(self) -> str:
-        """Its address."""
         return self.master.uri
 
     def get(self, key: str) -> XmlRpcValue:
-        """A value, or a namespace."""
         reply = self._call("getParam", key)
         if reply.code != 1:
             raise absent(key, self.names(), self.title)
         return reply.value
 
     def names(self) -> list[str]:
-        """The names of all parameters, in order."""
         value = self._call("getParamNames").value
         return sorted(str(name) for name in value) if isinstance(value, list) else []
 
     def set(self, key: str, value: XmlRpcValue) -> int:
-        """Set a parameter, or each member of a namespace."""
         from rmpa.ros.wire.xmlrpc import serialize_response
 
         parameters = check(key, value)
-        serialize_response(value)  # what cannot be said is told before anything is set
+        serialize_response(value)  # a value that XML-RPC cannot hold is an error before anything is set
         for name, one in parameters:
             reply = self._call("setParam", name, one)
             if reply.code != 1:
@@ -157,7 +164,6 @@ class MasterStore:
         return len(parameters)
 
     def delete(self, key: str) -> None:
-        """Take a parameter or namespace away."""
         reply = self._call("deleteParam", key)
         if reply.code != 1:
             raise absent(key, self.names(), self.title)
@@ -172,28 +178,24 @@ class MasterStore:
 
 
 @dataclass
-class PeerStore:
-    """The parameters of a peer's module, asked from agent to agent."""
+class _PeerStore:
+    """The parameters of a peer's module, through both agents."""
 
     client: ControlClient
     peer: str
 
     @property
     def title(self) -> str:
-        """The peer's name."""
         return self.peer
 
     def get(self, key: str) -> XmlRpcValue:
-        """A value, or a namespace."""
         return self._value(transfer.GET, {"key": key})
 
     def names(self) -> list[str]:
-        """The names of all parameters that we may read, in order."""
         value = self._value(transfer.NAMES, {})
         return sorted(str(name) for name in value) if isinstance(value, list) else []
 
     def set(self, key: str, value: XmlRpcValue) -> int:
-        """Set a parameter, or each member of a namespace."""
         from rmpa.ros.wire.xmlrpc import serialize_response
 
         check(key, value)
@@ -204,7 +206,6 @@ class PeerStore:
         return int(self._drive(transfer.writing(key, text, secrets.randbits(31))))
 
     def delete(self, key: str) -> None:
-        """Take a parameter or namespace away."""
         self._ask((transfer.DELETE, {"key": key}))
 
     def _value(self, what: str, args: dict[str, Any]) -> XmlRpcValue:
@@ -225,4 +226,4 @@ class PeerStore:
         try:
             return self.client.call("param", dict[str, Any], peer=self.peer, what=what, args=args)
         except PeerRefused as error:
-            raise RmpaError(error.reason) from None  # our agent only passes on what the peer's says
+            raise RmpaError(error.reason) from None  # this agent only passes on the answer of the peer's agent

@@ -1,4 +1,4 @@
-"""Parameters as YAML, read and written by PyYAML as rosparam does, with its angles; errors name the place."""
+"""Parameters as YAML: PyYAML with the additions of rosparam (angles), and errors that name line and column."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _OPERATORS: Final[dict[type[ast.AST], Callable[..., float]]] = {
 class _Loader(yaml.SafeLoader):
     """PyYAML's safe loader with rosparam's angles: ``deg(90)``, ``rad(pi/2)``, ``!degrees 90``, ``!radians pi/2``.
 
-    A key that stands twice in one mapping is an error: PyYAML would drop the first value without a word.
+    A key that stands twice in one mapping is an error: PyYAML alone would silently drop the first value.
     """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
@@ -53,7 +53,7 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes no anchors: two equal lists are two lists in the parameter server."""
+    """PyYAML's safe dumper without anchors: two equal lists are two lists in the parameter server."""
 
     def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002 - PyYAML's signature
         """Whether each value is written in full."""
@@ -61,7 +61,7 @@ class _Dumper(yaml.SafeDumper):
 
 
 def _construct_value(loader: _Loader, node: yaml.ScalarNode) -> str:
-    """A lone ``=``, for which PyYAML has a type and no value: the text."""
+    """The text of a lone ``=``: PyYAML resolves it to a type that it cannot construct."""
     return str(loader.construct_scalar(node))
 
 
@@ -102,7 +102,7 @@ def _calculate(node: ast.AST) -> float:
 
 
 def read_yaml(text: str, where: str) -> XmlRpcValue:
-    """The value of a YAML text; an empty one is an empty string, for a shell's quotes are gone.
+    """The value of a YAML text; an empty text is an empty string, since the shell removes the quotes.
 
     Raises:
         RmpaError: It is not YAML, or cannot be a parameter: with ``where``, line and column.
@@ -124,7 +124,7 @@ def read_documents(text: str, where: str) -> list[XmlRpcValue]:
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise RmpaError(f"{where}{_place(error)}: not YAML: {_problem(error)}") from None
     for document in documents:
-        for key, problem in _unsayable(document):
+        for key, problem in _unstorable(document):
             raise RmpaError(f"{where}: {f'{key}: ' if key else ''}{problem}")
     return [_plain(document) for document in documents]
 
@@ -138,8 +138,8 @@ def _problem(error: Exception) -> str:
     return str(getattr(error, "problem", None) or error).splitlines()[0]
 
 
-def _unsayable(value: object, key: str = "", depth: int = 0) -> Iterator[tuple[str, str]]:
-    """What in a value no parameter can be, with its key."""
+def _unstorable(value: object, key: str = "", depth: int = 0) -> Iterator[tuple[str, str]]:
+    """The parts of a value that no parameter can hold: key and problem of each."""
     if depth > limits.PARAM_DEPTH_MAX:
         yield key.partition("[")[0], f"nested deeper than {limits.PARAM_DEPTH_MAX} levels"
     elif isinstance(value, dict):
@@ -147,10 +147,10 @@ def _unsayable(value: object, key: str = "", depth: int = 0) -> Iterator[tuple[s
             if not isinstance(name, str):
                 yield key, f"the key {name!r} is not a string; put it in quotes"
             else:
-                yield from _unsayable(member, f"{key}/{name}", depth + 1)
+                yield from _unstorable(member, f"{key}/{name}", depth + 1)
     elif isinstance(value, list | tuple):
         for index, member in enumerate(value):
-            yield from _unsayable(member, f"{key}[{index}]", depth + 1)
+            yield from _unstorable(member, f"{key}[{index}]", depth + 1)
     elif value is None:
         yield key, "null is no value of a parameter; write '' for an empty string, or leave it out"
     elif isinstance(value, int) and not isinstance(value, bool) and not -_INT_MAX - 1 <= value <= _INT_MAX:
@@ -160,7 +160,7 @@ def _unsayable(value: object, key: str = "", depth: int = 0) -> Iterator[tuple[s
 
 
 def _plain(value: Any) -> Any:
-    """A value of the types that XML-RPC has: a date has a time there."""
+    """A value in the types of XML-RPC, where a date always has a time."""
     if isinstance(value, dict):
         return {name: _plain(member) for name, member in value.items()}
     if isinstance(value, list | tuple):
@@ -176,5 +176,5 @@ def write_yaml(value: XmlRpcValue) -> str:
 
 
 def show_yaml(value: XmlRpcValue) -> str:
-    """A value as ``rosparam get`` prints it: without the mark that ends a document of one scalar."""
+    """A value as ``rosparam get`` prints it: without the ``...`` that ends a document of one scalar."""
     return write_yaml(value).removesuffix("...\n").rstrip("\n") + "\n"

@@ -1,16 +1,16 @@
-"""``rmpa peer``: the peers that this machine's agent knows."""
+"""``rmpa peer list|info|ping``: the peers that this machine's agent knows."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.lazy import LazyGroup
 from rmpa.cli.options import agent_option, json_option
-from rmpa.cli.output import Column, duration, print_json, print_line, print_table, printable, size, warn
+from rmpa.cli.output import Column, duration, print_json, print_line, print_table, size, warn
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import PeerRefused, RmpaError
 from rmpa.core.stats import SampleSummary
@@ -20,48 +20,19 @@ from rmpa.observe.snapshot import PingReply
 if TYPE_CHECKING:
     from rmpa.observe.snapshot import PeerInfo, RouteInfo, Snapshot, TopicInfo
 
-_HERE: Final = "rmpa.cli.peer"
 _COLOURS: Final = {"linked": "green", "relayed": "green", "linking": "yellow", "refused": "red", "conflict": "red"}
-_COLUMNS: Final = (
-    Column("PEER"),
-    Column("STATE"),
-    Column("SINCE", right=True),
-    Column("ADDRESS"),
-    Column("DIALLED"),
-    Column("RTT", right=True),
-    Column("CLOCK", right=True),
-    Column("IN", right=True),
-    Column("OUT", right=True),
-    Column("QUEUE", right=True),
-    Column("DROPS", right=True),
+_COLUMNS: Final = tuple(
+    Column(title, right=title not in ("PEER", "STATE", "ADDRESS", "DIALLED"))
+    for title in ("PEER", "STATE", "SINCE", "ADDRESS", "DIALLED", "RTT", "CLOCK", "IN", "OUT", "QUEUE", "DROPS")
 )
 _ROUTES: Final = (
-    Column("  TOPIC"),
-    Column("TYPE"),
-    Column("NODE"),
-    Column("ROUTE"),
-    Column("MESSAGES", right=True),
-    Column("RATE", right=True),
-    Column("LATENCY", right=True),
-    Column("P99", right=True),
-    Column("LOST", right=True),
+    *map(Column, ("  TOPIC", "TYPE", "NODE", "ROUTE")),
+    *(Column(title, right=True) for title in ("MESSAGES", "RATE", "LATENCY", "P99", "LOST")),
 )
-
-
-@click.group(
-    cls=LazyGroup,
-    commands_at={
-        "list": (_HERE, "List the peers, and how their links are."),
-        "info": (_HERE, "Show all that is known of one peer."),
-        "ping": (_HERE, "Measure the round trip to a peer over the mesh."),
-    },
-)
-def peer() -> None:
-    """See the peers that the agent knows."""
 
 
 def connect(agent: str | None) -> ControlClient:
-    """A connection to the agent that is meant."""
+    """A connection to the agent of that name, or to the only one of this machine."""
     return ControlClient(choose_agent(os.environ, agent).path)
 
 
@@ -89,16 +60,14 @@ def list_(as_json: bool, agent: str | None) -> None:
 
 
 def _row(info: PeerInfo) -> list[str]:
-    name = printable(info.name)
     link = info.link
     if info.via:
-        return [name, info.state, "-", f"via {printable(info.via)}", "-", "-", "-", "-", "-", "-", "-"]
+        return [info.name, info.state, "-", f"via {info.via}", *"-------"]
     if link is None:
-        address = info.guid.partition("#")[0]
-        return [name, info.state, duration(info.since_ago), address, "-", "-", "-", "-", "-", "-", "-"]
+        return [info.name, info.state, duration(info.since_ago), info.guid.partition("#")[0], *"-------"]
     clock = "-" if link.clock_offset is None else f"{duration(link.clock_offset)} ±{duration(link.clock_error)}"
     return [
-        name,
+        info.name,
         info.state,
         duration(info.since_ago),
         link.remote,
@@ -122,14 +91,14 @@ def _troubles(snapshot: Snapshot) -> list[str]:
         if info.last_error and info.state not in {"linked", "relayed"}:
             again = "" if info.next_attempt is None else f"; next attempt in {duration(info.next_attempt)}"
             found.append(f"{info.name}: {info.last_error}{again}")
-    return [printable(text) for text in found]
+    return found
 
 
 def find_peer(snapshot: Snapshot, wanted: str) -> PeerInfo:
-    """The peer of a name, or of a GUID.
+    """The peer of that name or GUID.
 
     Raises:
-        RmpaError: There is none; the nearest name is offered.
+        RmpaError: There is none; the text offers the nearest name.
     """
     for info in snapshot.peers:
         if wanted in (info.name, info.guid, info.guid.partition("#")[0]):
@@ -159,7 +128,7 @@ def info(name: str, as_json: bool, agent: str | None) -> None:
         print_json(found)
         return
     for label, text in _facts(found):
-        click.echo(f"{label + ':':<13} {printable(text)}")
+        print_line(f"{label + ':':<13} {text}")
     for direction, title in (("in", "it publishes"), ("out", "we publish to it")):
         routes = [
             (t, r) for t in snapshot.topics for r in t.routes if r.peer == found.name and r.direction == direction
@@ -173,7 +142,7 @@ def info(name: str, as_json: bool, agent: str | None) -> None:
 def _route_row(topic: TopicInfo, route: RouteInfo) -> list[str]:
     latency = route.latency
     return [
-        *map(printable, (f"  {topic.name}", route.type or topic.type or "-", route.node, route.state)),
+        *(f"  {topic.name}", route.type or topic.type or "-", route.node, route.state),
         str(route.messages),
         "-" if route.rate is None else f"{route.rate:.1f} Hz",
         "-" if latency is None else f"{duration(latency.p50)} ±{duration(latency.error)}",
@@ -234,14 +203,12 @@ def ping(name: str, count: int | None, interval: float, as_json: bool, agent: st
     sent = 0
     with connect(agent) as client:
         found = find_peer(client.snapshot(), name)
-        try:
+        with contextlib.suppress(KeyboardInterrupt):
             while count is None or sent < count:
                 if sent:
                     time.sleep(interval)
                 sent += 1
                 _ping_once(client, found, sent, times, as_json=as_json)
-        except KeyboardInterrupt:
-            pass
     _ping_summary(found.name, sent, times, as_json=as_json)
     return 0 if times else 1
 
@@ -249,7 +216,7 @@ def ping(name: str, count: int | None, interval: float, as_json: bool, agent: st
 def _ping_once(client: ControlClient, peer: PeerInfo, number: int, times: list[float], *, as_json: bool) -> None:
     name = peer.name
     try:
-        # By its GUID: names may be given twice.
+        # By GUID: two peers may have the same name.
         reply = client.call("ping", PingReply, peer=peer.guid, count=1)
         elapsed, problem = (reply.times[0] if reply.times else None), "no answer"
     except PeerRefused as error:
@@ -258,7 +225,7 @@ def _ping_once(client: ControlClient, peer: PeerInfo, number: int, times: list[f
         times.append(elapsed)
     if as_json:
         answer = {"peer": name, "seq": number, "time": elapsed, "remote": reply.remote}
-        print_json(answer if elapsed is not None else answer | {"error": problem}, flush=True)
+        print_json(answer if elapsed is not None else answer | {"error": problem})
     elif elapsed is None:
         print_line(f"{name}: seq={number} {problem}")
     else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from rmpa.cli.options import agent_option, json_option
-from rmpa.cli.output import print_json, printable, warn
+from rmpa.cli.output import print_json, print_line, printable, warn
 from rmpa.cli.peer import connect
 from rmpa.observe.reload_reply import ReloadReply
 
@@ -27,7 +27,7 @@ Examples:
 @json_option
 @agent_option
 def reload(check: bool, as_json: bool, agent: str | None) -> int:
-    """Let the agent read its rmpa.toml again, without an effect on what stays as it is.
+    """Make the agent read its rmpa.toml again; what the changes do not touch is not interrupted.
 
     Exit code 2 if the settings cannot be used; then nothing has changed.
     """
@@ -38,11 +38,11 @@ def reload(check: bool, as_json: bool, agent: str | None) -> int:
     elif reply.problem:
         click.echo(f"rmpa: {printable(reply.problem)}", err=True)
     else:
-        click.echo(printable(_summary(reply, check=check)))
+        print_line(_summary(reply, check=check))
         for note in reply.notes:
-            warn(printable(note))
+            warn(note)
         for key in reply.restart:
-            warn(printable(f"{key} {'needs' if check else 'waits for'} a restart"))
+            warn(f"{key} {'needs' if check else 'waits for'} a restart")
     return 2 if reply.problem else 0
 
 

@@ -1,4 +1,4 @@
-"""``rmpa resource list``: those that are here, and those that were seen before."""
+"""``rmpa resource list``: the resources of the graph, and those that were seen before."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from rmpa.cli.master import choose_master
-from rmpa.cli.options import agent_option, json_option, master_option
-from rmpa.cli.output import Column, print_json, print_table, printable, warn
-from rmpa.cli.resources_known import remembered
-from rmpa.cli.resources_seen import look_around
+from rmpa.cli.known_resources import remembered
+from rmpa.cli.options import GraphOptions, graph_options
+from rmpa.cli.output import Column, print_json, print_table, warn
+from rmpa.cli.resource_graph import with_resources
 from rmpa.core.errors import UnreachableError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from rmpa.cli.known_resources import KnownResource
     from rmpa.cli.master import Master
-    from rmpa.cli.resources_known import KnownResource
-    from rmpa.cli.resources_seen import Room, SeenResource
+    from rmpa.cli.resource_graph import ResourceGraph, SeenResource
 
 _COLOURS: Final = {"active": "green", "inactive": "yellow", "unconfigured": "yellow", "finalized": "red"}
 _TITLES: Final = ("RESOURCE", "STATE", "ROLE", "KIND", "PROFILE", "CONTEXT", "DESCRIPTION")
@@ -37,7 +36,7 @@ Examples:
 
 @dataclass(frozen=True, slots=True)
 class _Present:
-    """A resource that is here, with what it says; ``None``: it does not answer."""
+    """A resource of the graph with its state, profile and context; ``None`` where it does not answer."""
 
     seen: SeenResource
     state: str | None
@@ -48,23 +47,21 @@ class _Present:
 @click.command("list", epilog=_EXAMPLES)
 @click.option("--known", is_flag=True, help="Those too that `rmpa run` has seen before and that are not here now.")
 @click.option("--state", metavar="DIR", help="Where it wrote them down. [env: RMPA_STATE_DIR]")
-@json_option
-@agent_option
-@master_option
-def list_(known: bool, state: str | None, as_json: bool, agent: str | None, master: str | None) -> None:
+@graph_options
+def list_(known: bool, state: str | None, options: GraphOptions) -> None:
     """List the resources of this module, and those of peers with the peers' names."""
     here: list[_Present] = []
-    module = agent or os.environ.get("RMPA_AGENT")
+    module = options.agent or os.environ.get("RMPA_AGENT")
     try:
-        chosen = choose_master(master, agent, os.environ)
-        here = _here(chosen)
-        module = snapshot.agent.name if (snapshot := chosen.snapshot()) is not None else None
+        master = options.master()
+        here = _here(master)
+        module = snapshot.agent.name if (snapshot := master.snapshot(topics=())) is not None else None
     except UnreachableError as error:
         if not known:
             raise
-        warn(printable(str(error)))
+        warn(str(error))
     gone = remembered(module, state, [each.seen for each in here]) if known else []
-    if as_json:
+    if options.as_json:
         more = {"here": True} if known else {}
         print_json([_as_json(e.seen, e) | more for e in here] + [_as_json(e.seen) | _as_known(e) for e in gone])
     else:
@@ -72,18 +69,18 @@ def list_(known: bool, state: str | None, as_json: bool, agent: str | None, mast
 
 
 def _here(master: Master) -> list[_Present]:
-    """The resources that the master's graph shows now."""
+    """The resources of the master's graph."""
     found: list[_Present] = []
 
-    async def body(room: Room) -> None:
-        for path, count in Counter(one.path for one in room.seen).items():
+    async def body(graph: ResourceGraph) -> None:
+        for path, count in Counter(one.path for one in graph.seen).items():
             if count > 1:
                 text = "what is asked of that name is heard by all of them; docs/names.md tells them apart"
-                warn(f"{count} modules have a resource {printable(path)}: {text}")
-        states, profiles, contexts = await room.texts(room.seen, "state", "profile", "context")
-        found.extend(_Present(one, states.get(one), profiles.get(one), contexts.get(one)) for one in room.seen)
+                warn(f"{count} modules have a resource {path}: {text}")
+        states, profiles, contexts = await graph.texts(graph.seen, "state", "profile", "context")
+        found.extend(_Present(one, states.get(one), profiles.get(one), contexts.get(one)) for one in graph.seen)
 
-    asyncio.run(look_around(master, body))
+    asyncio.run(with_resources(master, body))
     return found
 
 
@@ -92,9 +89,9 @@ def _print(here: Sequence[_Present], gone: Sequence[KnownResource]) -> None:
     rows += [_row(one.seen, str(one), None, None) for one in gone]
     colours = [_COLOURS.get(one.state or "", "") for one in here] + [""] * len(gone)
     titles = list(_TITLES)
-    if len({one.module for one in gone}) > 1:  # then the names are those of several graphs
+    if len({one.module for one in gone}) > 1:  # the names are those of several graphs
         titles.append("SEEN BY")
-        modules = [*("-" for _ in here), *(printable(one.module) for one in gone)]
+        modules = [*("-" for _ in here), *(one.module for one in gone)]
         rows = [[*row, module] for row, module in zip(rows, modules, strict=True)]
     print_table(tuple(map(Column, titles)), rows, colours=colours)
 
@@ -102,8 +99,7 @@ def _print(here: Sequence[_Present], gone: Sequence[KnownResource]) -> None:
 def _row(seen: SeenResource, state: str, profile: str | None, context: str | None) -> list[str]:
     said = seen.descriptor
     kind = "device" if said.physical else "simulated"
-    cells = (str(seen), state, said.role, kind, profile or "-", context or "-", said.description)
-    return [printable(cell) for cell in cells]
+    return [str(seen), state, said.role, kind, profile or "-", context or "-", said.description]
 
 
 def _as_json(seen: SeenResource, present: _Present | None = None) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""``rmpa run``: the Smart Resources of a file, with the agent of their module."""
+"""``rmpa run``: runs the Smart Resources of a Python file, with the agent of their module."""
 
 from __future__ import annotations
 
@@ -26,15 +26,16 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import FrameType, TracebackType
 
-    from rmpa.resource.declare.resource import Parameter, Resource
+    from rmpa.resource.declare.parameters import Parameter
+    from rmpa.resource.declare.resource import Resource
 
 _log = logging.getLogger("rmpa.run")
 _STARTS: Final = 20.0
-"""Seconds that an agent may take until it answers."""
+"""Seconds that an agent may take to start."""
 _ENDS: Final = 10.0
-"""Seconds that it may take to say goodbye."""
+"""Seconds that it may take to end after SIGTERM."""
 _THREADS: Final = 1.0
-"""Seconds that a function of the user's may take to come back once its resource has ended."""
+"""Seconds that a user's function may go on after its resource has ended."""
 _PR_SET_PDEATHSIG: Final = 1
 EPILOG = """\
 \b
@@ -55,14 +56,16 @@ Examples:
 @click.command(epilog=EPILOG, context_settings={"ignore_unknown_options": False})
 @click.argument("file", type=click.Path(exists=True, dir_okay=False))
 @click.option("--name", metavar="NAME", help="The module's name. [default: the first resource's]")
-@click.option("--master", metavar="URI", help="Run on this ROS core, whosever it is; no agent is started.")
+@click.option("--master", metavar="URI", help="Run on this ROS core; no agent is started.")
 @click.option(
     "--set", "given", metavar="[RESOURCE.]PARAMETER=VALUE", multiple=True, help="Start with this value; repeatable."
 )
 @click.option(
-    "--state", metavar="DIR", help="Where it remembers. [env: RMPA_STATE_DIR; default: ~/.local/state/rmpa]"
+    "--state",
+    metavar="DIR",
+    help="Where resources keep their state. [env: RMPA_STATE_DIR; default: ~/.local/state/rmpa]",
 )
-@click.option("--no-state", is_flag=True, help="The resources remember nothing; for the core say -- --fresh.")
+@click.option("--no-state", is_flag=True, help="The resources store nothing; for an empty core add -- --fresh.")
 @click.option("--log-level", default="info", type=click.Choice(["debug", "info", "warning", "error"]))
 @click.argument("options", nargs=-1, type=click.UNPROCESSED, metavar="[-- OPTIONS OF rmpa up]")
 def run(
@@ -80,34 +83,34 @@ def run(
 
     from rmpa.core.log import configure_logging
 
-    gc.disable()  # nothing that an import makes is garbage; it is on again when the resources are active
+    gc.disable()  # imports leave no garbage; collection is on again when the resources are active
     configure_logging(log_level, sys.stderr, as_json=False)
     for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, _told_to_end)
+        signal.signal(number, _interrupt)
     path = Path(file)
 
-    def stores(module: str) -> Path | None:
-        return None if no_state else _stores(module, state)
+    def state_of(module: str) -> Path | None:
+        return None if no_state else _state_dir(module, state)
 
     if master is not None:
         if options:
             raise ConfigError("--", "options of an agent, but --master starts none", "leave one of them out")
         resources = prepared(path, given)
-        return asyncio.run(_run(resources, master, None, stores(name or resources[0].name)))
+        return asyncio.run(_run(resources, master, None, state_of(name or resources[0].name)))
     resources = prepared(path, given) if name is None else []
     with ModuleAgent(name or resources[0].name, options) as agent:
         if not resources:  # the agent starts meanwhile
             resources = prepared(path, given)
-        return asyncio.run(_run(resources, agent.core(), agent, stores(name or resources[0].name)))
+        return asyncio.run(_run(resources, agent.core(), agent, state_of(name or resources[0].name)))
 
 
 def prepared(path: Path, given: Sequence[str] = ()) -> list[Resource]:
-    """The resources of a file with the given parameters, and all that they need imported and compiled.
+    """Load the resources of a file, set the given parameters, and import and compile all that they need.
 
     Raises:
         ConfigError: The file cannot be run, or a parameter cannot have its value.
     """
-    import rmpa.resource.run.member  # noqa: F401 - takes a while, the first time
+    import rmpa.resource.run.resource_node  # noqa: F401 - the first import takes long
 
     resources = load(path)
     for text in given:
@@ -121,7 +124,7 @@ def prepared(path: Path, given: Sequence[str] = ()) -> list[Resource]:
 
 
 def load(path: Path) -> list[Resource]:
-    """The resources that a Python file declares, in order.
+    """Run a Python file and return the resources that it declares, in order.
 
     Raises:
         ConfigError: It cannot be run, declares none, two of one name, or one without a profile.
@@ -134,8 +137,8 @@ def load(path: Path) -> list[Resource]:
     try:
         names = runpy.run_path(str(path), run_name="__rmpa__")
     except RmpaError as error:
-        told = error if isinstance(error, ConfigError) else ConfigError("the file", str(error))
-        raise ConfigError(told.source, told.problem, told.remedy, path, _line_in(path, error)) from error
+        cause = error if isinstance(error, ConfigError) else ConfigError("the file", str(error))
+        raise ConfigError(cause.source, cause.problem, cause.remedy, path, _line_in(path, error)) from error
     except (Exception, SystemExit) as error:
         what = f"{type(error).__name__}: {error}"
         raise ConfigError("the file", f"it cannot be run: {what}", "", path, _line_in(path, error)) from error
@@ -159,7 +162,7 @@ def load(path: Path) -> list[Resource]:
 
 
 def _line_in(path: Path, error: BaseException) -> int | None:
-    """The line of the user's file at which something was raised."""
+    """The line of the user's file at which an exception was raised."""
     if isinstance(error, SyntaxError) and error.filename == str(path):
         return error.lineno
     line = None
@@ -172,10 +175,10 @@ def _line_in(path: Path, error: BaseException) -> int | None:
 
 
 def _set(resources: Sequence[Resource], text: str) -> None:
-    """Give a parameter the value that it starts with.
+    """Set the initial value of a parameter, ``[RESOURCE.]PARAMETER=VALUE``.
 
     Raises:
-        ConfigError: There is no such one, more than one, or it cannot have this value.
+        ConfigError: There is no such parameter, there are several, or the value does not fit.
     """
     from rmpa.config.values import did_you_mean
 
@@ -195,7 +198,7 @@ def _set(resources: Sequence[Resource], text: str) -> None:
 
 
 def _read(parameter: Parameter, text: str) -> bool | int | float | str:
-    """A value as it was typed."""
+    """Convert a text to the parameter's type."""
     if isinstance(parameter.default, str):
         return text
     if isinstance(parameter.default, bool):
@@ -211,22 +214,22 @@ def _read(parameter: Parameter, text: str) -> bool | int | float | str:
 
 
 class ModuleAgent:
-    """The agent of a module: one that runs already, or one of ours for as long as the ``with`` lasts.
+    """The agent of a module: one that runs already, or a child process for as long as the ``with`` lasts.
 
-    Ours ends with us in any case: when we are killed, the kernel tells it to.
+    A child ends with this process in any case: if this process is killed, the kernel sends SIGTERM to the child.
 
     Args:
-        name: The module's.
-        options: Of ``rmpa up``, for one that is started.
+        name: The module's name.
+        options: Options of ``rmpa up`` for a child.
 
     Raises:
-        ConfigError: It runs already, so that options for it come too late.
+        ConfigError: The agent runs already, and options are given.
     """
 
     def __init__(self, name: str, options: Sequence[str]) -> None:
         self.name = name
         self.process: subprocess.Popen[bytes] | None = None
-        """If it is ours."""
+        """The child, if one was started."""
         self._uri = _core_of(name)
         self._options = options
 
@@ -245,7 +248,7 @@ class ModuleAgent:
             if os.getppid() != us:
                 os._exit(1)
 
-        # A session of its own: Ctrl-C is ours, and the agent ends when the resources have ended.
+        # In a session of its own Ctrl-C does not reach the agent: it ends after the resources.
         self.process = subprocess.Popen(command, start_new_session=True, preexec_fn=tie)  # noqa: S603, PLW1509
         return self
 
@@ -255,10 +258,10 @@ class ModuleAgent:
         self.end()
 
     def core(self) -> str:
-        """The URI of its core, once it answers.
+        """Wait until the agent answers; return the URI of its core.
 
         Raises:
-            StartError: It does not.
+            StartError: It ended, or does not answer in time.
         """
         deadline = time.monotonic() + _STARTS
         while self._uri is None:
@@ -273,21 +276,21 @@ class ModuleAgent:
         return self._uri
 
     def end(self) -> None:
-        """Let it say goodbye, if it is ours."""
+        """End the child, if there is one: by SIGTERM, so that it says goodbye to its peers."""
         if self.process is None or self.process.poll() is not None:
             return
         self.process.terminate()
         try:
             self.process.wait(_ENDS)
         except BaseException as error:
-            self.process.kill()  # it hangs, or somebody has no patience
+            self.process.kill()  # it hangs, or the user pressed Ctrl-C again
             self.process.wait()
             if not isinstance(error, subprocess.TimeoutExpired):
                 raise
 
 
 def _core_of(name: str) -> str | None:
-    """The core's URI of a running agent, or ``None``."""
+    """The URI of the core of a running agent, or ``None``."""
     from rmpa.observe.io.control_client import ControlClient, find_agents
 
     for found in find_agents(os.environ):
@@ -300,9 +303,9 @@ def _core_of(name: str) -> str | None:
     return None
 
 
-def _stores(module: str, state: str | None) -> Path | None:
-    """Where the resources of a module remember."""
-    from rmpa.resource.run.store import module_dir, state_dir
+def _state_dir(module: str, state: str | None) -> Path | None:
+    """The directory in which the resources of a module store their state; ``None`` without a home directory."""
+    from rmpa.runtime.state_dir import module_dir, state_dir
 
     directory = state_dir(os.environ, state)
     if directory is None:
@@ -312,29 +315,29 @@ def _stores(module: str, state: str | None) -> Path | None:
 
 
 async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None, stores: Path | None = None) -> int:
-    from rmpa.resource.run.member import run_all
+    from rmpa.resource.run.resource_node import run_all
     from rmpa.runtime.descriptors import raise_file_limit
 
     raise_file_limit()
-    sys.setswitchinterval(limits.THREAD_SWITCH)  # a task that is due does not wait for what the loop does just then
+    sys.setswitchinterval(limits.THREAD_SWITCH)  # so that a due task interrupts the event loop's work
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     threads = ThreadPoolExecutor(thread_name_prefix="profile or hook")
     loop.set_default_executor(threads)
 
-    def told(number: int) -> None:
+    def on_signal(number: int) -> None:
         if stop.is_set():
             _log.warning("! told twice: ending at once")
             _leave(128 + number)
         stop.set()
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        loop.add_signal_handler(number, told, number)
+        loop.add_signal_handler(number, on_signal, number)
     process = agent.process if agent is not None else None
     died = asyncio.create_task(_watch(process, stop)) if process is not None else None
 
     def ready() -> None:
-        gc.freeze()  # a full collection, in the midst of a task, need not look at all that was loaded
+        gc.freeze()  # a full collection then skips what was loaded until now
         gc.enable()
         _log.info("= %s: active on %s", ", ".join(printable(r.name) for r in resources), uri)
 
@@ -364,14 +367,14 @@ async def _run(resources: list[Resource], uri: str, agent: ModuleAgent | None, s
 
 
 async def _watch(process: subprocess.Popen[bytes], stop: asyncio.Event) -> None:
-    """End with the agent: a resource without its core serves nobody."""
-    while process.poll() is None:  # noqa: ASYNC110 - the kernel's event is SIGCHLD, which is the interpreter's own
+    """Set ``stop`` when the agent's process ends: a resource without a core has no clients."""
+    while process.poll() is None:  # noqa: ASYNC110 - the kernel's event would be SIGCHLD, which asyncio's child watcher owns
         await asyncio.sleep(0.25)
     stop.set()
 
 
 async def _left_behind() -> list[str]:
-    """Names of the threads in which functions of the user's hang: the interpreter would wait for them for ever."""
+    """Names of the threads in which user's functions hang: the interpreter would wait for them at its exit."""
     loop = asyncio.get_running_loop()
     deadline = loop.time() + _THREADS
     while True:
@@ -382,12 +385,12 @@ async def _left_behind() -> list[str]:
 
 
 def _leave(code: int) -> NoReturn:
-    """End now, whatever threads there are; an agent of ours is told so by the kernel."""
+    """Exit now, whatever threads run; the kernel ends a child agent."""
     logging.shutdown()
     sys.stdout.flush()
     os._exit(code)
 
 
-def _told_to_end(number: int, _frame: FrameType | None) -> NoReturn:
-    """Told to end before there is a loop: unwind as at Ctrl-C, and end what was started."""
+def _interrupt(number: int, _frame: FrameType | None) -> NoReturn:
+    """Handle a signal before there is a loop: unwind as at Ctrl-C, which ends a child agent."""
     raise KeyboardInterrupt(number)

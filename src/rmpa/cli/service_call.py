@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import time
 from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.master import choose_master, read_graph, read_topic
+from rmpa.cli.graph import read_graph, read_name
 from rmpa.cli.message_text import to_text
-from rmpa.cli.options import agent_option, json_option, master_option
+from rmpa.cli.options import GraphOptions, graph_options
 from rmpa.cli.output import print_json, printable
-from rmpa.cli.service_ends import CALLER_ID, known_type, lookup, require_service
+from rmpa.cli.service_probe import CALLER_ID, known_type, lookup
 from rmpa.cli.topic_pub import fill_stamps, read_values
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 
 if TYPE_CHECKING:
-    from rmpa.cli.master import Master, TopicName
+    from rmpa.cli.graph import GraphName
+    from rmpa.cli.master import Master
     from rmpa.ros.types.messages import Plain
 
 _LOOK: Final = 0.1
-"""Between two looks whether a service is there."""
+"""Seconds between two questions to the master whether the service is there."""
 
 
 @click.command(
@@ -47,36 +47,26 @@ Examples:
 @click.option(
     "-t", "--timeout", type=click.FloatRange(0.001), default=60.0, show_default=True, help="Seconds for the answer."
 )
-@json_option
-@agent_option
-@master_option
-def call(
-    service: str,
-    values: tuple[str, ...],
-    wait: bool,
-    timeout: float,
-    as_json: bool,
-    agent: str | None,
-    master: str | None,
-) -> None:
+@graph_options
+def call(service: str, values: tuple[str, ...], wait: bool, timeout: float, options: GraphOptions) -> None:
     """Call a SERVICE with VALUES, in YAML or JSON, and print its response.
 
-    An error of the server is told on stderr, in its own words; the exit code is 1 then.
+    An error of the server goes to stderr in its own words, and the exit code is 1.
     """
-    wanted = read_topic(service, "service")
+    wanted = read_name(service, "service")
     plain = read_values(values)
-    chosen = choose_master(master, agent, os.environ)
+    master = options.master()
     began = time.monotonic()
-    response = asyncio.run(_call(chosen, wanted, plain, timeout, wait=wait))
-    if as_json:
-        print_json({"service": wanted.topic, "response": response, "took": time.monotonic() - began})
+    response = asyncio.run(_call(master, wanted, plain, timeout, wait=wait))
+    if options.as_json:
+        print_json({"service": wanted.name, "response": response, "took": time.monotonic() - began})
     elif response:
         click.echo(to_text(response))
 
 
 async def _call(
     master: Master,
-    wanted: TopicName,
+    wanted: GraphName,
     plain: Plain,
     timeout: float,  # noqa: ASYNC109 - the user's
     *,
@@ -86,9 +76,9 @@ async def _call(
 
     if wait:
         await _wait(master, wanted, timeout)
-    require_service(await read_graph(master), wanted)
-    uri = await lookup(master, wanted.topic)
-    connection = await ServiceConnection.open(uri, wanted.topic, CALLER_ID, timeout=timeout)
+    (await read_graph(master)).require_service(wanted)
+    uri = await lookup(master, wanted.name)
+    connection = await ServiceConnection.open(uri, wanted.name, CALLER_ID, timeout=timeout)
     try:
         kind = known_type(connection.description)
         request = kind.request.serialize(kind.request.make(fill_stamps(plain, time.time_ns())))
@@ -97,12 +87,12 @@ async def _call(
         connection.close()
     if not ok:
         text = printable(str(bytes(body), "utf-8", "replace")) or "it gave no reason"
-        raise PeerRefused(f"service {wanted.topic}", text)
+        raise PeerRefused(f"service {wanted.name}", text)
     return kind.response.to_plain(kind.response.deserialize(body))
 
 
-async def _wait(master: Master, wanted: TopicName, timeout: float) -> None:  # noqa: ASYNC109 - likewise
-    """Wait until a service is registered, by that peer if one was named.
+async def _wait(master: Master, wanted: GraphName, timeout: float) -> None:  # noqa: ASYNC109 - likewise
+    """Wait until a service is registered, by the peer if one is named.
 
     Raises:
         UnreachableError: It is not in time.
@@ -112,7 +102,7 @@ async def _wait(master: Master, wanted: TopicName, timeout: float) -> None:  # n
         async with asyncio.timeout(timeout):
             while True:
                 try:
-                    require_service(await read_graph(master), wanted)
+                    (await read_graph(master)).require_service(wanted)
                 except RmpaError as error:
                     last = error
                 else:

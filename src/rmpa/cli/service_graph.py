@@ -1,38 +1,33 @@
-"""``rmpa service list|info|type|find``: what the graph offers."""
+"""``rmpa service list|info|type|find``: the services of the graph."""
 
 from __future__ import annotations
 
 import asyncio
-import os
 from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.bridge.proxy_names import proxied_node
-from rmpa.cli.master import Graph, Master, choose_master, read_graph, read_topic
-from rmpa.cli.options import agent_option, json_option, master_option
-from rmpa.cli.output import Column, coloured, print_json, print_table, printable, warn
-from rmpa.cli.service_ends import known_type, probe, probe_all, require_service, service_peers
-from rmpa.cli.service_mesh import crossing, print_crossing
+from rmpa.cli.graph import origin_json, origin_text, peers_of, print_names, read_name, read_namespace
+from rmpa.cli.options import GraphOptions, graph_options
+from rmpa.cli.output import Column, print_json, print_line, print_table, warn
+from rmpa.cli.service_crossing import crossing, print_crossing
+from rmpa.cli.service_probe import known_type, probe, probe_all
 from rmpa.core.errors import RmpaError
 
 if TYPE_CHECKING:
-    from rmpa.cli.service_ends import Probed
+    from rmpa.cli.graph import Graph
+    from rmpa.cli.service_probe import Probed
     from rmpa.observe.snapshot import ServiceInfo
     from rmpa.ros.types.messages import MessageType
 
 
-def _graph(master: str | None, agent: str | None) -> tuple[Master, Graph]:
-    chosen = choose_master(master, agent, os.environ)
-    return chosen, asyncio.run(read_graph(chosen))
+def _node(graph: Graph, name: str, unknown: str = "") -> str:
+    """The node that serves a service."""
+    return next(iter(graph.services.get(name, ())), unknown)
 
 
 def _service_json(graph: Graph, name: str, found: Probed | None = None) -> dict[str, object]:
-    node = next(iter(graph.services.get(name, ())), "")
-    proxy = proxied_node(node)
-    about: dict[str, object] = {"name": name, "node": node}
-    if proxy is not None:
-        about |= {"peer": proxy[0], "remote_node": proxy[1]}
+    about: dict[str, object] = {"name": name, **origin_json(_node(graph, name))}
     if found is not None:
         said = found.description
         about |= {"uri": found.uri or None, "type": said and said.type, "md5": said and said.md5sum}
@@ -41,96 +36,74 @@ def _service_json(graph: Graph, name: str, found: Probed | None = None) -> dict[
     return about
 
 
-def _mark(graph: Graph, name: str) -> str:
-    peers = service_peers(graph, name)
-    text = printable(f"  [{', '.join(peers)}]") if peers else ""
-    return click.style(text, fg="cyan") if text and coloured() else text
-
-
 @click.command(
     "list", epilog="\b\nExamples:\n  rmpa service list\n  rmpa service list -v /arm\n  rmpa service list base:/\n"
 )
 @click.argument("namespace", default="")
 @click.option("-v", "--verbose", is_flag=True, help="Types and nodes too; each server is asked.")
-@json_option
-@agent_option
-@master_option
-def list_(namespace: str, verbose: bool, as_json: bool, agent: str | None, master: str | None) -> None:
+@graph_options
+def list_(namespace: str, verbose: bool, options: GraphOptions) -> None:
     """List services, all or those of a NAMESPACE.
 
     A service that a peer offers has its name behind it: /add  [base].
     """
-    chosen, graph = _graph(master, agent)
-    wanted = read_topic(namespace, "service") if namespace else None
-    names = [
-        name
-        for name in sorted(graph.services)
-        if (wanted is None or wanted.topic == "/" or f"{name}/".startswith(f"{wanted.topic}/"))
-        and (wanted is None or wanted.peer is None or wanted.peer in service_peers(graph, name))
-    ]
-    found = asyncio.run(probe_all(chosen, names)) if verbose else {}
-    if as_json:
+    master, graph = options.graph()
+    wanted = read_namespace(namespace, "service")
+    names = [name for name in sorted(graph.services) if wanted.contains(name, peers_of(graph.services[name]))]
+    found = asyncio.run(probe_all(master, names)) if verbose else {}
+    if options.as_json:
         print_json([_service_json(graph, name, found.get(name)) for name in names])
     elif verbose:
-        rows = [(printable(name), printable(_type_of(found[name])), printable(_whose(graph, name))) for name in names]
+        rows = [(name, _type_of(found[name]), origin_text(_node(graph, name, "unknown"))) for name in names]
         print_table((Column("SERVICE"), Column("TYPE"), Column("NODE")), rows)
     else:
-        for name in names:
-            click.echo(printable(name) + _mark(graph, name))
+        print_names(names, graph.services)
 
 
 def _type_of(found: Probed) -> str:
     return found.description.type if found.description is not None else "does not answer"
 
 
-def _whose(graph: Graph, name: str) -> str:
-    node = next(iter(graph.services.get(name, ())), "unknown")
-    proxy = proxied_node(node)
-    return node if proxy is None else f"{proxy[1]} of peer {proxy[0]}, by its proxy {node}"
-
-
 @click.command(
     epilog="\b\nExamples:\n  rmpa service info /add_two_ints\n  rmpa service info base:/arm/enable --json\n"
 )
 @click.argument("service")
-@json_option
-@agent_option
-@master_option
-def info(service: str, as_json: bool, agent: str | None, master: str | None) -> None:
+@graph_options
+def info(service: str, options: GraphOptions) -> None:
     """Show a service's node, address, type and arguments, and what of it crosses."""
-    wanted = read_topic(service, "service")
-    chosen, graph = _graph(master, agent)
-    mesh = crossing(chosen, wanted)
+    wanted = read_name(service, "service")
+    master, graph = options.graph()
+    mesh = crossing(master, wanted)
     if any(each.hidden for each in mesh) and all(each.hidden for each in mesh):
-        # Not in the graph, and that is what the user wants to know.
-        if as_json:
-            print_json({"name": wanted.topic, "mesh": mesh})
+        # It is not in the graph because it is hidden: the lines say why.
+        if options.as_json:
+            print_json({"name": wanted.name, "mesh": mesh})
         else:
             print_crossing(mesh)
         return
-    require_service(graph, wanted)
-    found = asyncio.run(probe(chosen, wanted.topic))
+    graph.require_service(wanted)
+    found = asyncio.run(probe(master, wanted.name))
     request, response, unknown = _halves(found)
-    if as_json:
-        about = _service_json(graph, wanted.topic, found)
+    if options.as_json:
+        about = _service_json(graph, wanted.name, found)
         about |= {"request": request and _fields(request), "response": response and _fields(response)}
         print_json(about | {"mesh": mesh})
         return
-    click.echo(f"Node: {printable(_whose(graph, wanted.topic))}")
-    click.echo(f"URI: {printable(found.uri)}")
+    print_line(f"Node: {origin_text(_node(graph, wanted.name, 'unknown'))}")
+    print_line(f"URI: {found.uri}")
     if found.description is None:
         _print_mesh(mesh)
-        raise RmpaError(f"{wanted.topic} does not say what it is: {found.problem}")
-    click.echo(f"Type: {printable(found.description.type)}")
-    click.echo(f"MD5: {printable(found.description.md5sum)}")
+        raise RmpaError(f"{wanted.name} does not say what it is: {found.problem}")
+    print_line(f"Type: {found.description.type}")
+    print_line(f"MD5: {found.description.md5sum}")
     if request is None or response is None:
-        warn(printable(unknown))
+        warn(unknown)
     else:
-        click.echo(f"Args: {' '.join(_fields(request))}")
+        print_line(f"Args: {' '.join(_fields(request))}")
         for title, half in (("Request", request), ("Response", response)):
-            click.echo(f"{title}:" + ("" if half.fields else " nothing"))
+            print_line(f"{title}:" + ("" if half.fields else " nothing"))
             for field in half.fields:
-                click.echo(f"  {field} {field.name}")
+                print_line(f"  {field} {field.name}")
     _print_mesh(mesh)
 
 
@@ -141,7 +114,7 @@ def _print_mesh(mesh: tuple[ServiceInfo, ...]) -> None:
 
 
 def _halves(found: Probed) -> tuple[MessageType | None, MessageType | None, str]:
-    """The request's and the response's types, or why they are not known here."""
+    """The types of request and response, or the reason why they are not known here."""
     if found.description is None:
         return None, None, found.problem
     try:
@@ -157,38 +130,33 @@ def _fields(half: MessageType) -> list[str]:
 
 @click.command("type", epilog="\b\nExamples:\n  rmpa service type /add_two_ints\n")
 @click.argument("service")
-@json_option
-@agent_option
-@master_option
-def type_(service: str, as_json: bool, agent: str | None, master: str | None) -> None:
+@graph_options
+def type_(service: str, options: GraphOptions) -> None:
     """Print a service's type."""
-    wanted = read_topic(service, "service")
-    chosen, graph = _graph(master, agent)
-    require_service(graph, wanted)
-    found = asyncio.run(probe(chosen, wanted.topic))
+    wanted = read_name(service, "service")
+    master, graph = options.graph()
+    graph.require_service(wanted)
+    found = asyncio.run(probe(master, wanted.name))
     if found.description is None:
-        raise RmpaError(f"{wanted.topic} does not say what it is: {found.problem}")
-    if as_json:
-        print_json({"name": wanted.topic, "type": found.description.type, "md5": found.description.md5sum})
+        raise RmpaError(f"{wanted.name} does not say what it is: {found.problem}")
+    if options.as_json:
+        print_json({"name": wanted.name, "type": found.description.type, "md5": found.description.md5sum})
     else:
-        click.echo(printable(found.description.type))
+        print_line(found.description.type)
 
 
 @click.command(epilog="\b\nExamples:\n  rmpa service find std_srvs/Trigger\n")
 @click.argument("kind", metavar="TYPE")
-@json_option
-@agent_option
-@master_option
-def find(kind: str, as_json: bool, agent: str | None, master: str | None) -> None:
+@graph_options
+def find(kind: str, options: GraphOptions) -> None:
     """Print the services of a TYPE; each server is asked, and one that does not answer is named on stderr."""
-    chosen, graph = _graph(master, agent)
-    probed = asyncio.run(probe_all(chosen, sorted(graph.services)))
+    master, graph = options.graph()
+    probed = asyncio.run(probe_all(master, sorted(graph.services)))
     found = [name for name, each in probed.items() if each.description is not None and each.description.type == kind]
     for name, each in probed.items():
         if each.description is None:
-            warn(printable(f"{name}: {each.problem}"))
-    if as_json:
+            warn(f"{name}: {each.problem}")
+    if options.as_json:
         print_json(found)
     else:
-        for name in found:
-            click.echo(printable(name) + _mark(graph, name))
+        print_names(found, graph.services)

@@ -1,4 +1,4 @@
-"""Runs a command that goes on until Ctrl-C, a count or its master ends it: one anonymous ROS node, left cleanly."""
+"""Runs commands that end at Ctrl-C, at a count, or with their master: one anonymous ROS node, closed cleanly."""
 
 from __future__ import annotations
 
@@ -13,31 +13,32 @@ from rmpa.core.errors import UnreachableError
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine
 
-    from rmpa.cli.master import Master, TopicName
+    from rmpa.cli.graph import GraphName
+    from rmpa.cli.master import Master
     from rmpa.ros.node.node import Node, Received
 
 
 class Enough(Exception):  # noqa: N818 - not an error
-    """As many messages came as were asked for: raised by a command's callback, caught around ``watch_topic``."""
+    """``--count`` is reached: raised by a command's callback, caught around ``watch_topic``."""
 
 
 class StreamWatch:
-    """Until when a command runs, and where its callbacks hand over what went wrong."""
+    """The end of a running command, and the error that its callbacks report."""
 
     def __init__(self) -> None:
         self._end = asyncio.Event()
         self._error: BaseException | None = None
 
     def finish(self, error: BaseException | None = None) -> None:
-        """End the command; with an error it fails with that."""
+        """End the command; it fails with the first error that is given."""
         self._error = self._error or error
         self._end.set()
 
     async def finished(self, seconds: float | None = None) -> bool:
-        """Wait for the end, or for so long; whether it is the end.
+        """Wait for the end, or for so many seconds; return whether the command ends.
 
         Raises:
-            BaseException: What ``finish`` was given.
+            BaseException: The error that ``finish`` was given.
         """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
@@ -48,7 +49,7 @@ class StreamWatch:
 
 
 def run_stream(body: Callable[[], Coroutine[object, object, None]]) -> None:
-    """Run until the body ends; Ctrl-C and SIGTERM end it too, behind its own cleaning up."""
+    """Run a coroutine to its end; Ctrl-C and SIGTERM cancel it, and its own clean-up runs."""
     from rmpa.runtime.descriptors import raise_file_limit
 
     async def run() -> None:
@@ -83,7 +84,7 @@ async def with_node(master: Master, name: str, body: Callable[[Node], Awaitable[
 
 async def watch_topic(
     master: Master,
-    wanted: TopicName,
+    wanted: GraphName,
     on_message: Callable[[Received], None],
     body: Callable[[StreamWatch], Awaitable[None]],
 ) -> None:
@@ -91,14 +92,14 @@ async def watch_topic(
 
     Args:
         master: The master to ask.
-        wanted: The topic, and perhaps the one peer whose messages are meant.
-        on_message: Called for each of them; what it raises ends the command.
+        wanted: The topic; with a peer only messages of that peer's nodes count.
+        on_message: Called for each message; an exception ends the command and is raised by ``watch.finished``.
         body: Runs until the watch is finished.
     """
     watch = StreamWatch()
 
     def take(received: Received) -> None:
-        if not wanted.takes(received.caller_id):
+        if not wanted.matches(received.caller_id):
             return
         try:
             on_message(received)
@@ -106,7 +107,7 @@ async def watch_topic(
             watch.finish(error)
 
     async def listen(node: Node) -> None:
-        subscriber = await node.subscribe(wanted.topic, None, take)
+        subscriber = await node.subscribe(wanted.name, None, take)
         stopped = asyncio.get_running_loop().create_task(_end_with(node, watch))
         try:
             await body(watch)

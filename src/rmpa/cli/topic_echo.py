@@ -1,62 +1,64 @@
-"""``rmpa topic echo``: messages as they come."""
+"""``rmpa topic echo``: prints messages as they arrive."""
 
 from __future__ import annotations
 
 import csv
 import io
-import os
 import sys
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import click
 
 from rmpa.bridge.proxy_names import proxied_node
-from rmpa.cli.master import Graph, Master, TopicName, choose_master, read_graph, read_topic
+from rmpa.cli.graph import Graph, GraphName, read_graph, read_name
 from rmpa.cli.message_text import flatten, pick, shorten, to_text
-from rmpa.cli.options import agent_option, json_option, master_option
-from rmpa.cli.output import print_json, print_line, warn
+from rmpa.cli.options import GraphOptions, graph_options
+from rmpa.cli.output import print_json, warn
 from rmpa.cli.stream import Enough, StreamWatch, run_stream, watch_topic
 from rmpa.config.values import did_you_mean
 
 if TYPE_CHECKING:
+    from rmpa.cli.master import Master
     from rmpa.ros.node.node import Received
     from rmpa.ros.types.messages import Plain
 
-_CLEAR = "\x1b[2J\x1b[H"
 
-
+@dataclass
 class _MessagePrinter:
-    """Prints messages, each in the form that was asked for."""
+    """Prints messages in one form and counts them.
 
-    def __init__(
-        self, wanted: TopicName, path: list[str], *, form: str, noarr: bool, nostr: bool, clear: bool
-    ) -> None:
-        self.count = 0
-        self._wanted = wanted
-        self._path = path
-        self._form = form
-        self._noarr = noarr
-        self._nostr = nostr
-        self._clear = clear
+    Args:
+        form: ``text``, ``csv`` or ``json``.
+        noarr: Print the length of an array in place of its elements.
+        nostr: Print the length of a string in place of its text.
+        clear: Clear the terminal before each message.
+    """
 
-    def show(self, received: Received) -> None:
-        plain = shorten(pick(received.plain, self._path), arrays=self._noarr, strings=self._nostr)
+    form: str
+    noarr: bool
+    nostr: bool
+    clear: bool
+    count: int = 0
+
+    def show(self, received: Received, wanted: GraphName, path: list[str]) -> None:
+        """Print a message, or the field of it at ``path``."""
+        plain = shorten(pick(received.plain, path), arrays=self.noarr, strings=self.nostr)
         self.count += 1
-        if self._form == "json":
-            self._json(received, plain)
-        elif self._form == "csv":
+        if self.form == "json":
+            proxy = proxied_node(received.caller_id)
+            source = {"node": received.caller_id} if proxy is None else {"peer": proxy[0], "node": proxy[1]}
+            line: dict[str, Plain] = {"topic": str(wanted), **source, "time": received.stamp_ns / 1e9}
+            print_json(line | {"message": plain})
+        elif self.form == "csv":
             columns = list(flatten(plain))
             if self.count == 1:
-                print_line(_csv(["%time", *(name for name, _ in columns)]))
-            print_line(_csv([str(received.stamp_ns), *(cell for _, cell in columns)]))
+                click.echo(_csv(["%time", *(name for name, _ in columns)]))
+            click.echo(_csv([str(received.stamp_ns), *(cell for _, cell in columns)]))
         else:
-            print_line((_CLEAR if self._clear else "") + to_text(plain) + "\n---")
-
-    def _json(self, received: Received, plain: Plain) -> None:
-        proxy = proxied_node(received.caller_id)
-        whence = {"node": received.caller_id} if proxy is None else {"peer": proxy[0], "node": proxy[1]}
-        line = {"topic": str(self._wanted), **whence, "time": received.stamp_ns / 1e9, "message": plain}
-        print_json(line, flush=True)
+            if self.clear:
+                click.clear()
+            click.echo(to_text(plain) + "\n---")
 
 
 def _csv(cells: list[str]) -> str:
@@ -65,8 +67,8 @@ def _csv(cells: list[str]) -> str:
     return line.getvalue()
 
 
-def split_field(text: str, graph: Graph) -> tuple[TopicName, list[str]]:
-    """``/cmd/axes[0]`` to the topic and the path of a field in it, by which topics there are.
+def split_field(text: str, graph: Graph) -> tuple[GraphName, list[str]]:
+    """Split ``/cmd/axes[0]`` into the topic and the path of a field, by the topics that the graph has.
 
     Raises:
         ConfigError: It is no topic's name.
@@ -76,8 +78,8 @@ def split_field(text: str, graph: Graph) -> tuple[TopicName, list[str]]:
     for end in range(len(parts), 0, -1):
         topic = "/" + "/".join(parts[:end])
         if topic in graph.publishers or topic in graph.subscribers:
-            return read_topic(f"{peer}{colon}{topic}"), parts[end:]
-    return read_topic(text), []
+            return read_name(f"{peer}{colon}{topic}"), parts[end:]
+    return read_name(text), []
 
 
 @click.command(
@@ -97,50 +99,37 @@ Examples:
 @click.option("--noarr", is_flag=True, help="Leave arrays out.")
 @click.option("--nostr", is_flag=True, help="Leave strings out.")
 @click.option("-c", "--clear", is_flag=True, help="Clear the terminal before each message.")
-@json_option
-@agent_option
-@master_option
+@graph_options
 def echo(
-    topic: str,
-    count: int | None,
-    plot: bool,
-    noarr: bool,
-    nostr: bool,
-    clear: bool,
-    as_json: bool,
-    agent: str | None,
-    master: str | None,
+    topic: str, count: int | None, plot: bool, noarr: bool, nostr: bool, clear: bool, options: GraphOptions
 ) -> None:
     """Print messages until Ctrl-C.
 
     Behind the TOPIC a field may stand: /cmd/axes, /cmd/axes[0].
     """
-    form = "json" if as_json else "csv" if plot else "text"
-    chosen = choose_master(master, agent, os.environ)
-    clear = clear and sys.stdout.isatty()
-    run_stream(lambda: _echo(chosen, topic, count, form=form, noarr=noarr, nostr=nostr, clear=clear))
+    form = "json" if options.as_json else "csv" if plot else "text"
+    printer = _MessagePrinter(form, noarr, nostr, clear and sys.stdout.isatty())
+    master = options.master()
+    run_stream(lambda: _echo(master, topic, count, printer))
 
 
-async def _echo(
-    master: Master, topic: str, count: int | None, *, form: str, noarr: bool, nostr: bool, clear: bool
-) -> None:
+async def _echo(master: Master, topic: str, count: int | None, printer: _MessagePrinter) -> None:
     graph = await read_graph(master)
     wanted, path = split_field(topic, graph)
-    if wanted.topic not in graph.publishers:
-        near = did_you_mean(wanted.topic, graph.publishers)
-        warn(f"{wanted.topic} is not published yet; waiting" + (f" (did you mean {near}?)" if near else ""))
-    printer = _MessagePrinter(wanted, path, form=form, noarr=noarr, nostr=nostr, clear=clear)
+    if wanted.name not in graph.publishers:
+        near = did_you_mean(wanted.name, graph.publishers)
+        warn(f"{wanted.name} is not published yet; waiting" + (f" (did you mean {near}?)" if near else ""))
 
-    def take(received: Received) -> None:
+    def on_message(received: Received) -> None:
         if count is None or printer.count < count:
-            printer.show(received)
-        if count is not None and printer.count >= count:
+            printer.show(received, wanted, path)
+        if printer.count == count:
             raise Enough
 
     async def body(watch: StreamWatch) -> None:
         await watch.finished()
 
     try:
-        await watch_topic(master, wanted, take, body)
+        await watch_topic(master, wanted, on_message, body)
     except Enough:
         return

@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 import asyncio
-import os
+import contextlib
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import click
 
-from rmpa.cli.master import Master, choose_master, read_topic
-from rmpa.cli.options import agent_option, json_option, master_option
-from rmpa.cli.output import print_json, print_line, printable, warn
+from rmpa.cli.graph import read_name
+from rmpa.cli.options import GraphOptions, graph_options
+from rmpa.cli.output import print_json, print_line, warn
 from rmpa.cli.stream import run_stream, with_node
 from rmpa.core.errors import ConfigError, UnreachableError
 
 if TYPE_CHECKING:
+    from rmpa.cli.master import Master
     from rmpa.ros.node.node import Node, Publisher
     from rmpa.ros.types.messages import MessageType, Plain
 
 _ONCE_SECONDS: Final = 3.0
-"""How long a single message stays latched for subscribers to find us, as ``rostopic pub -1`` has it."""
+"""Seconds for which a single message stays latched for subscribers to connect, as in ``rostopic pub -1``."""
 
 
 def read_values(texts: tuple[str, ...]) -> Plain:
-    """What the command line says of a message: nothing, one YAML value, or one for each field in order.
+    """Read a message's values from the command line: none, one YAML value, or one for each field in order.
 
     Raises:
         ConfigError: It is not YAML.
@@ -45,7 +47,7 @@ def read_values(texts: tuple[str, ...]) -> Plain:
 
 
 def fill_stamps(values: Plain, now_ns: int) -> Plain:
-    """Put the time where ``auto`` (a header) and ``now`` (a stamp) stand, as rostopic does."""
+    """Replace ``auto`` (a header) and ``now`` (a stamp) by the time, as rostopic does."""
     secs, nsecs = divmod(now_ns, 1_000_000_000)
     stamp: dict[str, Plain] = {"secs": secs, "nsecs": nsecs}
     if isinstance(values, list):
@@ -85,27 +87,17 @@ Examples:
 @click.option("-r", "--rate", type=click.FloatRange(0.001, 10_000), help="Messages a second, until Ctrl-C.")
 @click.option("-1", "--once", is_flag=True, help="Publish one message and end.")
 @click.option("-l", "--latch", is_flag=True, help="Latch, with -r too: a new subscriber gets the last message.")
-@json_option
-@agent_option
-@master_option
+@graph_options
 def pub(
-    topic: str,
-    kind: str,
-    values: tuple[str, ...],
-    rate: float | None,
-    once: bool,
-    latch: bool,
-    as_json: bool,
-    agent: str | None,
-    master: str | None,
+    topic: str, kind: str, values: tuple[str, ...], rate: float | None, once: bool, latch: bool, options: GraphOptions
 ) -> None:
     """Publish VALUES, in YAML or JSON, as messages of a TYPE on a TOPIC."""
     from rmpa.ros.types.definitions import UnknownTypeError
     from rmpa.ros.types.find import find_message_type
 
-    wanted = read_topic(topic)
+    wanted = read_name(topic)
     if wanted.peer is not None:
-        raise ConfigError("TOPIC", f"{topic!r} names a peer", f"publish on {wanted.topic}: it crosses to every peer")
+        raise ConfigError("TOPIC", f"{topic!r} names a peer", f"publish on {wanted.name}: it crosses to every peer")
     if once and rate is not None:
         raise ConfigError("--once", "does not go with --rate", "choose one of them")
     plain = read_values(values)
@@ -118,17 +110,16 @@ def pub(
             raise
         unknown = error
     if found is not None and not found.source:
-        found.make(fill_stamps(plain, 0))  # a mistake is told before anything is asked
-    chosen = choose_master(master, agent, os.environ)
+        found.make(fill_stamps(plain, 0))  # a mistake is reported before the master is asked
+    master = options.master()
     latch = latch or rate is None
+    publish = partial(_pub, master, wanted.name, found or kind, plain, rate, once=once, latch=latch)
     try:
-        run_stream(
-            lambda: _pub(chosen, wanted.topic, found or kind, plain, rate, once=once, latch=latch, as_json=as_json)
-        )
+        run_stream(lambda: publish(as_json=options.as_json))
     except UnreachableError as error:
         if unknown is None:
             raise
-        unknown.problem += f"; {error}"  # whose publishers might know it
+        unknown.problem += f"; {error}"  # a publisher there might have told the type
         raise unknown from None
 
 
@@ -145,7 +136,7 @@ async def _pub(
 ) -> None:
     async def publish(node: Node) -> None:
         kind = await _version(node, topic, type_)
-        kind.make(fill_stamps(plain, 0))  # a mistake is told before anything is registered
+        kind.make(fill_stamps(plain, 0))  # a mistake is reported before the topic is registered
         publisher = await node.advertise(topic, kind, latch=latch)
         if rate is not None:
             if not as_json:
@@ -162,7 +153,9 @@ async def _pub(
 
 
 async def _version(node: Node, topic: str, found: MessageType | str) -> MessageType:
-    """The type, learnt if it was not found here; of a user's own type the version that the topic has already.
+    """The type to publish: as found here, else learnt from a publisher.
+
+    For a type of the user's own packages the version of a present publisher is taken, with a warning.
 
     Raises:
         DefinitionError: It is not known here, and no publisher tells it.
@@ -175,10 +168,8 @@ async def _version(node: Node, topic: str, found: MessageType | str) -> MessageT
         there = await fetch_type(node.master_uri, node.name, found.name, topic=topic, elsewhere=False)
         if there is not None and there.kind.md5sum != found.md5sum:
             warn(
-                printable(
-                    f"{there.node} publishes {topic} with another version of {found.name} (md5 {there.kind.md5sum}) "
-                    f"than {found.source} has ({found.md5sum}); that of {there.node} is used"
-                )
+                f"{there.node} publishes {topic} with another version of {found.name} (md5 {there.kind.md5sum}) "
+                f"than {found.source} has ({found.md5sum}); that of {there.node} is used"
             )
             return there.kind
     return found
@@ -189,7 +180,7 @@ def _one(publisher: Publisher, kind: MessageType, plain: Plain, number: int, *, 
     publisher.publish(kind.make(fill_stamps(plain, now_ns)))
     if as_json:
         line = {"topic": publisher.topic, "seq": number, "time": now_ns / 1e9, "subscribers": publisher.subscribers}
-        print_json(line, flush=True)
+        print_json(line)
 
 
 async def _repeat(
@@ -201,13 +192,11 @@ async def _repeat(
     while not node.stopped.is_set():
         number += 1
         _one(publisher, kind, plain, number, as_json=as_json)
-        # Each from the beginning: what one comes late is not added to the next.
+        # Each due time counts from the beginning, so that lateness does not add up.
         await _wait(node, max(0.0, begin + number / rate - loop.time()))
 
 
 async def _wait(node: Node, seconds: float | None) -> None:
-    try:
+    with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(seconds):
             await node.stopped.wait()
-    except TimeoutError:
-        pass

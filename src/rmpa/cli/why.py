@@ -1,28 +1,25 @@
-"""``rmpa why``: where on its way a topic gets lost."""
+"""``rmpa why``: the stage at which a topic of a peer, or a service, stops."""
 
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import click
 
-from rmpa.cli.master import read_topic
+from rmpa.cli.graph import read_name
 from rmpa.cli.options import agent_option, json_option
-from rmpa.cli.output import coloured, print_json, printable
+from rmpa.cli.output import LEVEL_COLOURS, print_json, printable
 from rmpa.observe import limits
+from rmpa.observe.check import FAIL, OK, WARN
 from rmpa.observe.io.control_client import ControlClient, choose_agent
-from rmpa.observe.why.diagnosis import Diagnosis, PathStage, StageResult
+from rmpa.observe.why.diagnosis import Diagnosis
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-_COLOURS: Final = {
-    StageResult.OK: "green",
-    StageResult.WARN: "yellow",
-    StageResult.FAIL: "red",
-    StageResult.UNKNOWN: "yellow",
-}
+    from rmpa.observe.check import Check, CheckLevel
+
 EPILOG = """\
 \b
 Exit codes: 0 it flows, on every way if there are several; 1 it does not, and the first stage that fails says why.
@@ -44,14 +41,14 @@ Examples:
 def why(name: str, service: bool, as_json: bool, agent: str | None) -> int:
     """Say why a topic of a peer does not arrive here, or a service cannot be called, and what to do.
 
-    Both agents are asked, stage by stage from the publisher to the reader; what flows is looked at for a second, and
+    Both agents are asked, stage by stage from the publisher to the reader; messages are watched for a second, and
     a service's server is probed.
-    PEER is a name or a GUID. Without PEER every module that publishes the topic is looked at, and for one of this
+    PEER is a name or a GUID. Without PEER every module that publishes the topic is checked, and for one of this
     module's own topics every peer says how it arrives there.
     """
-    wanted = read_topic(name)
+    wanted = read_name(name)
     with ControlClient(choose_agent(os.environ, agent).path, timeout=limits.CONTROL_HANDLER_TIMEOUT) as client:
-        found = client.call("why", tuple[Diagnosis, ...], name=wanted.topic, peer=wanted.peer, service=service)
+        found = client.call("why", tuple[Diagnosis, ...], name=wanted.name, peer=wanted.peer, service=service)
     if as_json:
         print_json(found)
     else:
@@ -64,7 +61,7 @@ def why(name: str, service: bool, as_json: bool, agent: str | None) -> int:
 
 
 def exit_code(diagnoses: Sequence[Diagnosis]) -> int:
-    """0 if something gets through on every way that was meant, else 1."""
+    """0 if messages or calls get through on every path that was asked about, else 1."""
     return 0 if diagnoses and all(diagnosis.flows for diagnosis in diagnoses) else 1
 
 
@@ -77,19 +74,19 @@ def _lines(diagnosis: Diagnosis) -> list[str]:
     lines += [_line(stage, width) for stage in diagnosis.stages]
     failed = diagnosis.failed
     if failed is None:
-        lines.append(_paint("it can be called" if diagnosis.kind == "service" else "it flows", StageResult.OK))
+        lines.append(_paint("it can be called" if diagnosis.kind == "service" else "it flows", OK))
     else:
-        lines.append(_paint(printable(f"it stops at: {failed.name}"), StageResult.FAIL))
+        lines.append(_paint(printable(f"it stops at: {failed.name}"), FAIL))
         if failed.remedy:
             lines.append(printable(f"what to do: {failed.remedy}"))
     return lines
 
 
-def _line(stage: PathStage, width: int) -> str:
-    mark = _paint(f"{stage.verdict.value:<7}", stage.verdict)
-    advice = f" ({stage.remedy})" if stage.remedy and stage.verdict is StageResult.WARN else ""
+def _line(stage: Check, width: int) -> str:
+    mark = _paint(f"{stage.level.value:<7}", stage.level)
+    advice = f" ({stage.remedy})" if stage.remedy and stage.level is WARN else ""
     return f"  {mark}  {printable(stage.name):<{width}}  {printable(stage.text + advice)}"
 
 
-def _paint(text: str, verdict: StageResult) -> str:
-    return click.style(text, fg=_COLOURS[verdict]) if coloured() else text
+def _paint(text: str, level: CheckLevel) -> str:
+    return click.style(text, fg=LEVEL_COLOURS[level])

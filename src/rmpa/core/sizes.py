@@ -1,4 +1,4 @@
-"""Units of size."""
+"""Units of size, and the bounds of 32-bit integers."""
 
 from __future__ import annotations
 
@@ -6,3 +6,7 @@ from typing import Final
 
 KIB: Final = 1024
 MIB: Final = 1024 * KIB
+
+INT32_MIN: Final = -(1 << 31)
+INT32_MAX: Final = (1 << 31) - 1
+UINT32_MAX: Final = (1 << 32) - 1

@@ -22,6 +22,7 @@ from typing import Final
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError
 from rmpa.core.guid import Guid, dialable
 from rmpa.core.identity import Identity
+from rmpa.core.sizes import UINT32_MAX
 from rmpa.discovery import limits
 
 Endpoint = tuple[str, int]
@@ -34,7 +35,6 @@ _PREFIX: Final = struct.Struct(">4sBBH")
 _FIXED: Final = struct.Struct(">4sBBHQ16sIIB")
 _GUID: Final = struct.Struct(">Q")
 _ENDPOINT: Final = struct.Struct(">4sH")
-_U32: Final = 0xFFFF_FFFF
 
 
 class BeaconKind(IntEnum):
@@ -107,7 +107,7 @@ class Beacon:
     elsewhere: tuple[Endpoint, ...] = ()
 
     def __post_init__(self) -> None:
-        if not (0 <= self.lease_ms <= _U32 and 0 <= self.sequence <= _U32):
+        if not (0 <= self.lease_ms <= UINT32_MAX and 0 <= self.sequence <= UINT32_MAX):
             raise ValueError("lease and sequence have 32 bits")
         if len(self.identity.addresses) > limits.BEACON_ADDRESSES_MAX:
             raise ValueError(f"a beacon carries at most {limits.BEACON_ADDRESSES_MAX} addresses")

@@ -7,6 +7,7 @@ from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core import limits as core_limits
+from rmpa.core.serial_number import is_later
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import BeaconKind
 from rmpa.discovery.events import HeardBy
@@ -64,7 +65,7 @@ class PeerInstance:
 
     def accepts(self, sequence: int) -> bool:
         """Whether a beacon is newer than the last one (serial numbers, RFC 1982: they wrap)."""
-        return self.sequence is None or 0 < (sequence - self.sequence) & 0xFFFF_FFFF < 1 << 31
+        return self.sequence is None or is_later(sequence, self.sequence)
 
     def heed(self, beacon: Beacon, now: float, source: Address, *, multicast: bool) -> None:
         """Take over what a newer beacon says."""

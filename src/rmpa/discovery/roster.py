@@ -12,6 +12,7 @@ from rmpa.core import limits as core_limits
 from rmpa.core.clock import earliest
 from rmpa.core.counters import Counters
 from rmpa.core.identity import Identity
+from rmpa.core.serial_number import serial_add
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.discovery import limits
 from rmpa.discovery.beacon import Beacon, BeaconKind
@@ -469,7 +470,7 @@ class Roster:
     # --- sending ----------------------------------------------------------------------------------------------
 
     def _beacon(self, kind: BeaconKind, gossip: tuple[Guid, ...] = ()) -> Beacon:
-        self._sequence = (self._sequence + 1) & 0xFFFF_FFFF
+        self._sequence = serial_add(self._sequence, 1)
         return Beacon(kind, self._own, self._lease_ms, self._sequence, gossip, self._elsewhere(gossip))
 
     def _elsewhere(self, gossip: tuple[Guid, ...]) -> tuple[Address, ...]:

@@ -1,1 +1,1 @@
-"""The TCP links between peers: frames, handshake, keepalive, who dials whom (paper, section 4.4)."""
+"""The TCP links between peers: frames, handshake, keepalive, and which side dials (paper, section 4.4)."""

@@ -1,7 +1,7 @@
-"""Frames: what a link is made of (docs/design/protocol.md, "Frames").
+"""Frames: the units of a connection's byte stream (docs/design/protocol.md, "Frames").
 
-``Frame`` is the readable form, for everything rare. The data path packs and reads headers with the two bound
-methods ``pack_header`` and ``unpack_header`` and makes no objects.
+``Frame`` is the readable form, for all frames that are rare. The data path packs headers by ``pack_data_header`` and
+``pack_fragment_header``, reads them by ``unpack_header``, and makes no objects.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
 from rmpa.core.outbox import ABORT, FIRST, LAST
+from rmpa.core.serial_number import SERIAL_MASK
 from rmpa.mesh import limits
 
 if TYPE_CHECKING:
@@ -78,14 +79,14 @@ def pack_data_header(length: int, route: int, sequence: int, stamp_ns: int) -> b
     if length > limits.DATA_PAYLOAD_MAX:
         raise LocalProtocolError(f"a message of {length} bytes exceeds a frame's {limits.DATA_PAYLOAD_MAX}")
     try:
-        return _pack(length, 7, 3, 0, route, sequence & 0xFFFFFFFF, stamp_ns)
+        return _pack(length, 7, 3, 0, route, sequence & SERIAL_MASK, stamp_ns)
     except struct.error as error:
         raise LocalProtocolError(f"route {route} or stamp {stamp_ns} does not fit its field: {error}") from None
 
 
 def pack_fragment_header(parcel: QueuedMessage, length: int, flags: int) -> bytes:
     """The 24 bytes in front of a fragment of ``length`` bytes; the parcel's key is the route."""
-    return _pack(length, 7, flags, 0, parcel.key, parcel.sequence & 0xFFFFFFFF, parcel.stamp_ns)
+    return _pack(length, 7, flags, 0, parcel.key, parcel.sequence & SERIAL_MASK, parcel.stamp_ns)
 
 
 def check_header(length: int, kind: int, flags: int) -> None:
@@ -93,7 +94,7 @@ def check_header(length: int, kind: int, flags: int) -> None:
 
     Raises:
         LimitExceeded: The length is beyond what this kind may have.
-        RemoteProtocolError: There is no such kind, or it is no fragment that there can be.
+        RemoteProtocolError: The kind is unknown, or the flags are not possible.
     """
     limit = PAYLOAD_MAX.get(kind)
     if limit is None:
@@ -117,7 +118,7 @@ class Frame:
     """One whole frame.
 
     Args:
-        kind: What it is.
+        kind: Its kind.
         payload: Its bytes; what they mean depends on the kind.
         route: Data only: the route's id, 32 bits.
         sequence: Data only: counts the messages of the route, 32 bits.
@@ -140,7 +141,7 @@ class Frame:
             The frame and how many bytes it took; ``None`` while it is not complete.
 
         Raises:
-            RemoteProtocolError: Its header claims what cannot be (known as soon as the header is there).
+            RemoteProtocolError: Its header claims what is not allowed; raised as soon as the header is complete.
         """
         if len(data) < limits.FRAME_HEADER_BYTES:
             return None
@@ -185,7 +186,7 @@ def parse_pong(payload: Buffer) -> tuple[int, int]:
     """Read t1 and t2, in ns, from a pong's payload.
 
     Raises:
-        RemoteProtocolError: It has not 16 bytes.
+        RemoteProtocolError: It does not have 16 bytes.
     """
     if len(payload) != _STAMPS.size:
         raise RemoteProtocolError(f"pong of {len(payload)} bytes; it has {_STAMPS.size}")

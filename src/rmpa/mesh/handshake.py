@@ -1,6 +1,7 @@
-"""The handshake: who is there, and whether we want to be linked (docs/design/protocol.md, "Handshake").
+"""The handshake: each side says what it is, and accepts or refuses (docs/design/protocol.md, "Handshake").
 
-``judge`` decides on a hello, ``judge_welcome`` on the answer; both are pure, the machines act on them.
+``judge`` decides on a hello, ``judge_welcome`` on the answer; both are pure functions, the machines act on the
+result.
 """
 
 from __future__ import annotations
@@ -35,11 +36,11 @@ class Lane(IntEnum):
 
 
 LANES: Final = frozenset({Lane.EXPRESS, Lane.BULK})
-"""The lanes that this version joins."""
+"""The lanes that this version knows."""
 
 
 class Refusal(IntEnum):
-    """Why a link was refused."""
+    """Why a connection was refused; the numbers are those on the wire."""
 
     VERSION = 1
     DOMAIN = 2
@@ -55,7 +56,7 @@ class Refusal(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Refuse:
-    """A no, with its reason: the payload of a refuse frame.
+    """A refusal with its reason: the payload of a refuse frame.
 
     Args:
         code: One of ``Refusal``, or a number of a later version.
@@ -83,7 +84,7 @@ class Refuse:
 
     @property
     def label(self) -> str:
-        """The code as a word for counts: ``version``, ``already_linked``, ``code 17``."""
+        """The code for the names of counters: ``version``, ``already_linked``, ``code 17``."""
         try:
             return Refusal(self.code).name.lower()
         except ValueError:
@@ -94,12 +95,8 @@ class Refuse:
         return f"{self.label}: {self.text}"
 
 
-Verdict = Refuse | None
-"""``None`` is a welcome."""
-
-
 class HandshakeError(RemoteProtocolError):
-    """A hello or welcome that cannot be read; ``refuse`` says so to its sender."""
+    """A hello or welcome that cannot be read; ``refuse`` is the answer to its sender."""
 
     def __init__(self, refuse: Refuse) -> None:
         super().__init__(refuse.text)
@@ -120,9 +117,9 @@ class Hello:
         name: The sender's.
         domain: The sender's.
         lease_ms: The sender is dead when it was silent for this long, in milliseconds.
-        expected: Hello: whom the sender believes it dialled, ``None`` if it knows only an address; welcome: the
+        expected: Hello: the GUID that the sender dialled, ``None`` if it knows only an address; welcome: the
             hello's GUID.
-        lane: What the connection is for; a number, because a later version may know more.
+        lane: What the connection is for; an ``int``, because a later version may know more lanes.
         features: Bits for later versions.
     """
 
@@ -137,7 +134,7 @@ class Hello:
 
     @classmethod
     def of(cls, identity: Identity, *, lease: float, expected: Guid | None, lane: int = Lane.EXPRESS) -> Hello:
-        """Say who we are; ``lease`` in seconds."""
+        """The hello of this identity; ``lease`` in seconds."""
         return cls(
             identity.guid, identity.instance, identity.name, identity.domain, round(lease * 1000), expected, lane
         )
@@ -169,7 +166,7 @@ class Hello:
         if lease_ms == 0:
             raise _malformed("a lease of 0")
         if not Guid(guid).dialable:
-            # Discovery would pass it on, and no beacon may carry it.
+            # Discovery would gossip about it, and no beacon may carry such a GUID.
             raise _malformed(f"no peer can be reached at {Guid(guid)}")
         return cls(Guid(guid), instance, name, domain, lease_ms, Guid(expected) if expected else None, lane, features)
 
@@ -193,12 +190,12 @@ class Hello:
 
     @property
     def lease(self) -> float:
-        """Seconds, within what we accept."""
+        """The lease in seconds, held within ``limits.LINK_LEASE_MIN`` and ``LINK_LEASE_MAX``."""
         return min(max(self.lease_ms / 1000, limits.LINK_LEASE_MIN), limits.LINK_LEASE_MAX)
 
     @property
     def identity(self) -> Identity:
-        """The sender as an identity; only valid for a domain that was judged to be ours."""
+        """The sender as an identity; only valid once its domain was checked."""
         return Identity(self.guid, self.instance, self.name, self.domain)
 
     def __str__(self) -> str:
@@ -213,13 +210,13 @@ def same_place(one: Guid, other: Guid) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class KnownLink:
-    """What a hello is judged against: a link that is up.
+    """A link that is up, against which a hello is judged.
 
     Args:
         guid: The peer's.
         instance: The peer's.
-        dialled: Whether we dialled.
-        alive: Whether bytes came lately (``limits.GHOST_QUIET``): it is not the link of a peer that died.
+        dialled: Whether this side dialled.
+        alive: Whether bytes came within ``limits.GHOST_QUIET``; else the peer may be dead.
     """
 
     guid: Guid
@@ -228,16 +225,16 @@ class KnownLink:
     alive: bool
 
 
-def judge(hello: Hello, ours: Identity, links: Iterable[KnownLink], *, busy: bool = False) -> Verdict:
-    """Decide on a hello that came in.
+def judge(hello: Hello, ours: Identity, links: Iterable[KnownLink], *, busy: bool = False) -> Refuse | None:
+    """Decide on a hello: ``None`` accepts the connection.
 
     Args:
         hello: What the dialler says.
-        ours: Who we are.
-        links: Our links that are up, or at least those with a peer of the hello's address and port.
-        busy: Whether we have no room for one more peer.
+        ours: The identity of this agent.
+        links: The links that are up, or at least those with a peer of the hello's address and port.
+        busy: Whether there is no room for one more peer.
     """
-    if refuse := _stranger(hello, ours):
+    if refuse := _judge_identity(hello, ours):
         return refuse
     if hello.lane not in LANES:
         return Refuse(Refusal.LANE, f"lane {hello.lane} is not supported here: install the same release on both")
@@ -260,15 +257,15 @@ def judge(hello: Hello, ours: Identity, links: Iterable[KnownLink], *, busy: boo
     return None
 
 
-def judge_welcome(welcome: Hello, ours: Identity, expected: Guid | None) -> Verdict:
-    """Decide on the answer to our hello.
+def judge_welcome(welcome: Hello, ours: Identity, expected: Guid | None) -> Refuse | None:
+    """Decide on the answer to a hello of this side: ``None`` accepts the connection.
 
     Args:
-        welcome: What the one we dialled says.
-        ours: Who we are.
-        expected: Whom we believe we dialled.
+        welcome: What the acceptor says.
+        ours: The identity of this agent.
+        expected: The GUID that was dialled; ``None`` if only the address is known.
     """
-    if refuse := _stranger(welcome, ours):
+    if refuse := _judge_identity(welcome, ours):
         return refuse
     if expected is not None and not same_place(expected, welcome.guid):
         who = f"{welcome.name} ({welcome.guid})"
@@ -279,7 +276,7 @@ def judge_welcome(welcome: Hello, ours: Identity, expected: Guid | None) -> Verd
     return None
 
 
-def _stranger(hello: Hello, ours: Identity) -> Verdict:
+def _judge_identity(hello: Hello, ours: Identity) -> Refuse | None:
     if hello.instance == ours.instance:
         return Refuse(Refusal.MYSELF, f"{ours.name} reached its own port: one of its addresses leads back to it")
     if hello.domain != ours.domain:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Final
 
 from rmpa.core.limits import ROSTER_LEASE
-from rmpa.core.sizes import KIB, MIB
+from rmpa.core.sizes import KIB, MIB, UINT32_MAX
 
 # --- mesh -------------------------------------------------------------------------------------------------------
 LINK_LEASE: Final = 1.0
@@ -166,7 +166,7 @@ RESUME_BYTES_MAX: Final = 256 * MIB
 """Messages kept for them, over all; those of the route that waited longest are given up first, and only counted."""
 RESUMES_COUNTED_MAX: Final = 4096
 """Reliable routes without a link whose messages are only counted, 3 KB each."""
-LOST_TOLD_MAX: Final = (1 << 32) - 1
+LOST_TOLD_MAX: Final = UINT32_MAX
 """Lost messages that one ``opened`` tells of; more were never counted."""
 LOSSES_REMEMBERED: Final = 8192
 """(peer, source) pairs of reliable routes that are not open, of which it is remembered what was lost."""

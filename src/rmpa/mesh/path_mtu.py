@@ -1,10 +1,10 @@
-"""Finds path-MTU black holes: paths that drop large packets without a word (RFC 2923), and remembers them.
+"""Finds path-MTU black holes, which are paths that drop large packets silently (RFC 2923), and remembers them.
 
-Where a tunnel or a firewall drops what is too large for it, and the ICMP message that should say so is lost, a TCP
-connection stands still with its first large segment, while small ones still go through. Linux's own remedy
-(``net.ipv4.tcp_mtu_probing``, RFC 4821) is off by default, and no socket can switch it on for itself. So both lanes
-of a link are watched. Data that stands still while the other lane carries a small packet there and back is the
-evidence; from then on messages to that address go in smaller segments.
+Where a tunnel or a firewall drops packets that are too large for it, and the ICMP message that should report this is
+lost, a TCP connection stalls at its first large segment, while small ones still get through. The remedy of Linux
+(``net.ipv4.tcp_mtu_probing``, RFC 4821) is off by default, and a socket cannot switch it on for itself. Therefore
+both lanes of a link are watched. Data that stalls while the other lane carries a small packet there and back is the
+evidence; from then on messages to that address are sent in smaller segments.
 
 Pure: samples of TCP_INFO and ``now`` in, judgements out.
 """
@@ -25,14 +25,14 @@ _REMEDY: Final = (
 
 @dataclass(frozen=True, slots=True)
 class TcpSample:
-    """What the kernel tells of one connection, from ``TCP_INFO`` and ``SIOCOUTQ``.
+    """What the kernel reports of one connection, by ``TCP_INFO`` and ``SIOCOUTQ``.
 
     Args:
-        queued: Bytes sent and not acknowledged, those that have not left yet included.
-        retransmits: Time-outs of the oldest segment in a row.
+        queued: Bytes written and not acknowledged, those that have not been sent yet included.
+        retransmits: Retransmission time-outs of the oldest segment in a row.
         acked: Bytes acknowledged since the connection began.
         delivered: Segments that arrived since then.
-        rtt: Round trip as the kernel knows it, seconds.
+        rtt: Round-trip time as the kernel estimates it, seconds.
     """
 
     queued: int
@@ -43,40 +43,40 @@ class TcpSample:
 
 
 class Progress(Enum):
-    """How a connection's data gets on."""
+    """Whether the data of a connection gets through."""
 
     FLOWING = auto()
     """Nothing waits, or what waits is being acknowledged."""
     WAITING = auto()
-    """Something was repeated and has not been acknowledged yet: worth another look soon."""
+    """Something was retransmitted and has not been acknowledged yet: worth another look soon."""
     STALLED = auto()
-    """Large segments are repeated in vain; a small packet by another way tells whether it is their size."""
+    """Large segments are retransmitted in vain; a small packet by another connection shows whether size matters."""
     BLACK_HOLE = auto()
-    """A small packet went there and back, and what was repeated behind it was lost all the same."""
+    """A small packet was answered, and what was retransmitted after it was lost all the same."""
 
 
 class StallWatch:
     """Judges one connection by the samples of it.
 
     Args:
-        segment: Bytes that a segment has at the most, or ``None`` for as many as the kernel likes.
+        segment: Bytes of the largest segment, or ``None`` for as many as the kernel chooses.
         now: Monotonic seconds.
-        before: The watch of the same connection until now, when its segments had another size.
+        before: The watch of the same connection until now, while its segments had another size.
     """
 
     def __init__(self, segment: int | None, now: float, before: StallWatch | None = None) -> None:
         self.segment = segment
         self._least = smaller(segment) or segment or 0
-        """Bytes of a segment that would pass where these do not; of the smallest ones their own."""
+        """Bytes of the next smaller segment size; of the smallest size itself."""
         self._since = now
         self._acked, self._delivered = before.counted if before is not None else (0, 0)
         self._begun = self._acked
         self._passed = False
         self._retransmits = 0
         self._proof: int | None = None
-        """Of the stall: time-outs when a small packet had been answered."""
+        """Time-outs of the present stall at the moment when a small packet had been answered."""
         self._repeated: float | None = None
-        """When something had been repeated behind that."""
+        """When something had been retransmitted after that."""
 
     @property
     def counted(self) -> tuple[int, int]:
@@ -90,23 +90,23 @@ class StallWatch:
 
     @property
     def waiting(self) -> bool:
-        """Whether something was repeated, and has not been acknowledged."""
+        """Whether something was retransmitted, and has not been acknowledged."""
         return self._retransmits > 0
 
     def idle(self, now: float) -> None:
-        """Nothing waits."""
+        """Nothing waits to be acknowledged."""
         self._since = now
         self._retransmits = 0
         self._proof = self._repeated = None
 
     def look(self, sample: TcpSample, now: float) -> Progress:
-        """Take the next sample.
+        """Judge the next sample.
 
-        Where segments above the size that would come next have passed once, it is not the path's MTU that holds up
-        the rest. Such a connection ends by its time-out, and the next one is judged anew.
+        If segments larger than the next smaller size were acknowledged before, the path's MTU is not what stops the
+        rest. Such a connection ends by its time-out, and the next one is judged anew.
 
-        A cable that is in again lets a small packet pass before TCP repeats the large ones, ever more rarely. So only
-        what was repeated behind the small packet's answer counts.
+        A cable that is plugged in again passes a small packet before TCP retransmits the large ones, ever more
+        rarely. So only what was retransmitted after the small packet's answer counts.
         """
         acked, delivered = sample.acked - self._acked, sample.delivered - self._delivered
         self._acked, self._delivered = sample.acked, sample.delivered
@@ -128,15 +128,15 @@ class StallWatch:
         return Progress.BLACK_HOLE if late else Progress.WAITING
 
     def small_passed(self) -> None:
-        """A small packet that left during the stall was answered by the peer."""
+        """A small packet that was sent during the stall was answered by the peer."""
         if self.waiting and self._proof is None:
             self._proof = self._retransmits
 
     @property
     def suspected(self) -> bool:
-        """Whether a connection that ends now did so for a black hole, though there was no time to be sure.
+        """Whether a connection that ends now probably met a black hole, although the evidence is incomplete.
 
-        With a long round trip the lease is over before TCP repeats a segment often enough.
+        With a long round trip the lease is over before TCP has retransmitted a segment often enough.
         """
         return self._repeated is not None
 

@@ -1,17 +1,18 @@
-"""Who dials whom, when, and which of two links stays: one machine over all peers.
+"""Decides which side dials, when, and which of two links with one peer stays: one machine over all peers.
 
-A peer's place is its address and port; its incarnations follow each other there. Outputs are collected and
-taken with ``take``: ``Dial`` and ``CloseLink`` are orders to the driver, ``LinkUp`` and ``LinkDown`` tell the
-rooms above. Each ``Dial`` is answered by exactly one of ``link_up``, ``dial_refused`` or ``dial_failed``.
+A peer's place is its address and port; its runs (incarnations) follow each other there. Outputs are collected and
+taken with ``take``: ``Dial`` and ``CloseLink`` are orders to the driver, ``LinkUp`` and ``LinkDown`` are events for
+the rooms above. Each ``Dial`` is answered by exactly one of ``link_up``, ``dial_refused`` or ``dial_failed``.
 
-Anybody can invent peers. So those that were never linked, strangers, stand in line for their dials, which are bounded
-over all of them; who was linked before does not notice.
+Beacons can be forged. Therefore peers that were never linked, *unverified* ones, wait in a queue for their dials,
+whose rate is bounded over all of them. Peers that were linked before are dialled at once.
 """
 
 from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import TYPE_CHECKING, Final, Literal
 
 from rmpa.core import limits as core_limits
@@ -20,7 +21,7 @@ from rmpa.core.clock import earliest
 from rmpa.core.timer_queue import TimerQueue
 from rmpa.core.token_bucket import TokenBucket
 from rmpa.mesh import limits
-from rmpa.mesh.handshake import Hello, KnownLink, Refusal, Refuse, Verdict, judge
+from rmpa.mesh.handshake import Hello, KnownLink, Refusal, Refuse, judge
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,25 +31,27 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-Endpoint = tuple[str, int]
+SocketAddress = tuple[str, int]
 
-_SLOW: Final = frozenset({Refusal.VERSION, Refusal.DOMAIN, Refusal.DUPLICATE, Refusal.MALFORMED, Refusal.LANE})
-REPLACED: Final = "replaced by a newer link"
-"""Why a link ends whose peer, the same instance, has another one in the same moment."""
-_ELSEWHERE: Final = frozenset({Refusal.MYSELF, Refusal.WRONG_PEER})
+_SELDOM_MENDED: Final = frozenset(
+    {Refusal.VERSION, Refusal.DOMAIN, Refusal.DUPLICATE, Refusal.MALFORMED, Refusal.LANE}
+)
+"""Refusals that waiting seldom mends."""
+_OTHER_PEER: Final = frozenset({Refusal.MYSELF, Refusal.WRONG_PEER})
+"""Refusals that concern one endpoint: another agent, or this one, answered there."""
 
 
 @dataclass(frozen=True, slots=True)
 class Dial:
-    """Connect to this peer, at whichever of its endpoints answers first.
+    """Connect to this peer, at the endpoint that answers first.
 
     Args:
-        guid: Who should be there.
-        endpoints: Where to try, best first; a peer with several addresses may be reached at some of them only.
+        guid: The peer.
+        endpoints: Its endpoints, best first; a peer with several addresses may be reachable at some of them only.
     """
 
     guid: Guid
-    endpoints: tuple[Endpoint, ...]
+    endpoints: tuple[SocketAddress, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,40 +70,59 @@ class LinkUp:
     identity: Identity
 
 
+class LinkDownCause(Enum):
+    """Why a link is not used any more; the value is the text for people."""
+
+    REPLACED = "replaced by a newer link"
+    """The same run of the peer has another link in the same moment."""
+    RESTARTED = "the peer restarted"
+    """Another run of the peer has taken its place."""
+    ENDED = "the connection ended"
+    """The connection of its express lane ended; ``LinkDown.reason`` says how."""
+
+
 @dataclass(frozen=True, slots=True)
 class LinkDown:
-    """The link that was used with this peer is gone."""
+    """The link that was used with this peer is not used any more.
+
+    Args:
+        link_id: Its number.
+        identity: The peer.
+        cause: What kind of end it was.
+        reason: Why, for people.
+    """
 
     link_id: int
     identity: Identity
+    cause: LinkDownCause
     reason: str
 
 
 @dataclass(frozen=True, slots=True)
 class LinkRefused:
-    """A peer said no, for the first time for this reason; what to do is in the text."""
+    """A peer refuses links, for the first time for this reason; ``refuse`` says what to do."""
 
     identity: Identity
     refuse: Refuse
 
 
-Output = Dial | CloseLink | LinkUp | LinkDown | LinkRefused
+PeeringOutput = Dial | CloseLink | LinkUp | LinkDown | LinkRefused
 
 
 @dataclass(frozen=True, slots=True)
 class PeerStatus:
-    """One peer, for the monitor.
+    """The state of one peer, for the snapshot.
 
     Args:
-        identity: Who.
-        state: ``refused`` is a wait after a no that waiting seldom mends.
+        identity: The peer.
+        state: ``refused`` is a wait after a refusal that waiting seldom mends.
         link_id: Its link, if linked.
-        lower: Whether we are the lower GUID, which dials first.
-        since: When the link came up, or the last one fell; ``None`` before the first. In monotonic seconds.
+        lower: Whether this agent has the lower GUID of the two, and dials first.
+        since: When the link came up, or the last one fell, monotonic seconds; ``None`` before the first.
         attempts: Dials since the last link.
-        last_error: Why there is no link, as far as we know; for a linked peer, why the last one ended.
-        next_attempt: When we dial next, in monotonic seconds.
-        endpoint: Where we dial or dialled last.
+        last_error: Why there is no link, as far as is known; for a linked peer, why the last one ended.
+        next_attempt: When it is dialled next, monotonic seconds.
+        endpoint: Where it is dialled, or was dialled last.
     """
 
     identity: Identity
@@ -111,7 +133,7 @@ class PeerStatus:
     attempts: int
     last_error: str
     next_attempt: float | None
-    endpoint: Endpoint | None
+    endpoint: SocketAddress | None
 
 
 @dataclass(slots=True)
@@ -127,26 +149,26 @@ class _Peer:
     identity: Identity
     lower: bool
     backoff: Backoff
-    announced: bool = False
-    stranger: bool = True
-    paid: bool = False
-    gone: bool = False
+    announced: bool = False  # discovery knows it
+    verified: bool = False  # it was linked before
+    token_taken: bool = False  # its present dial counts against the rate of unverified peers
+    gone: bool = False  # it is forgotten when its link or dial ends
     source: str | None = None
-    good: Endpoint | None = None
+    good: SocketAddress | None = None  # where it was reached last
     link: _LinkInfo | None = None
     fell: float | None = None
-    dialling: tuple[Endpoint, ...] = ()
-    tried: set[Endpoint] = field(default_factory=set)
+    dialling: tuple[SocketAddress, ...] = ()
+    tried: set[SocketAddress] = field(default_factory=set)
     next_attempt: float | None = None
     forget_at: float | None = None
     attempts: int = 0
     last_error: str = ""
-    last_endpoint: Endpoint | None = None
+    last_endpoint: SocketAddress | None = None
     refused: Refuse | None = None
-    said: set[int] = field(default_factory=set)
+    reported: set[int] = field(default_factory=set)  # refusals that were reported
 
-    def endpoints(self) -> list[Endpoint]:
-        """Where to dial, best first: what worked last, where its beacon came from, what it says of itself."""
+    def endpoints(self) -> list[SocketAddress]:
+        """Where to dial, best first: where it was reached last, its beacon's source, the addresses it announces."""
         candidates = [self.good] if self.good is not None else []
         if self.source is not None:
             candidates.append((self.source, self.identity.guid.port))
@@ -157,9 +179,9 @@ class Peering:
     """The machine over all peers.
 
     Args:
-        ours: Who we are.
+        ours: The identity of this agent.
         rng: Uniform numbers in [0, 1), for the jitter.
-        alive: Whether a link, by its id, heard something in the last ``limits.GHOST_QUIET`` seconds.
+        alive: Whether something came on a link, by its id, in the last ``limits.GHOST_QUIET`` seconds.
     """
 
     def __init__(self, ours: Identity, *, rng: Callable[[], float], alive: Callable[[int], bool]) -> None:
@@ -168,23 +190,24 @@ class Peering:
         self._alive = alive
         self._peers: dict[int, _Peer] = {}
         self._by_link: dict[int, _Peer] = {}
-        self._outputs: list[Output] = []
+        self._outputs: list[PeeringOutput] = []
         self._timers: TimerQueue[int] = TimerQueue()
-        self._strangers: set[int] = set()
-        # Strangers whose dials are due, who came first in front, and of these the ones that were never dialled.
-        self._line: dict[int, None] = {}
-        self._untried: dict[int, None] = {}
-        self._untried_next = True
-        self._line_at: float | None = None
-        self._allowed = TokenBucket(limits.DIAL_STRANGERS_RATE, limits.DIAL_STRANGERS_BURST)
+        self._unverified: set[int] = set()
+        self._dial_queue: dict[int, None] = {}
+        """Unverified peers whose dials are due, in the order in which they became so."""
+        self._never_dialled: dict[int, None] = {}
+        """Those of the queue that were never dialled."""
+        self._newest_next = True
+        self._queue_at: float | None = None
+        self._dial_rate = TokenBucket(limits.DIAL_STRANGERS_RATE, limits.DIAL_STRANGERS_BURST)
 
-    # --- what discovery says --------------------------------------------------------------------------------
+    # --- events of discovery --------------------------------------------------------------------------------
 
     def peer_found(self, identity: Identity, now: float, source: str | None = None) -> None:
-        """Discovery knows a peer, or knows it better (new addresses, a restart).
+        """Discovery found a peer, or has news of it (new addresses, a restart).
 
         Args:
-            identity: Who.
+            identity: The peer.
             now: Monotonic seconds.
             source: The address that its beacon came from, if it was the peer's own beacon.
         """
@@ -196,7 +219,7 @@ class Peering:
         restarted = peer.identity.instance != identity.instance
         fresh = not peer.announced or restarted
         if restarted and identity.guid < peer.identity.guid and peer.link is not None:
-            return  # old news: the link is with a newer instance
+            return  # outdated: the link is with a newer run
         peer.announced, peer.gone, peer.forget_at = True, False, None
         self._set_timer(peer)
         peer.source = source or peer.source
@@ -209,17 +232,17 @@ class Peering:
         self._dial_due(peer, now)
 
     def peer_gone(self, guid: Guid, now: float) -> None:  # noqa: ARG002 - all machines are told the time
-        """Discovery gave a peer up: dial it no more. A link that is up stays until it falls by itself."""
+        """Discovery gave a peer up: do not dial it any more. A link that is up stays until it ends by itself."""
         peer = self._peers.get(guid.place)
         if peer is None or peer.identity.guid != guid:
             return
         peer.announced, peer.gone = False, True
         self._forget_if_idle(peer)
 
-    # --- what the driver says -------------------------------------------------------------------------------
+    # --- events of the driver -------------------------------------------------------------------------------
 
-    def judge(self, hello: Hello) -> Verdict:
-        """Decide on a hello that came in; ``None`` is a welcome, and ``link_up`` follows."""
+    def judge(self, hello: Hello) -> Refuse | None:
+        """Decide on the hello of a dialler; ``None`` accepts it, and ``link_up`` follows."""
         peer = self._peers.get(hello.guid.place)
         known = []
         if peer is not None and peer.link is not None:
@@ -228,16 +251,16 @@ class Peering:
         return judge(hello, self._ours, known, busy=len(self._by_link) >= limits.LINKS_MAX)
 
     def link_up(
-        self, link_id: int, identity: Identity, now: float, *, dialled: bool, endpoint: Endpoint | None = None
+        self, link_id: int, identity: Identity, now: float, *, dialled: bool, endpoint: SocketAddress | None = None
     ) -> None:
-        """A handshake ended well.
+        """A handshake succeeded.
 
         Args:
             link_id: The driver's number for the link, never used twice.
-            identity: Who the other side says it is; discovery need not have seen it.
+            identity: What the remote side says it is; discovery need not have found it.
             now: Monotonic seconds.
-            dialled: Whether we dialled.
-            endpoint: Where we dialled.
+            dialled: Whether this side dialled.
+            endpoint: Where it dialled.
         """
         peer = self._peers.get(identity.guid.place) or self._add(identity)
         if dialled:
@@ -249,8 +272,8 @@ class Peering:
             self._outputs.append(CloseLink(link_id, "we are linked already; the lower GUID's link stays"))
             return
         if old is not None:
-            reason = REPLACED if old.identity.instance == identity.instance else "the peer restarted"
-            self._drop(peer, old, reason, close=True)
+            same_run = old.identity.instance == identity.instance
+            self._replace(peer, old, LinkDownCause.REPLACED if same_run else LinkDownCause.RESTARTED)
         if peer.identity.instance != identity.instance:
             peer.identity = identity
             peer.lower = self._ours.guid < identity.guid
@@ -258,34 +281,34 @@ class Peering:
         peer.link = new
         peer.forget_at = peer.refused = None
         self._dial_at(peer, None)
-        self._met(peer, now)
+        self._verify(peer, now)
         peer.attempts = 0
         peer.gone = False
         peer.tried.clear()
-        peer.said.clear()
+        peer.reported.clear()
         self._by_link[link_id] = peer
         self._outputs.append(LinkUp(link_id, identity))
 
     def link_down(self, link_id: int, reason: str, now: float, *, silent: bool = False) -> None:
-        """A link ended, for whatever reason; one that was replaced or never up says nothing new.
+        """A link ended, for whatever reason; without effect for one that was replaced or never up.
 
         Args:
-            link_id: Which.
-            reason: Why.
+            link_id: Its number.
+            reason: Why, for people.
             now: Monotonic seconds.
-            silent: It fell silent: the way to the peer is what failed, and may be back at once.
+            silent: Whether it fell silent: the path to the peer failed, and may be back at once.
         """
         peer = self._by_link.get(link_id)
         if peer is None or peer.link is None:
             return
         link = peer.link
-        self._drop(peer, link, reason)
+        self._drop(peer, link, LinkDownCause.ENDED, reason)
         peer.fell = now
         peer.last_error = reason
         if silent or now - link.since >= limits.LINK_STABLE:
             peer.backoff.reset()
         if not peer.announced and len(self._peers) > core_limits.ROSTER_PEERS_MAX:
-            peer.gone = True  # invented identities must not fill the memory, nor make us dial for them
+            peer.gone = True  # forged identities must not fill the memory, nor cause dials
         if peer.gone:
             self._forget_if_idle(peer)
             return
@@ -295,47 +318,47 @@ class Peering:
         if not peer.dialling:
             self._dial_at(peer, now + self._pause(peer) + (0.0 if peer.lower else limits.DIAL_FALLBACK))
 
-    def dial_failed(self, guid: Guid, error: str, now: float, endpoint: Endpoint | None = None) -> None:
-        """Nobody answered a ``Dial``, or the connection ended before the handshake did.
+    def dial_failed(self, guid: Guid, error: str, now: float, endpoint: SocketAddress | None = None) -> None:
+        """A ``Dial`` was not answered, or its connection ended before the handshake did.
 
         Args:
-            guid: Whose.
+            guid: The peer that was dialled.
             error: What happened.
             now: Monotonic seconds.
-            endpoint: Where the connection was that ended; ``None`` if no endpoint answered.
+            endpoint: The endpoint of the connection that ended; ``None`` if no endpoint answered.
         """
-        peer = self._answered(guid, endpoint)
+        peer = self._dial_ended(guid, endpoint)
         if peer is not None:
             peer.last_error = error
             peer.refused = None
-            self._again(peer, now)
+            self._retry(peer, now)
 
-    def dial_refused(self, guid: Guid, refuse: Refuse, now: float, endpoint: Endpoint | None = None) -> None:
-        """A ``Dial`` was answered with a no, by them or by us, at this endpoint."""
-        peer = self._answered(guid, endpoint)
+    def dial_refused(self, guid: Guid, refuse: Refuse, now: float, endpoint: SocketAddress | None = None) -> None:
+        """The handshake of a ``Dial`` was refused at this endpoint, by either side."""
+        peer = self._dial_ended(guid, endpoint)
         if peer is None:
             return
         peer.last_error = str(refuse)
         if refuse.code == Refusal.ALREADY_LINKED:
-            # They hold a link that we lost, or that is about to be welcomed here: it falls within the lease.
+            # The peer has a link that was lost or is about to be accepted here: it ends within the lease.
             if peer.link is None:
                 self._dial_at(peer, now + max(limits.LINK_LEASE, self._pause(peer)))
             return
-        if refuse.code in _ELSEWHERE or refuse.code not in _SLOW:
-            self._again(peer, now)
+        if refuse.code in _OTHER_PEER or refuse.code not in _SELDOM_MENDED:
+            self._retry(peer, now)
         elif peer.link is None:
             peer.refused = refuse
             pause = max(limits.REFUSED_RETRY, self._cap(peer))
             self._dial_at(peer, now + pause * (1 + 0.5 * self._rng()))
-        if refuse.code not in _ELSEWHERE and refuse.code not in peer.said:
-            peer.said.add(refuse.code)
+        if refuse.code not in _OTHER_PEER and refuse.code not in peer.reported:
+            peer.reported.add(refuse.code)
             self._outputs.append(LinkRefused(peer.identity, refuse))
 
     # --- time and outputs -----------------------------------------------------------------------------------
 
     def next_timer(self) -> float | None:
         """When ``handle_timer`` is due, in monotonic seconds."""
-        return earliest(self._timers.next(), self._line_at)
+        return earliest(self._timers.next(), self._queue_at)
 
     def handle_timer(self, now: float) -> None:
         """Dial and forget what is due."""
@@ -347,14 +370,14 @@ class Peering:
             else:
                 self._set_timer(peer)
                 self._dial_due(peer, now)
-        self._admit(now)
+        self._dial_unverified(now)
 
-    def take(self) -> list[Output]:
-        """What was decided since the last call, in order."""
+    def take(self) -> list[PeeringOutput]:
+        """Return what was decided since the last call, in order."""
         outputs, self._outputs = self._outputs, []
         return outputs
 
-    def endpoints(self, guid: Guid) -> list[Endpoint]:
+    def endpoints(self, guid: Guid) -> list[SocketAddress]:
         """Where a peer may be reached, best first; empty for one that is not known."""
         peer = self._peers.get(guid.place)
         return peer.endpoints() if peer is not None else []
@@ -369,54 +392,60 @@ class Peering:
         backoff = Backoff(limits.BACKOFF_FIRST, limits.BACKOFF_MAX, self._rng)
         peer = _Peer(identity, self._ours.guid < identity.guid, backoff)
         self._peers[identity.guid.place] = peer
-        self._strangers.add(identity.guid.place)
+        self._unverified.add(identity.guid.place)
         return peer
 
-    def _met(self, peer: _Peer, now: float) -> None:
-        """A peer is linked: it exists, and a dial that led there was none too many."""
-        peer.stranger = False
-        self._strangers.discard(peer.identity.guid.place)
-        if peer.paid:
-            peer.paid = False
-            self._allowed.put_back()
-            self._admit(now)
+    def _verify(self, peer: _Peer, now: float) -> None:
+        """A peer is linked: it exists, and the dial that led there does not count against the rate."""
+        peer.verified = True
+        self._unverified.discard(peer.identity.guid.place)
+        if peer.token_taken:
+            peer.token_taken = False
+            self._dial_rate.put_back()
+            self._dial_unverified(now)
 
     def _forget_if_idle(self, peer: _Peer) -> None:
-        """Forget a peer that is gone; one that we are dialling only when the dial was answered."""
+        """Forget a peer that is gone; one that is being dialled only when the dial was answered."""
         peer.forget_at = None
         self._dial_at(peer, None)
         if peer.link is None and not peer.dialling:
             self._peers.pop(peer.identity.guid.place, None)
-            self._strangers.discard(peer.identity.guid.place)
+            self._unverified.discard(peer.identity.guid.place)
 
     def _restart(self, peer: _Peer, now: float) -> None:
-        """A new instance announced itself: nothing that its ghost did counts."""
+        """A new run of a peer announced itself: forget errors and refusals of the run before."""
         peer.backoff.reset()
         peer.tried.clear()
-        peer.said.clear()
+        peer.reported.clear()
         peer.refused = None
         link = peer.link
         ghost = link is not None and link.identity.instance != peer.identity.instance
         if link is not None and ghost and (link.identity.guid < peer.identity.guid or not self._alive(link.id)):
-            self._drop(peer, link, "the peer restarted", close=True)
+            self._replace(peer, link, LinkDownCause.RESTARTED)
         if peer.link is None and not peer.dialling:
             self._dial_at(peer, now if peer.lower else now + limits.DIAL_FALLBACK)
 
     def _keeps(self, old: _LinkInfo, new: _LinkInfo) -> bool:
-        """Of two links with one instance: the one that the lower GUID dialled; of one direction, the newer."""
+        """Whether ``old`` stays, of two links with one run of a peer.
+
+        The one stays that the lower GUID dialled; of two that the same side dialled, the newer one.
+        """
         if old.identity.instance != new.identity.instance or old.dialled == new.dialled:
             return False
         return old.dialled == (self._ours.guid < old.identity.guid)
 
-    def _drop(self, peer: _Peer, link: _LinkInfo, reason: str, *, close: bool = False) -> None:
+    def _replace(self, peer: _Peer, link: _LinkInfo, cause: LinkDownCause) -> None:
+        """Close a link that another one, or another run of the peer, takes the place of."""
+        self._outputs.append(CloseLink(link.id, cause.value))
+        self._drop(peer, link, cause, cause.value)
+
+    def _drop(self, peer: _Peer, link: _LinkInfo, cause: LinkDownCause, reason: str) -> None:
         peer.link = None
         self._by_link.pop(link.id, None)
-        if close:
-            self._outputs.append(CloseLink(link.id, reason))
-        self._outputs.append(LinkDown(link.id, link.identity, reason))
+        self._outputs.append(LinkDown(link.id, link.identity, cause, reason))
 
-    def _answered(self, guid: Guid, endpoint: Endpoint | None) -> _Peer | None:
-        """The peer that was dialled. Who answered at one endpoint says nothing of the others."""
+    def _dial_ended(self, guid: Guid, endpoint: SocketAddress | None) -> _Peer | None:
+        """The peer whose dial has ended. What happened at one endpoint tells nothing about the others."""
         peer = self._peers.get(guid.place)
         if peer is None or not peer.dialling:
             return None
@@ -426,13 +455,13 @@ class Peering:
             peer.tried.add(endpoint)
             peer.last_endpoint = endpoint
         peer.dialling = ()
-        peer.paid = False
+        peer.token_taken = False
         if peer.gone:
             self._forget_if_idle(peer)
             return None
         return peer
 
-    def _again(self, peer: _Peer, now: float) -> None:
+    def _retry(self, peer: _Peer, now: float) -> None:
         """Try the other endpoints at once, or wait when all were tried."""
         if peer.link is not None:
             return
@@ -446,10 +475,10 @@ class Peering:
     # --- when to dial ---------------------------------------------------------------------------------------
 
     def _cap(self, peer: _Peer) -> float:
-        """The longest pause between dials: strangers share what all of them may have."""
-        if not peer.stranger:
+        """The longest pause between dials, in seconds: unverified peers share the rate of all of them."""
+        if peer.verified:
             return limits.BACKOFF_MAX
-        return max(limits.BACKOFF_MAX, len(self._strangers) / limits.DIAL_STRANGERS_RATE)
+        return max(limits.BACKOFF_MAX, len(self._unverified) / limits.DIAL_STRANGERS_RATE)
 
     def _pause(self, peer: _Peer) -> float:
         peer.backoff.cap = self._cap(peer)
@@ -457,46 +486,46 @@ class Peering:
 
     def _set_timer(self, peer: _Peer) -> None:
         place = peer.identity.guid.place
-        attempt = None if place in self._line else peer.next_attempt
+        attempt = None if place in self._dial_queue else peer.next_attempt
         self._timers.set(place, earliest(attempt, peer.forget_at))
 
     def _dial_at(self, peer: _Peer, when: float | None) -> None:
-        """Let the next dial be due then, or not at all."""
+        """Set when the next dial is due; ``None``: never."""
         place = peer.identity.guid.place
         peer.next_attempt = when
-        self._line.pop(place, None)
-        self._untried.pop(place, None)
+        self._dial_queue.pop(place, None)
+        self._never_dialled.pop(place, None)
         self._set_timer(peer)
 
     def _dial_due(self, peer: _Peer, now: float) -> None:
-        """Dial if it is time; a stranger when its turn comes."""
+        """Dial a peer if it is time; an unverified one joins the queue."""
         due = peer.next_attempt
         if due is None or now < due or peer.link is not None or peer.dialling:
             return
-        if not peer.stranger:
+        if peer.verified:
             self._dial(peer)
             return
         place = peer.identity.guid.place
-        self._line[place] = None
+        self._dial_queue[place] = None
         if not peer.attempts:
-            self._untried[place] = None
+            self._never_dialled[place] = None
         self._set_timer(peer)
-        self._admit(now)
+        self._dial_unverified(now)
 
-    def _admit(self, now: float) -> None:
-        """Dial strangers as far as all of them may be.
+    def _dial_unverified(self, now: float) -> None:
+        """Dial unverified peers of the queue as far as the rate allows.
 
-        In turn the newest that was never dialled, for a real one must not wait behind many invented ones, and who
-        waits longest, for it must not wait for ever.
+        In turn the newest that was never dialled, because a real peer must not wait behind many forged ones, and the
+        one that waits longest, because it must not wait for ever.
         """
-        while self._line and self._allowed.take(now):
-            newest = self._untried_next and self._untried
-            place = next(reversed(self._untried) if newest else iter(self._line))
-            self._untried_next = not self._untried_next
+        while self._dial_queue and self._dial_rate.take(now):
+            newest = self._newest_next and self._never_dialled
+            place = next(reversed(self._never_dialled) if newest else iter(self._dial_queue))
+            self._newest_next = not self._newest_next
             peer = self._peers[place]
-            peer.paid = True
+            peer.token_taken = True
             self._dial(peer)
-        self._line_at = self._allowed.next(now) if self._line else None
+        self._queue_at = self._dial_rate.next(now) if self._dial_queue else None
 
     def _dial(self, peer: _Peer) -> None:
         self._dial_at(peer, None)

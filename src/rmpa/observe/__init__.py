@@ -1,1 +1,1 @@
-"""TODO room."""
+"""The agent seen from outside: snapshot, health, ``rmpa why``, ``rmpa doctor`` and the control socket."""

@@ -1,4 +1,4 @@
-"""The words of the control socket: one JSON object a line each way.
+"""The protocol of the control socket: one JSON object a line each way.
 
 ::
 
@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
@@ -20,13 +20,24 @@ from rmpa.observe.json_pieces import json_pieces
 if TYPE_CHECKING:
     from rmpa.core.yielding import Yielder
 
+_T = TypeVar("_T")
+
+
+def _parse(line: bytes, type_: type[_T], what: str, most: int) -> _T:
+    if len(line) > most:
+        raise LimitExceeded(f"a {what}", len(line), most)
+    try:
+        return msgspec.json.decode(line, type=type_)
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        raise RemoteProtocolError(f"not a {what}: {error}") from None
+
 
 class ControlRequest(msgspec.Struct, frozen=True):
-    """What a client asks.
+    """A client's request.
 
     Attributes:
-        op: A handler's name.
-        args: What that handler wants, by name.
+        op: The name of an operation (``control_operations.OPERATIONS``).
+        args: Its arguments, by name.
     """
 
     op: str
@@ -34,17 +45,12 @@ class ControlRequest(msgspec.Struct, frozen=True):
 
     @classmethod
     def parse(cls, line: bytes) -> ControlRequest:
-        """Read one line, with or without its end.
+        """Parse one line, with or without its end.
 
         Raises:
-            RemoteProtocolError: It is no request.
+            RemoteProtocolError: It is not a request.
         """
-        if len(line) > limits.CONTROL_REQUEST_MAX:
-            raise LimitExceeded("a control request", len(line), limits.CONTROL_REQUEST_MAX)
-        try:
-            return msgspec.json.decode(line, type=cls)
-        except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
-            raise RemoteProtocolError(f"not a control request: {error}") from None
+        return _parse(line, cls, "control request", limits.CONTROL_REQUEST_MAX)
 
     def serialize(self) -> bytes:
         """One line."""
@@ -57,45 +63,40 @@ class ControlRequest(msgspec.Struct, frozen=True):
 
 
 class ControlReply(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What the agent answers.
+    """The agent's reply.
 
     Attributes:
-        ok: Whether ``value`` is the answer; else ``error`` says why not and ``remedy`` what to do.
-        value: Anything that JSON can say.
+        ok: Whether ``value`` is the result; else ``error`` says why there is none and ``remedy`` what to do.
+        value: Anything that JSON can hold.
         error: What happened.
         remedy: What to do; may be empty.
     """
 
     ok: bool
-    value: Any = None  # the edge: each op has its own type, and its caller converts it
+    value: Any = None  # the edge: each operation has its own type, and its caller converts the value
     error: str = ""
     remedy: str = ""
 
     @classmethod
     def parse(cls, line: bytes) -> ControlReply:
-        """Read one line, with or without its end.
+        """Parse one line, with or without its end.
 
         Raises:
-            RemoteProtocolError: It is no reply.
+            RemoteProtocolError: It is not a reply.
         """
-        if len(line) > limits.CONTROL_REPLY_MAX:
-            raise LimitExceeded("a control reply", len(line), limits.CONTROL_REPLY_MAX)
-        try:
-            return msgspec.json.decode(line, type=cls)
-        except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
-            raise RemoteProtocolError(f"not a control reply: {error}") from None
+        return _parse(line, cls, "control reply", limits.CONTROL_REPLY_MAX)
 
-    def serialize(self, breathing: Yielder = iter) -> bytes:
+    def serialize(self, yielder: Yielder = iter) -> bytes:
         """One line.
 
         Args:
-            breathing: For the pieces of a large one, some 50 microseconds each.
+            yielder: Yields to data between the pieces of a large reply, which take some 50 microseconds each.
 
         Raises:
-            LocalProtocolError: A handler returned something that JSON cannot say, or too much of it.
+            LocalProtocolError: The value is something that JSON cannot hold, or too large.
         """
         try:
-            line = b"".join((*breathing(json_pieces(self)), b"\n"))
+            line = b"".join((*yielder(json_pieces(self)), b"\n"))
         except (TypeError, ValueError, RecursionError) as error:
             raise LocalProtocolError(f"a handler's value is not JSON: {error}") from None
         if len(line) > limits.CONTROL_REPLY_MAX:

@@ -1,6 +1,6 @@
-"""How the agent, its links and what comes over them are: snapshots judged by REP 107's levels.
+"""Judges snapshots: how the agent, its links and the topics that cross them are.
 
-STALE is what was there and is not any more: a peer that is gone, and what came from it.
+Levels are those of REP 107: STALE is what was there and is not any more, as a peer that is gone and its topics.
 """
 
 from __future__ import annotations
@@ -10,16 +10,18 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.open_files import remedy
 from rmpa.observe import limits
+from rmpa.observe.check import FAIL, OK, STALE, WARN, Check
 from rmpa.observe.health_values import agent_values, link_values, number, route_values, service_values
 from rmpa.ros.types.diagnostic_array import DiagnosticLevel, DiagnosticStatus
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
+    from rmpa.observe.check import CheckLevel
     from rmpa.observe.snapshot import PeerInfo, RouteInfo, ServiceInfo, Snapshot, TopicInfo
 
 HERE: Final = "rmpa: this module"
-"""The agent's own status."""
+"""The name of the agent's own status."""
 _LINKED: Final = "linked"
 _UNKNOWN: Final = "loss_unknown"
 _LOST, _RESTORED, _DEADLINE = "liveliness_lost", "liveliness_restored", "deadline_missed"
@@ -32,28 +34,40 @@ _MISSES: Final = {
     _UNKNOWN: "times an unknown number lost",
     _DEADLINE: "deadlines missed",
 }
+_LEVELS: Final = {
+    OK: DiagnosticLevel.OK,
+    WARN: DiagnosticLevel.WARN,
+    FAIL: DiagnosticLevel.ERROR,
+    STALE: DiagnosticLevel.STALE,
+}
+
+
+def diagnostic_status(check: Check, module: str) -> DiagnosticStatus:
+    """A check as an element of ``/diagnostics``; ``module`` is the agent's name, which stands as hardware id."""
+    return DiagnosticStatus(_LEVELS[check.level], check.name, check.message, module, check.evidence)
 
 
 class Health:
-    """Judges one snapshot after the other; remembers the last one, for what is new in this."""
+    """Judges snapshots in turn, and compares each with the one before it to find what is new."""
 
     def __init__(self) -> None:
         self._counts: dict[str, Counter[str]] = {}
+        """The counts of the last snapshot, by the check's name."""
         self._linked: dict[str, float] = {}
         """When each peer was last linked, by name; forgotten after ``limits.DIAGNOSTICS_STALE``."""
         self._topics: dict[str, set[str]] = {}
-        """The names of the statuses of what came from each of these."""
+        """The names of the checks of each peer's topics."""
 
-    def judge(self, snapshot: Snapshot, now: float) -> Iterator[DiagnosticStatus]:
-        """One status for the agent, one for each peer, one for each topic that comes from one or does not fit there.
+    def judge(self, snapshot: Snapshot, now: float) -> Iterator[Check]:
+        """One check for the agent, each peer, each topic that comes from a peer or that a peer cannot take.
 
-        And one for each service that was called across the mesh.
+        And one for each node that cannot be reached and each service that was called across the mesh. All names
+        differ.
 
         Args:
-            snapshot: All of it.
+            snapshot: With all topics and services.
             now: Monotonic seconds.
         """
-        here = snapshot.agent.name
         counts: dict[str, Counter[str]] = {}
         peers = _by_name(snapshot.peers)
         yield _agent(snapshot)
@@ -62,37 +76,38 @@ class Health:
                 self._linked[name] = now
                 self._topics[name] = set()
             counts[name] = Counter(dropped=info.link.dropped if info.link else 0)
-            yield _peer(name, here, info, self._new(name, counts[name]), was_linked=name in self._linked)
-        for name, topic, route in _named(snapshot.topics):
+            yield _peer(name, info, self._new(name, counts[name]), was_linked=name in self._linked)
+        for name, topic, route in _incoming(snapshot.topics):
             if route.peer not in peers or peers[route.peer].state != _LINKED:
-                continue  # it waits for its peer: stale, as all that came from it
+                continue  # the route waits for its peer: stale, like everything of that peer
             counts[name] = _missing(route)
             self._topics.setdefault(route.peer, set()).add(name)
-            yield _route(name, here, topic, route, self._new(name, counts[name]))
+            level, text = _judge_route(topic, route, self._new(name, counts[name]))
+            yield Check(name, level, text, evidence=route_values(route))
         for name, route in _outgoing(snapshot.topics):
             counts[name] = Counter(lost=route.lost, oversized=route.oversized)
-            # A status that was not there before: nothing was missed then.
+            # A check that the last snapshot had none of: nothing was missed then.
             before = self._counts.get(name, Counter()) if self._counts else counts[name]
-            yield _sent(name, here, route, counts[name] - before)
-        yield from _refused(snapshot, here)
+            yield _sent(name, route, counts[name] - before)
+        yield from _refused(snapshot)
         for node in snapshot.unreachable:
             values = {"unreachable for (s)": number(node.ago)}
-            yield DiagnosticStatus(DiagnosticLevel.WARN, f"rmpa: node {node.node}", str(node), here, values)
+            yield Check(f"rmpa: node {node.node}", WARN, str(node), evidence=values)
         for service in snapshot.services:
             if service.calls:
                 name = f"rmpa: {service.peer}: " if service.peer else "rmpa: "
                 name += f"service {service.name}"
                 counts[name] = Counter(calls=service.calls, failed=service.failed)
-                yield _service(name, here, service, self._new(name, counts[name]))
-        yield from self._stale(peers, here, now)
+                yield _service(name, service, self._new(name, counts[name]))
+        yield from self._stale(peers, now)
         self._counts = counts
 
     def _new(self, name: str, counts: Counter[str]) -> Counter[str]:
-        """What was counted since the snapshot before; nothing for who was not in it."""
+        """What was counted since the last snapshot; nothing if that had no such check."""
         return counts - self._counts.get(name, counts)
 
-    def _stale(self, peers: dict[str, PeerInfo], here: str, now: float) -> Iterator[DiagnosticStatus]:
-        """Peers that are gone, and what came from those that are not linked."""
+    def _stale(self, peers: Mapping[str, PeerInfo], now: float) -> Iterator[Check]:
+        """Peers that are gone, and the topics of those that are not linked."""
         for name, last in list(self._linked.items()):
             info = peers.get(name)
             if info is not None and info.state == _LINKED:
@@ -104,13 +119,13 @@ class Health:
             text = f"{name} is gone" if info is None else f"no link to {name}"
             values = {"linked before (s)": number(now - last)}
             if info is None:
-                yield DiagnosticStatus(DiagnosticLevel.STALE, f"rmpa: {name}", text, here, values)
+                yield Check(f"rmpa: {name}", STALE, text, evidence=values)
             for topic in sorted(self._topics.get(name, ())):
-                yield DiagnosticStatus(DiagnosticLevel.STALE, topic, text, here, values)
+                yield Check(topic, STALE, text, evidence=values)
 
 
 def _by_name(peers: tuple[PeerInfo, ...]) -> dict[str, PeerInfo]:
-    """Peers by unique names; the ghost of one that is back under another GUID is left out."""
+    """Peers by unique names, without the old entry of a peer that is back under another GUID."""
     found: dict[str, PeerInfo] = {}
     for info in sorted(peers, key=lambda info: (info.state != _LINKED, info.guid)):
         if info.name not in found:
@@ -120,58 +135,61 @@ def _by_name(peers: tuple[PeerInfo, ...]) -> dict[str, PeerInfo]:
     return found
 
 
-def _named(topics: tuple[TopicInfo, ...]) -> Iterator[tuple[str, TopicInfo, RouteInfo]]:
-    """What comes from peers, each with its status's name, which must be unique."""
+class _UniqueNames:
+    """Numbers names that were there before: ``x``, ``x #2``, ``x #3``."""
+
+    def __init__(self) -> None:
+        self._taken: Counter[str] = Counter()
+
+    def __call__(self, name: str) -> str:
+        self._taken[name] += 1
+        return name if self._taken[name] == 1 else f"{name} #{self._taken[name]}"
+
+
+def _incoming(topics: tuple[TopicInfo, ...]) -> Iterator[tuple[str, TopicInfo, RouteInfo]]:
+    """The routes from peers, each with the unique name of its check."""
     for topic in topics:
         sources = [route for route in topic.routes if route.direction == "in"]
         several = Counter(route.peer for route in sources)
-        taken: Counter[str] = Counter()
+        unique = _UniqueNames()
         for route in sources:
-            name = f"rmpa: {route.peer}: {topic.name}" + (f" ({route.node})" if several[route.peer] > 1 else "")
-            taken[name] += 1
-            yield name if taken[name] == 1 else f"{name} #{taken[name]}", topic, route
+            node = f" ({route.node})" if several[route.peer] > 1 else ""
+            yield unique(f"rmpa: {route.peer}: {topic.name}{node}"), topic, route
 
 
 def _outgoing(topics: tuple[TopicInfo, ...]) -> Iterator[tuple[str, RouteInfo]]:
-    """What peers miss, or may miss, of what goes to them, each with its status's name, which must be unique."""
-    taken: Counter[str] = Counter()
+    """The routes to peers that miss, or may miss, messages, each with the unique name of its check."""
+    unique = _UniqueNames()
     for topic in topics:
         for route in topic.routes:
             if route.direction == "out" and (route.state == "away" or route.lost or route.oversized):
-                name = f"rmpa: to {route.peer}: {topic.name} ({route.node})"
-                taken[name] += 1
-                yield name if taken[name] == 1 else f"{name} #{taken[name]}", route
+                yield unique(f"rmpa: to {route.peer}: {topic.name} ({route.node})"), route
 
 
-def _sent(name: str, here: str, route: RouteInfo, new: Counter[str]) -> DiagnosticStatus:
-    """What a peer misses: worth a warning while it is away, and when it has become more."""
+def _sent(name: str, route: RouteInfo, new: Counter[str]) -> Check:
+    """What a peer misses: a warning while it is away, and when it has become more."""
     texts = [route.problem] if route.problem else []
     texts += [f"{count} {_MISSES[kind]}" for kind, count in new.items()]
     if route.lost and not new["lost"]:
         texts.append(f"{route.lost} messages lost to it until now")
-    level = DiagnosticLevel.WARN if new or (route.state == "away" and route.lost) else DiagnosticLevel.OK
-    return DiagnosticStatus(level, name, "; ".join(texts) or "nothing is missed", here, route_values(route))
+    level = WARN if new or (route.state == "away" and route.lost) else OK
+    return Check(name, level, "; ".join(texts) or "nothing is missed", evidence=route_values(route))
 
 
-def _refused(snapshot: Snapshot, here: str) -> Iterator[DiagnosticStatus]:
-    """Our own topics that somebody elsewhere could not take; one that comes from a peer has a status already."""
+def _refused(snapshot: Snapshot) -> Iterator[Check]:
+    """Local topics that do not fit a subscriber elsewhere; a topic of a peer has a check already."""
     for topic in snapshot.topics:
         if topic.mismatches and not any(route.direction == "in" for route in topic.routes):
-            yield DiagnosticStatus(
-                DiagnosticLevel.ERROR, f"rmpa: {topic.name}", "; ".join(topic.mismatches), here, {}
-            )
+            yield Check(f"rmpa: {topic.name}", FAIL, "; ".join(topic.mismatches))
 
 
-def _service(name: str, here: str, info: ServiceInfo, new: Counter[str]) -> DiagnosticStatus:
-    """A service that was called; its failures are told once, for they may be the server's own words."""
+def _service(name: str, info: ServiceInfo, new: Counter[str]) -> Check:
+    """A service that was called. Failures are a warning once, for they may be what its server means to say."""
     if new["failed"]:
-        level, text = DiagnosticLevel.WARN, f"{new['failed']} of {new['calls']} calls failed: {info.problem}"
+        level, text = WARN, f"{new['failed']} of {new['calls']} calls failed: {info.problem}"
     else:
-        level, text = (
-            DiagnosticLevel.OK,
-            f"{new['calls']} calls" + (f", {info.active} under way" if info.active else ""),
-        )
-    return DiagnosticStatus(level, name, text, here, service_values(info))
+        level, text = OK, f"{new['calls']} calls" + (f", {info.active} under way" if info.active else "")
+    return Check(name, level, text, evidence=service_values(info))
 
 
 def _missing(route: RouteInfo) -> Counter[str]:
@@ -186,64 +204,55 @@ def _missing(route: RouteInfo) -> Counter[str]:
     )
 
 
-def _agent(snapshot: Snapshot) -> DiagnosticStatus:
+def _agent(snapshot: Snapshot) -> Check:
     linked = sum(info.state == _LINKED for info in snapshot.peers)
     notes, files = list(snapshot.notes), snapshot.agent.files
     if files is not None and files.near and not files.problem:
         notes.append(f"{files.open} of {files.limit} file descriptors are open; {remedy(snapshot.agent.pid)}")
-    level = DiagnosticLevel.WARN if notes else DiagnosticLevel.OK
-    if files is not None and files.problem:
-        level = DiagnosticLevel.ERROR
+    level = FAIL if files is not None and files.problem else WARN if notes else OK
     text = "; ".join(notes) or f"{linked} of {len(snapshot.peers)} known peers linked"
-    return DiagnosticStatus(level, HERE, text, snapshot.agent.name, agent_values(snapshot, linked))
+    return Check(HERE, level, text, evidence=agent_values(snapshot, linked))
 
 
-def _peer(name: str, here: str, info: PeerInfo, new: Counter[str], *, was_linked: bool) -> DiagnosticStatus:
+def _peer(name: str, info: PeerInfo, new: Counter[str], *, was_linked: bool) -> Check:
+    level, text = _judge_peer(info, new["dropped"], was_linked=was_linked)
+    return Check(f"rmpa: {name}", level, text, evidence=link_values(info))
+
+
+def _judge_peer(info: PeerInfo, dropped: int, *, was_linked: bool) -> tuple[CheckLevel, str]:
+    """The worst that is true of a peer now; ``dropped`` messages since the last snapshot."""
     link = info.link
     if info.state == _LINKED and link is not None:
-        level, text = (
-            DiagnosticLevel.OK,
-            "linked" + (f", round trip {link.rtt * 1e3:.2f} ms" if link.rtt is not None else ""),
-        )
+        if dropped:
+            return WARN, f"{dropped} messages dropped: the link takes them too slowly"
         troubles = [f"{link.path_problem}; {link.path_remedy}"] if link.path_problem else []
         troubles += [bound.text for bound in info.beyond]
         if troubles:
-            level, text = DiagnosticLevel.WARN, "; ".join(troubles)
-        if new["dropped"]:
-            level, text = DiagnosticLevel.WARN, f"{new['dropped']} messages dropped: the link takes them too slowly"
-    elif info.state in ("conflict", "refused"):
-        level, text = DiagnosticLevel.ERROR, "; ".join((*info.conflicts, info.last_error)).strip("; ") or info.state
-    else:
-        level = DiagnosticLevel.STALE if was_linked else DiagnosticLevel.WARN
-        text = info.state + (f": {info.last_error}" if info.last_error else "")
-    return DiagnosticStatus(level, f"rmpa: {name}", text, here, link_values(info))
+            return WARN, "; ".join(troubles)
+        return OK, "linked" + (f", round trip {link.rtt * 1e3:.2f} ms" if link.rtt is not None else "")
+    if info.state in ("conflict", "refused"):
+        return FAIL, "; ".join((*info.conflicts, info.last_error)).strip("; ") or info.state
+    return STALE if was_linked else WARN, info.state + (f": {info.last_error}" if info.last_error else "")
 
 
-def _route(name: str, here: str, topic: TopicInfo, route: RouteInfo, new: Counter[str]) -> DiagnosticStatus:
-    level, text = _judged(topic, route, new)
-    return DiagnosticStatus(level, name, text, here, route_values(route))
-
-
-def _judged(topic: TopicInfo, route: RouteInfo, new: Counter[str]) -> tuple[DiagnosticLevel, str]:
-    """The worst that is true of a route now, or since the last look."""
+def _judge_route(topic: TopicInfo, route: RouteInfo, new: Counter[str]) -> tuple[CheckLevel, str]:
+    """The worst that is true of a route now; ``new`` counts what it missed since the last snapshot."""
     if route.limit:
-        return DiagnosticLevel.WARN, route.problem  # the peer's own status says it for all of them
+        return WARN, route.problem  # the peer's own check says it for all of them
     if route.state == "hidden":
-        return DiagnosticLevel.ERROR, route.problem or "hidden"
+        return FAIL, route.problem or "hidden"
     if route.events.get(_LOST, 0) > route.events.get(_RESTORED, 0):
-        return DiagnosticLevel.ERROR, next(
-            (e.text for e in reversed(route.recent) if e.kind == _LOST), "does not live"
-        )
+        return FAIL, next((e.text for e in reversed(route.recent) if e.kind == _LOST), "does not live")
     if topic.mismatches:
-        return DiagnosticLevel.ERROR, "; ".join(topic.mismatches)
+        return FAIL, "; ".join(topic.mismatches)
     if route.problem:
-        return DiagnosticLevel.WARN, route.problem
+        return WARN, route.problem
     deadline = route.contract.get("deadline")
     if isinstance(deadline, float) and route.age is not None and route.age > deadline:
-        return DiagnosticLevel.WARN, f"no message for {route.age:.3g} s; deadline {deadline:.3g} s"
+        return WARN, f"no message for {route.age:.3g} s; deadline {deadline:.3g} s"
     if any(new.values()):
-        return DiagnosticLevel.WARN, ", ".join(f"{count} {_MISSES[kind]}" for kind, count in new.items() if count)
-    return DiagnosticLevel.OK, _flowing(route)
+        return WARN, ", ".join(f"{count} {_MISSES[kind]}" for kind, count in new.items() if count)
+    return OK, _flowing(route)
 
 
 def _flowing(route: RouteInfo) -> str:

@@ -1,20 +1,20 @@
-"""The key-values of each diagnostic status: figures without their unit, which stands in the key, for rqt to plot."""
+"""The evidence of each health check: figures as text, their units in the keys, so that rqt can plot them."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rmpa.observe.snapshot import PeerInfo, RouteInfo, ServiceInfo, Snapshot
+    from rmpa.observe.snapshot import PeerInfo, RouteInfo, SampleSpread, ServiceInfo, Snapshot
 
 
 def number(value: float | None, scale: float = 1.0) -> str:
-    """Six significant digits; empty for what is not known."""
+    """Six significant digits; empty for ``None``."""
     return "" if value is None else f"{value * scale:.6g}"
 
 
 def agent_values(snapshot: Snapshot, linked: int) -> dict[str, str]:
-    """The agent's own, and all that it refused or dropped by name."""
+    """The agent's own figures, and its counters by name."""
     agent = snapshot.agent
     known = {
         "name": agent.name,
@@ -38,7 +38,7 @@ def agent_values(snapshot: Snapshot, linked: int) -> dict[str, str]:
 
 
 def link_values(info: PeerInfo) -> dict[str, str]:
-    """A peer's, and its link's."""
+    """The figures of a peer and its link."""
     known = {"state": info.state, "GUID": info.guid, "address": ", ".join(info.addresses)}
     link = info.link
     if link is not None:
@@ -64,7 +64,7 @@ def link_values(info: PeerInfo) -> dict[str, str]:
 
 
 def service_values(info: ServiceInfo) -> dict[str, str]:
-    """A service's calls across the mesh."""
+    """The figures of a service's calls across the mesh."""
     known = {
         "node": info.node,
         "state": info.state,
@@ -74,17 +74,11 @@ def service_values(info: ServiceInfo) -> dict[str, str]:
         "under way": str(info.active),
         "last problem": info.problem,
     }
-    if info.latency is not None:
-        known |= {
-            "latency p50 (ms)": number(info.latency.p50, 1e3),
-            "latency p99 (ms)": number(info.latency.p99, 1e3),
-            "latency max (ms)": number(info.latency.max, 1e3),
-        }
-    return _known(known)
+    return _known(known | _milliseconds("latency", info.latency, "p50", "p99", "max"))
 
 
 def route_values(route: RouteInfo) -> dict[str, str]:
-    """Those of one source of a topic."""
+    """The figures of one source of a topic."""
     period, latency = route.period, route.latency
     known = {
         "node": route.node,
@@ -96,22 +90,11 @@ def route_values(route: RouteInfo) -> dict[str, str]:
         "age (s)": number(route.age),
     }
     if period is not None:
-        known |= {
-            "period mean (ms)": number(period.mean, 1e3),
-            "period sd (ms)": number(period.sd, 1e3),
-            "period min (ms)": number(period.min, 1e3),
-            "period max (ms)": number(period.max, 1e3),
-            "period p99 (ms)": number(period.p99, 1e3),
-            "jitter (ms)": number(route.jitter, 1e3),
-        }
+        known |= _milliseconds("period", period, "mean", "sd", "min", "max", "p99")
+        known["jitter (ms)"] = number(route.jitter, 1e3)
     if latency is not None:
-        known |= {
-            "latency p50 (ms)": number(latency.p50, 1e3),
-            "latency p99 (ms)": number(latency.p99, 1e3),
-            "latency max (ms)": number(latency.max, 1e3),
-            "latency last (ms)": number(latency.last, 1e3),
-            "latency error (± ms)": number(latency.error, 1e3),
-        }
+        known |= _milliseconds("latency", latency, "p50", "p99", "max", "last")
+        known["latency error (± ms)"] = number(latency.error, 1e3)
     if route.direction == "out":
         known |= {"waiting": str(route.kept)}
     if route.oversized:
@@ -122,6 +105,12 @@ def route_values(route: RouteInfo) -> dict[str, str]:
     known |= {f"contract {key}": str(value) for key, value in route.contract.items()}
     known |= {f"events {kind}": str(count) for kind, count in route.events.items()}
     return _known(known)
+
+
+def _milliseconds(what: str, spread: SampleSpread | None, *fields: str) -> dict[str, str]:
+    if spread is None:
+        return {}
+    return {f"{what} {field} (ms)": number(getattr(spread, field), 1e3) for field in fields}
 
 
 def _known(values: dict[str, str]) -> dict[str, str]:

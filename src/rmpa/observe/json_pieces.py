@@ -1,4 +1,4 @@
-"""Large JSON values piece by piece: who writes one can do something else between two pieces."""
+"""Encodes large JSON values in pieces, between which other work can be done."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ _BATCH: Final = 16
 
 
 def json_pieces(value: object) -> Iterator[bytes]:
-    """What ``msgspec.json.encode`` says, with long lists that are fields of structs cut in pieces.
+    """The output of ``msgspec.json.encode`` in pieces: long lists, also those in fields of structs, are cut.
 
     Args:
         value: Must not change meanwhile.
 
     Raises:
-        TypeError, ValueError, RecursionError: JSON cannot say it.
+        TypeError, ValueError, RecursionError: JSON cannot hold it.
     """
     if isinstance(value, list | tuple) and len(value) > _BATCH:
         yield from _list(value)

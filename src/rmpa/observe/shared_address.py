@@ -1,8 +1,8 @@
 """Finds peers that share an IP address with another machine.
 
-Each agent has a mesh port of its own, so two machines with one address do not share a GUID: the roster takes them for
-two agents of one machine. What tells them apart is TCP. The beacons of both come, because multicast needs no reply;
-connections to the address reach only one machine, and the other machine's port is refused there.
+Each agent has a mesh port of its own, so the GUIDs of two machines with one address differ, and the roster takes them
+for two agents of one machine. TCP shows the difference: the beacons of both arrive, because multicast needs no reply,
+but connections to the address reach only one machine, and it refuses the other machine's port.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def mark_shared_addresses(peers: Sequence[PeerInfo], own: Collection[str]) -> tuple[PeerInfo, ...]:
-    """Put peers whose address seems to be another machine's too into the state ``conflict``.
+    """Set the state ``conflict`` for peers whose address seems to be another machine's too.
 
     Args:
         peers: All peers.
@@ -32,20 +32,20 @@ def mark_shared_addresses(peers: Sequence[PeerInfo], own: Collection[str]) -> tu
     holders: dict[str, list[PeerInfo]] = {}
     for peer in peers:
         holders.setdefault(_address(peer), []).append(peer)
-    return tuple(_marked(peer, holders[_address(peer)], own) if _is_deaf(peer) else peer for peer in peers)
+    return tuple(_marked(peer, holders[_address(peer)], own) if _unreachable_by_tcp(peer) else peer for peer in peers)
 
 
 def _address(peer: PeerInfo) -> str:
     return peer.guid.rpartition(":")[0]
 
 
-def _is_deaf(peer: PeerInfo) -> bool:
-    """Whether its beacons come, though TCP has not reached it for a while."""
+def _unreachable_by_tcp(peer: PeerInfo) -> bool:
+    """Whether its beacons arrive though TCP has not reached it for ``limits.ADDRESS_SHARED_AFTER``."""
     return (
         peer.state == "linking"
         and peer.since_ago >= limits.ADDRESS_SHARED_AFTER
         and peer.beacon_ago is not None
-        # An agent that was killed is silent from the moment that its link fell.
+        # An agent that was killed sends no beacons after its link has fallen.
         and peer.beacon_ago < peer.since_ago - limits.ADDRESS_SHARED_MARGIN
         and not _address(peer).startswith("127.")
     )

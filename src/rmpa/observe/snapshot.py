@@ -1,12 +1,17 @@
-"""What an agent shows of itself: one value, built in ``rmpa.agent``, read by the CLI.
+"""The state of an agent as one value, built by ``observe.io.snapshot_builder`` and read by the command line.
 
 It crosses the control socket as JSON (``msgspec``). Times are seconds; ``…_ago`` counts back from the snapshot.
-A field that is ``None`` is not known, or not yet.
+A field that is ``None`` is not known, or not yet. A text "ready to read" is for users.
 """
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Self
+
 import msgspec
+
+if TYPE_CHECKING:
+    from rmpa.core.stats import SampleSummary
 
 
 class FilesInfo(msgspec.Struct, kw_only=True, frozen=True):
@@ -16,9 +21,9 @@ class FilesInfo(msgspec.Struct, kw_only=True, frozen=True):
         open: How many are open.
         limit: How many it may have (the soft limit, ``ulimit -n``).
         hard: What the limit may be raised to (``ulimit -Hn``).
-        reserved: The last ones, kept for the ROS core, the control socket and the links to peers.
-        near: Whether there are soon none left for data.
-        refused: Attempts to accept or to dial so far for which there was none, repetitions among them.
+        reserved: How many are kept for the ROS core, the control socket and the links to peers.
+        near: Whether nearly all that are not reserved are open.
+        refused: Attempts to accept or to dial that found none free so far, repetitions included.
         problem: What waits for one now, and what to do, ready to read; empty where nothing does.
     """
 
@@ -49,13 +54,13 @@ class AgentInfo(msgspec.Struct, kw_only=True, frozen=True):
         addresses: Its numeric IPv4 addresses, best first.
         interfaces: The interfaces that beacons go out on.
         config_file: Where its settings were read, or empty.
-        realtime: What came of each wish of ``--realtime``, ready to read; empty without it.
+        realtime: What came of each request of ``--realtime``, ready to read; empty without it.
         files: Its file descriptors.
-        proxies: Nodes of peers that stand in the local graph.
-        proxy_sockets: Sockets that listen for all of them together.
+        proxies: The number of proxies of peers' nodes in the local graph.
+        proxy_sockets: Listening sockets of all of them together.
         proxy_listening: How these are used, ready to read: the ports that all share, or why each has its own.
-        core_memory: Where the core keeps its registrations and parameters, and what it took up of the run before,
-            ready to read; empty for one that keeps nothing.
+        core_memory: Where the core stores registrations and parameters, and what it took over from its last run,
+            ready to read; empty for a core that stores nothing.
     """
 
     name: str
@@ -85,18 +90,18 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
 
     Attributes:
         remote: ``address:port`` of the other end of the TCP connection.
-        dialled: Whether we dialled; else the peer did.
+        dialled: Whether this agent dialled; else the peer did.
         up_ago: Seconds since it came up.
-        rtt: Round trip, seconds: the least of the last ones.
-        clock_offset: The peer's wall clock less ours, seconds.
+        rtt: The least of the last round trips, seconds.
+        clock_offset: The peer's wall clock less this machine's, seconds.
         clock_error: Bound of that offset's error, ± seconds.
         bytes_in: Received since it came up.
         bytes_out: Sent since it came up.
-        queued: Bytes that wait for the peer to take them.
-        dropped: Messages dropped because it took them too slowly.
+        queued: Bytes in its send queues.
+        dropped: Messages dropped because the link was too slow.
         heard_ago: Seconds since anything arrived.
-        packet: Bytes of the largest packet that large messages leave in, headers included.
-        path_problem: What is wrong with the path to it, ready to read; empty if nothing is known.
+        packet: Bytes of the largest packets that are sent, headers included.
+        path_problem: What is wrong with the network path, ready to read; empty if nothing is known.
         path_remedy: What to do about that.
     """
 
@@ -117,13 +122,13 @@ class LinkInfo(msgspec.Struct, kw_only=True, frozen=True):
 
 
 class BoundInfo(msgspec.Struct, kw_only=True, frozen=True):
-    """Something of a module that another one hides because there is more than its ``[limits]`` say.
+    """What one module hides of another one because a limit of its ``[limits]`` is exceeded.
 
     Attributes:
         kind: The limit: ``nodes``, ``topics`` or ``services``.
         limit: Its value.
-        hidden: How many of these are hidden.
-        here: Whether they are the peer's and hidden here; else they are ours and hidden there.
+        hidden: How many are hidden.
+        here: Whether this module hides the peer's; else the peer hides this module's.
         text: Ready to read, with the remedy.
     """
 
@@ -142,21 +147,21 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
         guid: Its GUID as text.
         instance: The random id of its run, 32 hexadecimal digits.
         addresses: Where it can be reached, best first.
-        state: ``linked``; ``linking`` (dialling, or waiting to be dialled); ``refused`` (it said no, or we did);
-            ``conflict`` (shares a GUID or a name with another); ``relayed`` (no link, but another peer passes on what
-            it publishes).
+        state: ``linked``; ``linking`` (dialling, or waiting to be dialled); ``refused`` (by either side);
+            ``conflict`` (shares a GUID or a name with another); ``relayed`` (has no link; another peer relays its
+            topics).
         since_ago: Seconds since it came into this state.
-        found_ago: Seconds since it was first heard of.
+        found_ago: Seconds since it was found.
         beacon_ago: Seconds since its last beacon.
         source: How it was found: ``multicast``, ``unicast``, ``seed``, ``gossip`` or ``link``.
         link: The link, while there is one.
         last_error: Why the last attempt or link failed, ready to read; empty if none did.
         next_attempt: Seconds until the next attempt to dial.
         conflicts: What is wrong with its identity, each ready to read.
-        topics_in: Topics that it offers us.
-        topics_out: Topics that we offer it.
-        via: The name of the peer that passes on what it publishes, if one does.
-        beyond: What of it is hidden here, and what of ours there, by the limits of either side.
+        topics_in: The number of topics that it offers.
+        topics_out: The number of topics that it is offered.
+        via: The name of the peer that relays its topics, if one does.
+        beyond: What either side hides of the other by its limits.
     """
 
     name: str
@@ -178,17 +183,17 @@ class PeerInfo(msgspec.Struct, kw_only=True, frozen=True):
     beyond: tuple[BoundInfo, ...] = ()
 
 
-class LatencySpread(msgspec.Struct, kw_only=True, frozen=True):
-    """How samples are spread, in seconds. The percentiles are linear between neighbours.
+class SampleSpread(msgspec.Struct, kw_only=True, frozen=True):
+    """The distribution of samples, in seconds. Percentiles are interpolated linearly.
 
     Attributes:
-        count: Of samples.
+        count: The number of samples.
         mean: Their mean.
         sd: Their standard deviation.
         min: The least.
         max: The greatest.
-        p50: Half of them are below.
-        p99: 99 of 100 are below.
+        p50: The median.
+        p99: The 99th percentile.
     """
 
     count: int
@@ -199,20 +204,27 @@ class LatencySpread(msgspec.Struct, kw_only=True, frozen=True):
     p50: float
     p99: float
 
+    @classmethod
+    def of(cls, samples: SampleSummary, **more: float) -> Self:
+        """The distribution that a summary holds; ``more`` are the fields of a subclass."""
+        return cls(
+            count=samples.count,
+            mean=samples.mean,
+            sd=samples.sd,
+            min=samples.minimum,
+            max=samples.maximum,
+            p50=samples.p50,
+            p99=samples.p99,
+            **more,
+        )
 
-class LatencyInfo(LatencySpread, kw_only=True, frozen=True):
-    """One-way latencies, from the publisher's agent taking a message to this agent handing it on.
+
+class LatencyInfo(SampleSpread, kw_only=True, frozen=True):
+    """One-way latencies, from the publisher's agent receiving a message to this agent handing it on.
 
     Attributes:
-        count: Of messages.
-        mean: Their mean.
-        sd: Their standard deviation.
-        min: The least.
-        max: The greatest.
-        p50: Half of them are below.
-        p99: 99 of 100 are below.
         last: The last message's.
-        error: The true ones lie within ± this: what is known of the other machine's clock.
+        error: The bound of their error, ±: how well the other machine's clock is known.
     """
 
     last: float
@@ -220,14 +232,14 @@ class LatencyInfo(LatencySpread, kw_only=True, frozen=True):
 
 
 class EventInfo(msgspec.Struct, kw_only=True, frozen=True):
-    """What happened to a topic's contract.
+    """An event of a topic's contract.
 
     Attributes:
         kind: ``deadline_missed``, ``lifespan_expired``, ``liveliness_lost``, ``liveliness_restored`` or
             ``messages_lost``.
-        count: How often, or to how many messages.
+        count: How many times, or how many messages.
         text: Ready to read.
-        ago: Seconds since then.
+        ago: Seconds since it happened.
     """
 
     kind: str
@@ -237,43 +249,43 @@ class EventInfo(msgspec.Struct, kw_only=True, frozen=True):
 
 
 class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
-    """One source that crosses the mesh, seen from here.
+    """The route of one source, a publisher of a topic at one node, between this module and a peer.
 
-    The figures are of the messages that an open route brought in the last minute, as far as they are remembered.
+    Figures are of the messages that an open route brought in the last minute, within the bounds of its statistics.
 
     Attributes:
         peer: The peer it comes from, or goes to.
         node: The publishing node, by its name in its own graph.
         direction: ``in`` or ``out``.
-        state: ``idle`` (visible, nobody listens), ``opening``, ``open``, ``lingering``, ``waiting`` (it failed and
-            is tried again) or ``hidden`` (not shown: see ``problem``); of those that go out ``open`` or ``away`` (the
+        state: Of incoming routes ``idle`` (no subscriber), ``opening``, ``open``, ``lingering``, ``waiting`` (it
+            failed and is tried again) or ``hidden`` (see ``problem``); of outgoing ones ``open`` or ``away`` (the
             peer has no link, and reliable messages are kept or counted for it).
         type: The message type that the source has.
         md5: Of that type; empty before it is known.
         messages: That crossed since the route was opened.
-        bytes: Of these, without the lengths that TCPROS puts in front.
+        bytes: Of these, without TCPROS's length fields.
         dropped: Messages dropped because a receiver was slow.
-        lost: Messages that never came, by the gaps in their numbers and by what the sender says; of a route that goes
-            out: messages of a reliable one that were given up.
-        kept: Messages that wait for the peer, of a reliable route that goes out.
+        lost: Messages that never arrived, by the gaps in their numbers and by the sender's reports; of outgoing
+            reliable routes: messages that were given up.
+        kept: Of outgoing reliable routes: messages that wait for the peer.
         oversized: Messages that the publisher's agent left out because they are too long to cross.
         oversized_bytes: The last one's.
-        late: Messages that came behind newer ones, or that an outage held up, and were left out.
+        late: Messages left out because newer ones, or an outage, came before them.
         expired: Messages dropped beyond their lifespan.
         age: Seconds since the last message.
         rate: Messages a second.
         bandwidth: Bytes a second.
         period: From one message to the next.
         jitter: The period's 99th percentile less its median, seconds.
-        latency: On the way; needs the link's clock.
-        latched: Whether its publisher latches.
+        latency: One-way; not known before the peer's clock is.
+        latched: Whether the publisher latches.
         lane: ``express`` or ``bulk``; empty before it is known.
-        contract: What the topic's contract says that is not the default, by key.
-        events: What happened to the contract, counted by kind.
+        contract: The topic's contract, without defaults, by key.
+        events: The contract's events, counted by kind.
         recent: The last of these, oldest first.
-        problem: Why it does not flow, ready to read; empty if nothing is wrong.
-        wire: The topic's name over there, where that is another one than here.
-        limit: The setting that hides it, where one of ``[limits]`` does: ``nodes`` or ``topics``; else empty.
+        problem: Why nothing flows, ready to read; empty if nothing is wrong.
+        wire: The topic's name at the peer, where that differs.
+        limit: The limit that hides it, ``nodes`` or ``topics``; empty if none does.
     """
 
     peer: str
@@ -294,7 +306,7 @@ class RouteInfo(msgspec.Struct, kw_only=True, frozen=True):
     age: float | None = None
     rate: float | None = None
     bandwidth: float | None = None
-    period: LatencySpread | None = None
+    period: SampleSpread | None = None
     jitter: float | None = None
     latency: LatencyInfo | None = None
     latched: bool = False
@@ -312,15 +324,15 @@ class TopicInfo(msgspec.Struct, kw_only=True, frozen=True):
 
     Attributes:
         name: Its global name.
-        type: The local graph's type; ``*`` or empty where nobody has told it.
+        type: Its type in the local graph; ``*`` or empty where that is not known.
         md5: Of that type; empty before it is known.
-        publishers: Local nodes that publish it (proxies of peers left out).
-        subscribers: Local nodes that subscribe to it (our own left out).
-        routes: What of it crosses.
+        publishers: Local nodes that publish it, without proxies.
+        subscribers: Local nodes that subscribe to it, without the agent's own.
+        routes: Its routes to and from peers.
         crosses: Whether policy lets it cross.
         policy: The rule that says so, ready to read.
-        mismatches: Sources with another type or md5, each ready to read.
-        unreachable: Local publishers that nothing can connect to, each ready to read.
+        mismatches: Sources and subscribers with another type or md5 sum, each ready to read.
+        unreachable: Local publishers to which no connection can be made, each ready to read.
     """
 
     name: str
@@ -347,18 +359,18 @@ class ServiceInfo(msgspec.Struct, kw_only=True, frozen=True):
         name: Its global name here.
         node: The node that provides it, by its name in its own graph.
         direction: ``out`` (of this module; peers may call it) or ``in`` (a peer's).
-        peer: Whose it is; empty for ``out``.
-        state: ``in``: ``hidden`` (not in the local graph: see ``hidden``), ``idle`` (nobody calls it), ``opening`` or
-            ``open``. ``out``: ``home`` (policy keeps it here), ``idle``, or ``open`` (some peer has it open).
-        wire: Its name on the way, and in the peer's own graph, where that differs.
-        type: ``package/Name``; empty before anybody asked for it.
+        peer: The module that provides it; empty for ``out``.
+        state: ``in``: ``hidden`` (not in the local graph: see ``hidden``), ``idle`` (no client), ``opening`` or
+            ``open``. ``out``: ``home`` (policy does not let it cross), ``idle``, or ``open`` (a peer has it open).
+        wire: Its name on the wire, and in the peer's own graph, where that differs.
+        type: ``package/Name``; empty before a client has asked for it.
         md5: Of that type, likewise.
         callers: ``out``: the peers that have it open.
-        calls: Calls made across the mesh so far.
+        calls: Calls across the mesh so far.
         failed: Of these, those that ended with an error.
         active: Calls under way.
-        latency: ``in``: from a client's request to its reply; ``out``: the server's part of it. Seconds, of the last
-            calls that went well.
+        latency: Of the last successful calls; ``in``: from a client's request to its reply, ``out``: the server's
+            part of that.
         crosses: Whether policy lets it cross.
         policy: The rule that says so, ready to read.
         hidden: Why a peer's service is not in the local graph, ready to read; empty where it is.
@@ -377,7 +389,7 @@ class ServiceInfo(msgspec.Struct, kw_only=True, frozen=True):
     calls: int = 0
     failed: int = 0
     active: int = 0
-    latency: LatencySpread | None = None
+    latency: SampleSpread | None = None
     crosses: bool = True
     policy: str = ""
     hidden: str = ""
@@ -385,14 +397,14 @@ class ServiceInfo(msgspec.Struct, kw_only=True, frozen=True):
 
 
 class UnreachableInfo(msgspec.Struct, kw_only=True, frozen=True):
-    """A node of the local graph that nothing can connect to; it may be dead, or its network may be down.
+    """A node of the local graph to which no connection can be made; it may be dead, or its network may be down.
 
     Attributes:
         node: Its name.
         uri: The slave API that it registered with.
         problem: Why it cannot be reached, ready to read.
-        ago: Seconds since it was first found so.
-        withdrawn: Whether peers are not offered it any more.
+        ago: Seconds since that was found.
+        withdrawn: Whether its topics are no longer offered to peers.
     """
 
     node: str
@@ -408,7 +420,7 @@ class UnreachableInfo(msgspec.Struct, kw_only=True, frozen=True):
 
 
 class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
-    """Everything at one moment.
+    """The state of an agent at one moment.
 
     Attributes:
         agent: The agent itself.
@@ -418,7 +430,7 @@ class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
         services: The graph's services and the peers', by name; of one name first the local one.
         counters: What was refused or dropped, by name: ``beacon.malformed`` …
         notes: What the user should know (a port taken, no multicast), each ready to read.
-        unreachable: Nodes of the local graph that nothing can connect to, by name.
+        unreachable: Nodes of the local graph to which no connection can be made, by name.
     """
 
     agent: AgentInfo
@@ -432,14 +444,14 @@ class Snapshot(msgspec.Struct, kw_only=True, frozen=True):
 
 
 class FollowedInfo(msgspec.Struct, kw_only=True, frozen=True):
-    """One parameter of another module that this one follows; a value of the op ``followed``.
+    """A parameter of another module that this one follows; a value of the operation ``followed``.
 
     Attributes:
         key: Its name here.
         owner: The peer's name.
-        owner_key: Its name over there.
+        owner_key: Its name at the owner.
         state: ``followed``; ``waiting`` for its owner; ``refused``.
-        size: Characters of its value as XML-RPC text; ``None`` where its owner has none, or has not told it.
+        size: Characters of its value as XML-RPC text; ``None`` where the owner has none, or has not replied.
         problem: What is wrong, or empty.
     """
 
@@ -452,11 +464,11 @@ class FollowedInfo(msgspec.Struct, kw_only=True, frozen=True):
 
 
 class PingReply(msgspec.Struct, kw_only=True, frozen=True):
-    """The value of the op ``ping``.
+    """The value of the operation ``ping``.
 
     Attributes:
         times: Round trips over the mesh in seconds, in order; ``None`` for one that was lost.
-        remote: ``address:port`` of the peer's end of the link.
+        remote: ``address:port`` of the link's other end.
     """
 
     times: tuple[float | None, ...]

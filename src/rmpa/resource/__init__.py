@@ -1,38 +1,60 @@
 """Smart Resources: modules that offer services with a quality, and adapt (paper, section 3).
 
-::
+This is the public interface; everything below it may move::
 
     from rmpa.resource import Resource, at_least
 
-``docs/tutorials/resources.md`` shows how to write one, ``docs/smart-resources.md`` what it offers to others.
+``docs/tutorials/resources.md`` shows how to write a resource, ``docs/smart-resources.md`` what it offers to others.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import importlib
+import warnings
+from typing import TYPE_CHECKING, Final
 
 from rmpa.resource.declare.answer import RequirementAnswer
-from rmpa.resource.declare.resource import QoSRequest, Resource, at_least, at_most, between, exactly
+from rmpa.resource.declare.connections import DeclaredAttribute, Demand, Input, Output
+from rmpa.resource.declare.parameters import Parameter
+from rmpa.resource.declare.qos_request import QoSRequest, at_least, at_most, between, exactly
+from rmpa.resource.declare.resource import Resource, Role
 
 if TYPE_CHECKING:
     from rmpa.resource.run.client import ResourceClient
+    from rmpa.ros.node.node import Node
 
 __all__ = [
+    "DeclaredAttribute",
+    "Demand",
+    "Input",
+    "Node",
+    "Output",
+    "Parameter",
     "QoSRequest",
     "RequirementAnswer",
     "Resource",
     "ResourceClient",
+    "Role",
     "at_least",
     "at_most",
     "between",
     "exactly",
 ]
+_LAZY: Final = {"ResourceClient": "rmpa.resource.run.client", "Node": "rmpa.ros.node.node"}
+"""Imported at their first use: they bring asyncio and sockets."""
+_RENAMED: Final = {"Wish": QoSRequest, "Answer": RequirementAnswer}
 
 
 def __getattr__(name: str) -> object:
-    """Load the client only where it is used: it brings asyncio and sockets."""
-    if name == "ResourceClient":
-        from rmpa.resource.run.client import ResourceClient  # noqa: PLC0415 - as said
+    """Find names that are imported late, and those of earlier releases.
 
-        return ResourceClient
+    Raises:
+        AttributeError: There is no such name.
+    """
+    if (module := _LAZY.get(name)) is not None:
+        return getattr(importlib.import_module(module), name)
+    if (kind := _RENAMED.get(name)) is not None:
+        text = f"rmpa.resource.{name} is deprecated: it is called {kind.__name__} now"
+        warnings.warn(text, DeprecationWarning, stacklevel=2)
+        return kind
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -51,9 +51,10 @@ class MachineTimer:
                 self._handle = loop.call_later(max(0.0, due - self._now()), self._fire)
 
     def close(self) -> None:
-        """Never call again."""
+        """Never call again, and let go of the machine: its owner may hold this timer, which would be a cycle."""
         self._closed = True
         self._cancel()
+        self._next_timer, self._on_due = _never, _nothing
 
     def _cancel(self) -> None:
         self._due = None
@@ -66,3 +67,12 @@ class MachineTimer:
         now = asyncio.get_running_loop().time() if self._now is None else self._now()
         self._on_due(now if due is None else max(due, now))
         self.arm()
+
+
+def _never() -> float | None:
+    """The ``next_timer()`` of a timer that is closed."""
+    return None
+
+
+def _nothing(_now: float) -> None:
+    """What a timer that is closed does."""

@@ -83,7 +83,11 @@ def running(clock: Clock) -> Iterator[Clock]:
     """Let a clock be the running event loop, and the wall clock of the flows."""
     asyncio._set_running_loop(cast("asyncio.AbstractEventLoop", clock))
     try:
-        with mock.patch("rmpa.bridge.data.io.flows.time", SimpleNamespace(time_ns=clock.wall_ns)):
+        wall = SimpleNamespace(time_ns=clock.wall_ns)
+        with (
+            mock.patch("rmpa.bridge.data.io.export_flow.time", wall),
+            mock.patch("rmpa.bridge.data.io.import_flow.time", wall),
+        ):
             yield clock
     finally:
         asyncio._set_running_loop(None)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from rmpa.core.outbox import Framer, QueuedMessage
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
     from tests.bridge.io.two_bridges import Side
 
 
@@ -122,7 +122,7 @@ class LinkEnd:
         wire = self.wires[lane] = Wire(self.far.receive)
         (self.express if lane == "express" else self.bulk).connect(cast("Any", wire))
 
-    # As mesh.aio.link.MeshLink.
+    # As mesh.io.link.PeerLink.
 
     def send_control(self, payload: bytes) -> None:
         """Send a control message."""
@@ -151,7 +151,7 @@ class LinkEnd:
         if now - self._heard > runtime_limits.STALE_AGE:
             self.resumed_at = now
         self._heard = now
-        bridge, link = self.side.bridge, cast("MeshLink", self)
+        bridge, link = self.side.bridge, cast("PeerLink", self)
         if frame.kind is FrameKind.CONTROL:
             bridge.control(link, frame.payload)
         elif frame.kind is FrameKind.FENCE:
@@ -170,4 +170,4 @@ class LinkEnd:
             self.gone, self.silent = True, silent
             self.express.end()
             self.bulk.end()
-            self.side.bridge.link_down(cast("MeshLink", self))
+            self.side.bridge.link_down(cast("PeerLink", self))

@@ -20,7 +20,7 @@ from rmpa.core.errors import LimitExceeded
 if TYPE_CHECKING:
     from rmpa.bridge.actions import Action
     from rmpa.bridge.io.bridge import PeerSession
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.core.embedded import RosCore
 
 ABOUT = Description("a/B", "5a9ea5f83505693b71e785041e67a8bb", "", False)
@@ -84,7 +84,7 @@ def test_the_longest_advertisement_of_ours_is_within_the_limit_of_one() -> None:
 
 
 async def test_a_longer_one_ends_the_link_before_it_is_read(bridge: Bridge) -> None:
-    link = cast("MeshLink", object())
+    link = cast("PeerLink", object())
     bridge._by_link[link] = cast("PeerSession", object())
     payload = encode(Advertise()).replace(b"[]", b" " * limits.ADVERTISEMENT_MAX + b"[]", 1)
     assert payload.startswith(b'{"op":"advertise"')

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from rmpa.bridge.io.bridge import PeerSession
     from rmpa.core.contract import ContractRule
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.core.embedded import RosCore
     from rmpa.ros.node.publication import Publication
     from tests.bridge.io.virtual import VirtualLoop
@@ -165,8 +165,8 @@ class World:
                 end.clock_offset, end.clock_error = 0.0, 0.001
             end.side.link = end
         for end in self.rng.sample(self._ends, 2):
-            end.side.bridge.link_up(cast("MeshLink", end))
-            end.side.bridge.clock(cast("MeshLink", end))
+            end.side.bridge.link_up(cast("PeerLink", end))
+            end.side.bridge.clock(cast("PeerLink", end))
 
     def cut(self) -> None:
         """The cable is out: nothing arrives any more; nobody has noticed yet."""
@@ -212,7 +212,7 @@ class World:
         if end is not None and end in self._bulk_lost and not end.gone:
             self._bulk_lost.remove(end)
             end.bulk.disconnect()
-            end.side.bridge.lane_lost(cast("MeshLink", end))
+            end.side.bridge.lane_lost(cast("PeerLink", end))
 
     def mend_bulk(self) -> None:
         """There is a new bulk connection; who had not noticed the end of the last one does so now."""
@@ -325,5 +325,7 @@ def made_up(loop: VirtualLoop) -> Iterator[None]:
         stack.enter_context(
             mock.patch("rmpa.bridge.topics.io.local_subscriptions.PublisherConnection", PublisherConnection)
         )
-        stack.enter_context(mock.patch("rmpa.bridge.data.io.flows.time", SimpleNamespace(time_ns=loop.time_ns)))
+        for flow in ("export_flow", "import_flow"):
+            wall = SimpleNamespace(time_ns=loop.time_ns)
+            stack.enter_context(mock.patch(f"rmpa.bridge.data.io.{flow}.time", wall))
         yield

@@ -40,7 +40,7 @@ def say(**fields: object) -> None:
 
 
 def beacon(guid: Guid, name: str, kind: BeaconKind = BeaconKind.ANNOUNCE, domain: int = 0) -> bytes:
-    """A valid beacon of somebody."""
+    """A valid beacon of an invented agent."""
     gossip = tuple(Guid.of(f"10.77.9.{RNG.randrange(1, 255)}", RNG.randrange(1, 65536)) for _ in range(8))
     identity = Identity(guid, RNG.randbytes(core_limits.INSTANCE_ID_BYTES), name, domain)
     return Beacon(kind, identity, 120_000, RNG.getrandbits(32), gossip).serialize()
@@ -136,7 +136,7 @@ def unknown_routes(link: Link) -> None:
 
 
 def wrong_length(link: Link) -> None:
-    """Offer a topic that somebody over there wants, and send what is not a message on its route."""
+    """Offer a topic that the agent under test subscribes to, and send on its route what is not a message."""
     link.send(FrameKind.CONTROL, encode(Advertise((TopicOffer("/evil", "/eve", "std_msgs/String"),), full=True)))
     while True:
         frame = link.frame()
@@ -168,7 +168,7 @@ def huge_frame(link: Link) -> None:
 
 
 def opens_of_nothing(link: Link) -> None:
-    """100,000 requests whose answers nobody reads."""
+    """100,000 requests whose answers are not read."""
     one = [Frame(FrameKind.CONTROL, encode(OpenRoute(n, "/none", "/none"))).serialize() for n in range(1, 1001)]
     for _ in range(100):
         link.sock.sendall(b"".join(one))
@@ -224,7 +224,7 @@ def mesh(here: str, victim: Guid) -> None:
             lived = link.outlives()  # long control frames are read between other things, not at once
         assert survives in (None, lived), f"attack {number}: the link {'lives' if lived else 'is closed'}"
         link.sock.close()
-    # Somebody who says to be a peer that is linked already.
+    # An agent that claims to be a peer that is linked already.
     say(attacks=len(ATTACKS))
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from rmpa.config.settings import LaneSettings
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
 
 DEADLINE = 20.0
 
@@ -54,13 +54,14 @@ class Peer:
         instance_id = bytes([number, instance]) + bytes(14)
         guid = Guid.of("127.0.0.1", self.port, instance)
         self.identity = Identity(guid, instance_id, f"peer{number}")
-        self.ups: list[MeshLink] = []
-        self.downs: list[tuple[MeshLink, str]] = []
+        self.ups: list[PeerLink] = []
+        self.downs: list[tuple[PeerLink, str]] = []
+        """Links that went down, and the reasons."""
         self.controls: list[bytes] = []
         self.data: list[tuple[int, int, int, bytes]] = []
         self.marks: list[tuple[FrameKind, int, int]] = []
-        self.clocks: list[MeshLink] = []
-        self.lanes_lost: list[MeshLink] = []
+        self.clocks: list[PeerLink] = []
+        self.lanes_lost: list[PeerLink] = []
         self.hand_made: list[socket.socket] = []
         """Sockets of ``raw``, closed at the end whatever becomes of the test."""
         self._begun: dict[int, tuple[int, int, bytearray]] = {}
@@ -68,17 +69,17 @@ class Peer:
             self.identity,
             sock,
             on_link_up=self.ups.append,
-            on_link_down=lambda link, reason: self.downs.append((link, reason)),
+            on_link_down=lambda link, down: self.downs.append((link, down.reason)),
             on_control=lambda _link, payload: self.controls.append(payload),
-            takers=LinkHandlers(self.on_data, self.on_part, self.on_mark, self.clocks.append, self.on_lane_lost),
+            handlers=LinkHandlers(self.on_data, self.on_part, self.on_mark, self.clocks.append, self.on_lane_lost),
             lanes=lanes,
         )
 
-    def on_data(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
+    def on_data(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
         assert link.used, "what comes by the bulk lane is its link's too"
         self.data.append((route, sequence, stamp_ns, bytes(payload)))
 
-    def on_part(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
+    def on_part(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
         """Put fragments together; a message is there when its last one is."""
         assert link.used
         if flags & FIRST:
@@ -92,11 +93,11 @@ class Peer:
             if not flags & ABORT:
                 self.data.append((route, sequence, stamp_ns, bytes(whole)))
 
-    def on_mark(self, link: MeshLink, kind: FrameKind, route: int, sequence: int) -> None:
+    def on_mark(self, link: PeerLink, kind: FrameKind, route: int, sequence: int) -> None:
         assert link.used
         self.marks.append((kind, route, sequence))
 
-    def on_lane_lost(self, link: MeshLink) -> None:
+    def on_lane_lost(self, link: PeerLink) -> None:
         self.lanes_lost.append(link)
         self._begun.clear()
 
@@ -107,23 +108,22 @@ class Peer:
     def linked(self, *others: Peer) -> bool:
         return all((link := self.mesh.link(o.identity.guid)) is not None and link.up for o in others)
 
-    def link(self, other: Peer) -> MeshLink:
+    def link(self, other: Peer) -> PeerLink:
         link = self.mesh.link(other.identity.guid)
         assert link is not None
         return link
 
     def both_lanes(self, *others: Peer) -> bool:
         """Whether the links with these have their bulk lanes too."""
-        return self.linked(*others) and all(self.link(other).bulk_link is not None for other in others)
+        return self.linked(*others) and all(self.link(other).bulk_connection is not None for other in others)
 
     def kill(self) -> None:
         """As kill -9: the kernel closes the sockets, nobody says bye."""
         self.mesh._running = False
         self.mesh._acceptor.close()
-        if self.mesh._timer is not None:
-            self.mesh._timer.cancel()
-        for link in self.mesh._links.values():
-            link.abort("killed")
+        self.mesh._timer.close()
+        for connection in self.mesh.connections():
+            connection.abort("killed")
 
 
 @asynccontextmanager

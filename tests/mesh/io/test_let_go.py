@@ -13,7 +13,8 @@ from tests.mesh.io.meshes import Peer, peers, until
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.connection import Connection
+    from rmpa.mesh.io.link import PeerLink
 
 MB = 1 << 20
 
@@ -25,20 +26,20 @@ def no_collector() -> Iterator[None]:
     gc.enable()
 
 
-def of(one: Peer, other: Peer) -> list[weakref.ref[MeshLink]]:
-    """A peer's link to another one, and its bulk lane's connection."""
+def references(one: Peer, other: Peer) -> list[weakref.ref[PeerLink] | weakref.ref[Connection]]:
+    """A peer's link to another one, and its two connections."""
     link = one.link(other)
-    assert link.bulk_link is not None
-    return [weakref.ref(link), weakref.ref(link.bulk_link)]
+    assert link.bulk_connection is not None
+    return [weakref.ref(link), weakref.ref(link.connection), weakref.ref(link.bulk_connection)]
 
 
 @pytest.mark.parametrize("way", ["close", "abort", "end"])
 async def test_an_ended_link_is_gone_with_what_waited(way: str) -> None:
     async with peers(2) as (one, other):
         await until(lambda: one.linked(other) and other.linked(one), "a link")
-        await until(lambda: one.link(other).bulk_link is not None, "a bulk lane")
-        await until(lambda: other.link(one).bulk_link is not None, "a bulk lane")
-        links = [*of(one, other), *of(other, one)]
+        await until(lambda: one.link(other).bulk_connection is not None, "a bulk lane")
+        await until(lambda: other.link(one).bulk_connection is not None, "a bulk lane")
+        links = [*references(one, other), *references(other, one)]
         for _ in range(20):
             one.link(other).bulk.send(1, 1, 0, bytes(MB))
         assert one.link(other).queue_bytes

@@ -37,11 +37,9 @@ async def test_a_full_mesh_with_one_link_a_pair(count: int) -> None:
     async with peers(count) as made:
         await until(lambda: all(p.linked(*(o for o in made if o is not p)) for p in made), "a full mesh")
         for peer in made:
-            used = [status for status in peer.mesh.links() if status.used]
-            assert len(used) == count - 1
-            for status in used:
-                assert status.guid is not None
-                assert status.dialled == (peer.identity.guid < status.guid)
+            assert len(peer.mesh.links()) == count - 1
+            for link in peer.mesh.links():
+                assert link.dialled == (peer.identity.guid < link.guid)
             assert {s.state for s in peer.mesh.peers()} == {"linked"}
         link = made[0].link(made[1])
         await until(lambda: link.rtt is not None, "a round trip")
@@ -51,7 +49,7 @@ async def test_a_full_mesh_with_one_link_a_pair(count: int) -> None:
         assert not any(p.downs for p in made)
     for peer in made:
         assert len(peer.downs) == count - 1
-        assert not peer.mesh.links()
+        assert not peer.mesh.connections()
 
 
 async def test_one_side_alone_knows_the_other() -> None:
@@ -64,7 +62,7 @@ async def test_one_side_alone_knows_the_other() -> None:
 async def test_of_several_addresses_whichever_answers_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody answers at the GUID's own address; at the next one nobody listens, and at the third a stranger does."""
     one, other = sorted((Peer(1, host="127.0.0.4"), Peer(2, host="127.0.0.4")), key=lambda p: p.identity.guid)
-    connect = one.mesh._connect  # where packets are swallowed
+    connect = one.mesh.dialler.connect  # where packets are swallowed
 
     async def through(endpoint: tuple[str, int], lane: Lane, within: float = limits.DIAL_TIMEOUT) -> socket.socket:
         if endpoint[0] == "127.0.0.1":
@@ -72,7 +70,7 @@ async def test_of_several_addresses_whichever_answers_is_used(monkeypatch: pytes
             raise TimeoutError
         return await connect(endpoint, lane, within)
 
-    monkeypatch.setattr(one.mesh, "_connect", through)
+    monkeypatch.setattr(one.mesh.dialler, "connect", through)
     stranger = await asyncio.start_server(lambda _, writer: writer.close(), "127.0.0.3", other.port)
     try:
         await one.mesh.start()
@@ -100,22 +98,22 @@ async def test_a_link_that_ends_during_its_redial_leaves_no_socket(
         link = one.link(other)
         racing, ended = asyncio.Event(), asyncio.Event()
         sockets: list[socket.socket] = []
-        race = one.mesh._race
+        redial = one.mesh.dialler.redial
 
         async def late(*args: Any) -> tuple[socket.socket, tuple[str, int]]:
             racing.set()
             await ended.wait()
-            sock, endpoint = await race(*args)
+            sock, endpoint = await redial(*args)
             sockets.append(sock)
             return sock, endpoint
 
-        monkeypatch.setattr(one.mesh, "_race", late)
+        monkeypatch.setattr(one.mesh.dialler, "redial", late)
         monkeypatch.setattr(one.mesh, "_alive", lambda _: False)
-        one.mesh.link_quiet(link)
+        one.mesh.connection_quiet(link.connection)
         task = one.mesh._redials[link.id]
         await racing.wait()
         link.abort("the cable is out")
-        await until(lambda: bool(one.downs) and link.sock.fileno() < 0, "its end")
+        await until(lambda: bool(one.downs) and link.connection.sock.fileno() < 0, "its end")
         ended.set()
         async with asyncio.timeout(DEADLINE):
             await asyncio.wait([task])
@@ -132,7 +130,7 @@ async def test_a_link_that_ends_while_its_bulk_lane_is_dialled_leaves_no_socket(
         one, other = sorted(made, key=lambda peer: peer.identity.guid)
         connected, ended = asyncio.Event(), asyncio.Event()
         sockets: list[socket.socket] = []
-        connect = one.mesh._connect
+        connect = one.mesh.dialler.connect
 
         async def late(endpoint: tuple[str, int], lane: Lane, within: float = 2.0) -> socket.socket:
             sock = await connect(endpoint, lane, within)
@@ -149,7 +147,7 @@ async def test_a_link_that_ends_while_its_bulk_lane_is_dialled_leaves_no_socket(
             opened.append(sock)
             open_link(sock, *args)
 
-        monkeypatch.setattr(one.mesh, "_connect", late)
+        monkeypatch.setattr(one.mesh.dialler, "connect", late)
         monkeypatch.setattr(one.mesh, "_open", note)
         one.mesh.peer_found(other.identity)
         await connected.wait()
@@ -170,7 +168,7 @@ async def test_a_dial_that_fails_of_a_bug_is_logged(
         async def fails(*_: object) -> tuple[socket.socket, tuple[str, int]]:
             raise KeyError("as asked")
 
-        monkeypatch.setattr(one.mesh, "_race", fails)
+        monkeypatch.setattr(one.mesh.dialler, "dial", fails)
         one.mesh.peer_found(other.identity)
         await until(lambda: any(r.exc_info for r in caplog.records), "a line in the log")
         assert not one.mesh._dials
@@ -248,7 +246,7 @@ async def test_another_domain_is_refused_with_what_to_do(caplog: pytest.LogCaptu
         assert Refuse.parse(answer.payload).code == Refusal.DOMAIN
         assert "--domain" in Refuse.parse(answer.payload).text
         assert one.mesh.counters["link.refused.domain"] == 1
-        await until(lambda: not one.mesh.links(), "the link ended")
+        await until(lambda: not one.mesh.connections(), "the link ended")
         assert [r.message for r in caplog.records if "domain" in r.message and r.levelname == "WARNING"] == [
             f"! refused a link with stranger at 127.0.0.1: {Refuse.parse(answer.payload).text}"
         ]
@@ -387,7 +385,7 @@ async def test_silent_connections_from_one_address_are_bounded() -> None:
             _, writer = await asyncio.open_connection("127.0.0.1", one.port)
             writers.append(writer)
         await until(lambda: one.mesh.counters["link.pending_full"] == 4, "four closed")
-        assert len(one.mesh.links()) == limits.PENDING_PER_ADDRESS
+        assert len(one.mesh.connections()) == limits.PENDING_PER_ADDRESS
         for writer in writers:
             writer.close()
 
@@ -403,7 +401,9 @@ async def test_both_dial_at_once_and_one_link_stays() -> None:
             lambda: (
                 one.both_lanes(other)
                 and other.both_lanes(one)
-                and all(sorted(s.bulk for s in p.mesh.links()) == [False, True] for p in (one, other))
+                and all(
+                    sorted(c.lane for c in p.mesh.connections()) == [Lane.EXPRESS, Lane.BULK] for p in (one, other)
+                )
             ),
             "one connection of each lane",
         )

@@ -22,8 +22,9 @@ from tests.mesh.io.meshes import DEADLINE, Peer, linked_pair, peers, raw, until
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
+    from rmpa.mesh.io.connection import Connection
     from rmpa.mesh.io.lane import LaneSender
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
 
 HAND_MADE = Identity(Guid.of("127.0.0.1", 9), b"h" * 16, "hand_made")
 
@@ -34,8 +35,8 @@ def large(number: int, size: int) -> bytes:
     return b"".join(hashlib.sha256(block + n.to_bytes(4, "big")).digest() for n in range(size // 32 + 1))[:size]
 
 
-def bulk_of(link: MeshLink) -> MeshLink:
-    bulk = link.bulk_link
+def bulk_of(link: PeerLink) -> Connection:
+    bulk = link.bulk_connection
     assert bulk is not None
     return bulk
 
@@ -49,16 +50,16 @@ async def test_each_link_has_a_bulk_lane_that_the_same_side_dialled(count: int) 
         others = {p.number: [o for o in made if o is not p] for p in made}
         await until(lambda: all(p.both_lanes(*others[p.number]) for p in made), "both lanes everywhere")
         for peer in made:
-            statuses = peer.mesh.links()
-            assert sum(s.bulk for s in statuses) == sum(s.used for s in statuses) == count - 1
-            assert not any(s.bulk and s.used for s in statuses)
-            assert {(s.guid, s.dialled) for s in statuses if s.bulk} == {
-                (s.guid, s.dialled) for s in statuses if not s.bulk
+            links, connections = peer.mesh.links(), peer.mesh.connections()
+            assert len(links) == count - 1
+            assert len(connections) == 2 * len(links)
+            assert {(c.identity, c.dialled) for c in connections if c.lane == Lane.BULK} == {
+                (link.identity, link.dialled) for link in links
             }
             assert len(peer.ups) == count - 1, "a bulk lane is no link of its own"
             assert not peer.downs
             assert not peer.lanes_lost
-    assert not any(p.mesh.links() for p in made)
+    assert not any(p.mesh.connections() for p in made)
 
 
 async def test_the_sockets_of_both_lanes_have_their_options() -> None:
@@ -68,11 +69,11 @@ async def test_the_sockets_of_both_lanes_have_their_options() -> None:
         for peer, far in ((one, other), (other, one)):
             express = peer.link(far)
             wanted = [
-                (express, 46, 5, limits.LINK_UNSENT_BYTES),
+                (express.connection, 46, 5, limits.LINK_UNSENT_BYTES),
                 (bulk_of(express), 8, 2, limits.BULK_UNSENT_BYTES),
             ]
-            for link, dscp, priority, unsent in wanted:
-                sock = link.sock
+            for connection, dscp, priority, unsent in wanted:
+                sock = connection.sock
                 assert sock.getsockopt(socket.IPPROTO_IP, socket.IP_TOS) == dscp << 2
                 assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_PRIORITY) == priority
                 assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT) == unsent
@@ -84,9 +85,10 @@ async def test_the_sockets_of_both_lanes_have_their_options() -> None:
 
 async def test_by_default_commands_go_first_in_every_queue_and_wifi_class() -> None:
     async with linked_pair() as (one, other):
-        for link, tos, priority in ((one.link(other), 0xC0, 6), (bulk_of(one.link(other)), 0, 0)):
-            assert link.sock.getsockopt(socket.IPPROTO_IP, socket.IP_TOS) == tos
-            assert link.sock.getsockopt(socket.SOL_SOCKET, socket.SO_PRIORITY) == priority
+        link = one.link(other)
+        for connection, tos, priority in ((link.connection, 0xC0, 6), (bulk_of(link), 0, 0)):
+            assert connection.sock.getsockopt(socket.IPPROTO_IP, socket.IP_TOS) == tos
+            assert connection.sock.getsockopt(socket.SOL_SOCKET, socket.SO_PRIORITY) == priority
 
 
 @pytest.mark.parametrize(
@@ -100,7 +102,7 @@ async def test_a_lane_without_an_express_one_and_one_that_does_not_exist_are_ref
         assert answer.kind is FrameKind.REFUSE
         assert Refuse.parse(answer.payload).code == code
         sock.close()
-        await until(lambda: not one.mesh.links(), "closed")
+        await until(lambda: not one.mesh.connections(), "closed")
         assert one.mesh.counters[f"link.refused.{code.name.lower()}"] == 1
         assert not one.ups
 
@@ -113,13 +115,13 @@ async def test_another_instance_gets_no_bulk_lane_beside_a_link_that_is_not_its_
         assert Refuse.parse(answer.payload).code == Refusal.NO_EXPRESS
         sock.close()
         express.close()
-        await until(lambda: not one.mesh.links(), "closed")
+        await until(lambda: not one.mesh.connections(), "closed")
 
 
 async def test_both_sides_promise_the_bulk_lanes_lease() -> None:
     async with linked_pair() as (one, other):
         for link in (one.link(other), other.link(one)):
-            leases = [remote.lease for k in (link, bulk_of(link)) if (remote := k._machine.remote) is not None]
+            leases = [k.remote.lease for k in (link.connection, bulk_of(link)) if k.remote is not None]
             assert leases == [limits.LINK_LEASE, limits.BULK_LEASE]
 
 
@@ -127,7 +129,7 @@ async def test_whoever_takes_what_comes_takes_it_from_both_lanes() -> None:
     async with linked_pair() as (one, other):
         got: list[int] = []
         link = other.link(one)
-        taken = replace(other.mesh._takers, data=lambda k, r, s, t, p: got.append(s))
+        taken = replace(other.mesh.handlers, data=lambda k, r, s, t, p: got.append(s))
         link.use(taken)
         one.link(other).bulk.send(7, 1, 0, b"x")
         one.link(other).express.send(7, 2, 0, b"x")
@@ -147,7 +149,7 @@ async def test_a_bulk_lane_that_cannot_be_reached_is_tried_again(monkeypatch: py
 
 def hold_bulk(peer: Peer, *, fails: int = 0, until_set: asyncio.Event | None = None) -> None:
     """Let dials of bulk lanes fail, or wait."""
-    real: Callable[..., Awaitable[socket.socket]] = peer.mesh._connect
+    real: Callable[..., Awaitable[socket.socket]] = peer.mesh.dialler.connect
     left = [None] * fails
 
     async def connect(endpoint: tuple[str, int], lane: Lane, *rest: float) -> socket.socket:
@@ -158,7 +160,7 @@ def hold_bulk(peer: Peer, *, fails: int = 0, until_set: asyncio.Event | None = N
             await until_set.wait()
         return await real(endpoint, lane, *rest)
 
-    peer.mesh._connect = connect  # type: ignore[assignment, method-assign]
+    peer.mesh.dialler.connect = connect  # type: ignore[assignment, method-assign]
 
 
 # --- messages -----------------------------------------------------------------------------------------------------
@@ -228,7 +230,7 @@ async def test_each_route_has_its_own_bound_and_drops_its_own() -> None:
         assert other.messages(8) == [(3, b"3"), (4, b"4")]
         assert other.messages(9) == [(0, b"other")]
         assert one.link(other).dropped == 3
-        assert [s.dropped for s in one.mesh.links() if s.used] == [3]
+        assert [link.dropped for link in one.mesh.links()] == [3]
 
 
 async def test_a_closed_route_lets_go_of_what_waits() -> None:
@@ -264,7 +266,7 @@ async def test_the_bulk_lane_falls_and_comes_back_while_small_messages_go_on(by_
         await until(lambda: bool(one.lanes_lost and other.lanes_lost), "both know")
         for sender, receiver in ((one, other), (other, one)):
             link = sender.link(receiver)
-            assert link.bulk_link is None
+            assert link.bulk_connection is None
             assert not link.bulk.connected
             assert link.up
             link.bulk.send(7, 2, 0, large(2, 300_000))
@@ -348,7 +350,7 @@ async def test_both_lanes_end_with_the_link() -> None:
         one.mesh.peer_gone(other.identity.guid)
         other.mesh.peer_gone(one.identity.guid)
         link.close("maintenance")
-        await until(lambda: not one.mesh.links() and not other.mesh.links(), "all connections are closed")
+        await until(lambda: not one.mesh.connections() and not other.mesh.connections(), "all connections are closed")
         assert one.downs == [(link, "maintenance")]
         assert not one.lanes_lost, "the whole link is gone, and that is what is told"
         assert link.express.ended
@@ -360,7 +362,7 @@ async def test_both_lanes_end_with_the_link() -> None:
 async def test_a_killed_peer_leaves_no_lane_behind() -> None:
     async with linked_pair() as (one, other):
         other.kill()
-        await until(lambda: not one.mesh.links(), "nothing is left")
+        await until(lambda: not one.mesh.connections(), "nothing is left")
         assert len(one.downs) == 1
         await until(lambda: not one.mesh._bulk_dials, "nobody dials its bulk lane")
 
@@ -374,7 +376,7 @@ async def test_a_new_bulk_lane_replaces_one_that_is_stuck_and_carries_what_waite
         express, _ = await raw(one, HAND_MADE, lease=60.0)
         stuck, answer = await raw(one, HAND_MADE, lease=60.0, lane=Lane.BULK)
         assert answer.kind is FrameKind.WELCOME
-        await until(lambda: bool(one.ups) and one.ups[0].bulk_link is not None, "both lanes")
+        await until(lambda: bool(one.ups) and one.ups[0].bulk_connection is not None, "both lanes")
         link = one.ups[0]
         old = bulk_of(link)
         for route in range(7, 11):
@@ -383,17 +385,17 @@ async def test_a_new_bulk_lane_replaces_one_that_is_stuck_and_carries_what_waite
         assert link.queue_bytes > 6_000_000
         fresh, answer = await raw(one, HAND_MADE, lease=60.0, lane=Lane.BULK)
         assert answer.kind is FrameKind.WELCOME
-        await until(lambda: link.bulk_link not in (None, old), "replaced")
+        await until(lambda: link.bulk_connection not in (None, old), "replaced")
         assert one.lanes_lost == [link]
         got = await read_messages(fresh, lambda found: {(route, 2) for route in range(7, 11)} <= set(found))
         for (route, number), payload in got.items():
             assert payload == large(route, 100_000 if number == 2 else 3_000_000)
-        await until(lambda: len(one.mesh.links()) == 2, "the old one is closed")
+        await until(lambda: len(one.mesh.connections()) == 2, "the old one is closed")
         assert link.up
         assert not one.downs
         for sock in (express, stuck, fresh):
             sock.close()
-        await until(lambda: not one.mesh.links(), "closed")
+        await until(lambda: not one.mesh.connections(), "closed")
 
 
 async def read_messages(
@@ -434,12 +436,12 @@ async def test_a_fence_is_answered_when_all_before_it_has_arrived(way: str) -> N
         seen: list[list[int]] = []
         taken = one.on_mark
 
-        def on_mark(link: MeshLink, kind: FrameKind, route: int, sequence: int) -> None:
+        def on_mark(link: PeerLink, kind: FrameKind, route: int, sequence: int) -> None:
             taken(link, kind, route, sequence)
             seen.append([number for number, _ in other.messages(7)])
 
         link = one.link(other)
-        link.use(replace(one.mesh._takers, mark=on_mark))
+        link.use(replace(one.mesh.handlers, mark=on_mark))
         for number in range(4):
             lane.send(7, 2 * number, 0, large(number, 2_000_000 if number % 2 else 100))
             lane.fence(7, number + 1)
@@ -495,7 +497,7 @@ async def test_a_fence_on_a_link_whose_messages_nobody_takes_is_not_answered() -
         data = pack_data_header(3, 7, 1, 0) + b"not"
         await loop.sock_sendall(sock, data + Frame(FrameKind.FENCE, route=7, sequence=1).serialize())
         await until(lambda: one.ups[0].bytes_in >= before + 2 * 24 + 3, "read")
-        one.ups[0].use(one.mesh._takers)
+        one.ups[0].use(one.mesh.handlers)
         await loop.sock_sendall(sock, data + Frame(FrameKind.FENCE, route=7, sequence=2).serialize())
         kept = b""
         answers: list[int] = []
@@ -507,7 +509,7 @@ async def test_a_fence_on_a_link_whose_messages_nobody_takes_is_not_answered() -
         assert answers == [2]
         assert len(one.data) == 1
         sock.close()
-        await until(lambda: not one.mesh.links(), "closed")
+        await until(lambda: not one.mesh.connections(), "closed")
 
 
 async def test_acknowledgements_go_in_front_and_by_the_express_lane() -> None:

@@ -16,7 +16,8 @@ from rmpa.mesh.path_mtu import TcpSample
 from tests.mesh.io.meshes import Peer, linked_pair, until
 
 if TYPE_CHECKING:
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.connection import Connection
+    from rmpa.mesh.io.link import PeerLink
 
 FIRST, LEAST = limits.SEGMENT_BYTES
 
@@ -31,14 +32,14 @@ class Hole:
         self._peers = peers
         self._looks: dict[int, int] = {}
         monkeypatch.setattr(path_monitor, "sample", self.sample)
-        monkeypatch.setattr("rmpa.mesh.io.link.MeshLink.has_sent", lambda _: True)
+        monkeypatch.setattr("rmpa.mesh.io.connection.Connection.has_sent", lambda _: True)
 
     def _stuck(self, sock: socket.socket) -> bool:
         for peer in self._peers:
-            for link in peer.mesh._links.values():
-                name = "bulk" if link.lane == 2 else "express"
-                if link.sock is sock and name in self.lanes:
-                    return (link.stalls.segment or 1448) > self.passes
+            for connection in peer.mesh.connections():
+                name = "bulk" if connection.lane == 2 else "express"
+                if connection.sock is sock and name in self.lanes:
+                    return (connection.stalls.segment or 1448) > self.passes
         return False
 
     def sample(self, sock: socket.socket) -> TcpSample | None:
@@ -48,9 +49,9 @@ class Hole:
         return TcpSample(queued=50_000, retransmits=looks, acked=0, delivered=0, rtt=0.001)
 
 
-def bulk(one: Peer, other: Peer) -> MeshLink | None:
+def bulk(one: Peer, other: Peer) -> Connection | None:
     link = one.mesh.link(other.identity.guid)
-    return link.bulk_link if link is not None else None
+    return link.bulk_connection if link is not None else None
 
 
 def segment(one: Peer, other: Peer) -> int | None:
@@ -68,7 +69,7 @@ async def test_a_bulk_lane_that_stands_still_is_dialled_anew_with_small_packets(
         hole.passes = FIRST
         await until(lambda: segment(one, other) == FIRST, "small packets")
         assert not one.downs, "commands go on"
-        assert one.link(other).stalls.segment == FIRST, "those of the express lane too, from now on"
+        assert one.link(other).connection.stalls.segment == FIRST, "those of the express lane too, from now on"
         await until(lambda: other.both_lanes(one), "the other side has the new lane")
         for number in range(3):
             one.link(other).bulk.send(7, number, 0, bytes([number]) * 300_000)
@@ -109,7 +110,7 @@ async def test_an_express_lane_that_stands_still_begins_anew(monkeypatch: pytest
         await until(lambda: bool(one.downs), "the link is given up")
         assert one.downs[0][0].silent, "its peer keeps its place"
         await until(lambda: one.both_lanes(other) and other.both_lanes(one), "the next one")
-        assert one.link(other).stalls.segment == segment(one, other) == FIRST
+        assert one.link(other).connection.stalls.segment == segment(one, other) == FIRST
 
 
 @pytest.mark.parametrize("dialler", [True, False])
@@ -128,20 +129,20 @@ async def test_where_both_lanes_stand_still_a_new_connection_is_the_small_packet
 async def test_a_peer_that_answers_nothing_is_no_black_hole(monkeypatch: pytest.MonkeyPatch) -> None:
     async with linked_pair() as (one, other):
 
-        async def refuses(_: MeshLink) -> bool:
+        async def refuses(_: PeerLink) -> bool:
             return False
 
-        monkeypatch.setattr("rmpa.mesh.io.link.MeshLink.take_probe", lambda _: False)
-        monkeypatch.setattr(one.mesh.paths, "_knock", refuses)
+        monkeypatch.setattr("rmpa.mesh.io.connection.Connection.take_probe", lambda _: False)
+        monkeypatch.setattr(one.mesh.paths, "_reachable", refuses)
         hole = Hole(monkeypatch, one)
         hole.lanes = {"express", "bulk"}
         link = one.link(other)
         looks = 0
 
-        def counted(lane: MeshLink) -> None:
+        def counted(link: PeerLink) -> None:
             nonlocal looks
             looks += 1
-            type(one.mesh.paths).look(one.mesh.paths, lane)
+            type(one.mesh.paths).look(one.mesh.paths, link)
 
         monkeypatch.setattr(one.mesh.paths, "look", counted)
         await until(lambda: looks > 8, "looked at for a while")
@@ -176,12 +177,12 @@ def test_what_the_kernel_tells_of_a_connection() -> None:
 async def test_the_end_of_a_mesh_ends_its_looks(monkeypatch: pytest.MonkeyPatch) -> None:
     async with linked_pair() as (one, _):
 
-        async def hangs(_: MeshLink) -> bool:
+        async def hangs(_: PeerLink) -> bool:
             await asyncio.Event().wait()
             return True
 
-        monkeypatch.setattr(one.mesh.paths, "_knock", hangs)
+        monkeypatch.setattr(one.mesh.paths, "_reachable", hangs)
         hole = Hole(monkeypatch, one)
         hole.lanes = {"express", "bulk"}
-        await until(lambda: bool(one.mesh.paths._knocks), "a knock")
-    assert not one.mesh.paths._soon
+        await until(lambda: bool(one.mesh.paths._trials), "a knock")
+    assert not one.mesh.paths._timers

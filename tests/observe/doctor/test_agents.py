@@ -4,49 +4,49 @@ from __future__ import annotations
 
 import msgspec
 
+from rmpa.observe.check import Check, CheckLevel
 from rmpa.observe.doctor.agents import judge_agents
-from rmpa.observe.doctor.finding import Finding, FindingLevel
 from rmpa.observe.snapshot import FilesInfo, UnreachableInfo
 from tests.observe.samples import SNAPSHOT
 
 
 def test_none_runs() -> None:
     (found,) = judge_agents({}, "0.1.0")
-    assert found.level is FindingLevel.SKIPPED
+    assert found.level is CheckLevel.SKIPPED
     assert "rmpa up" in found.remedy
 
 
 def test_one_that_does_not_answer() -> None:
     (found,) = judge_agents({"base": "no agent answers in time"}, "0.1.0")
-    assert found.level is FindingLevel.FAIL
+    assert found.level is CheckLevel.FAIL
 
 
 def test_peers_clocks_and_notes() -> None:
     found = judge_agents({"base": SNAPSHOT}, "0.1.0")
-    texts = {(f.check, f.subject, f.level): f.text for f in found}
-    assert texts["agent", "base", FindingLevel.OK] == "domain 3, core http://127.0.0.1:11311/, mesh 10.0.0.1:40001"
-    assert texts["proxies", "base", FindingLevel.OK].startswith(
+    texts = {(f.name, f.where, f.level): f.text for f in found}
+    assert texts["agent", "base", CheckLevel.OK] == "domain 3, core http://127.0.0.1:11311/, mesh 10.0.0.1:40001"
+    assert texts["proxies", "base", CheckLevel.OK].startswith(
         "17 nodes of peers, 2 listening sockets: two for all, ports"
     )
-    assert texts["agent", "base", FindingLevel.WARN] == "no multicast on eth0"
-    assert texts["core memory", "base", FindingLevel.OK] == SNAPSHOT.agent.core_memory
-    assert "found by multicast" in texts["peer", "base-joystick", FindingLevel.OK]
-    assert texts["peer", "base-joystick", FindingLevel.WARN].startswith("2 messages were given up")
-    assert "1.2 ms ±0.2 ms behind ours" in texts["clock", "base-joystick", FindingLevel.OK]
-    assert texts["peer", "base-pc", FindingLevel.WARN] == "linking: connection refused"
-    assert "shares its name" in texts["peer", "base-pc", FindingLevel.FAIL]
+    assert texts["agent", "base", CheckLevel.WARN] == "no multicast on eth0"
+    assert texts["core memory", "base", CheckLevel.OK] == SNAPSHOT.agent.core_memory
+    assert "found by multicast" in texts["peer", "base-joystick", CheckLevel.OK]
+    assert texts["peer", "base-joystick", CheckLevel.WARN].startswith("2 messages were given up")
+    assert "1.2 ms ±0.2 ms behind ours" in texts["clock", "base-joystick", CheckLevel.OK]
+    assert texts["peer", "base-pc", CheckLevel.WARN] == "linking: connection refused"
+    assert "shares its name" in texts["peer", "base-pc", CheckLevel.FAIL]
 
 
 def test_nodes_that_cannot_be_reached() -> None:
     cam = UnreachableInfo(node="/cam", uri="http://nosuch:1/", problem="no such name", ago=3.0)
     gone = UnreachableInfo(node="/gone", uri="http://10.9.9.9:1/", problem="no answer", ago=60.0, withdrawn=True)
     shown = msgspec.structs.replace(SNAPSHOT, unreachable=(cam, gone))
-    found = [f for f in judge_agents({"base": shown}, "0.1.0") if f.check == "node"]
-    assert [(f.subject, f.level, f.text) for f in found] == [
-        ("/cam", FindingLevel.WARN, "/cam cannot be reached at http://nosuch:1/ (no such name)"),
+    found = [f for f in judge_agents({"base": shown}, "0.1.0") if f.name == "node"]
+    assert [(f.where, f.level, f.text) for f in found] == [
+        ("/cam", CheckLevel.WARN, "/cam cannot be reached at http://nosuch:1/ (no such name)"),
         (
             "/gone",
-            FindingLevel.FAIL,
+            CheckLevel.FAIL,
             "/gone cannot be reached at http://10.9.9.9:1/ (no answer), so peers are not offered it",
         ),
     ]
@@ -58,10 +58,10 @@ def test_a_path_that_drops_large_packets() -> None:
     assert joystick.link is not None
     link = msgspec.structs.replace(joystick.link, path_problem="a hole", path_remedy="mend it")
     holed = msgspec.structs.replace(SNAPSHOT, peers=(msgspec.structs.replace(joystick, link=link),))
-    (found,) = [f for f in judge_agents({"base": holed}, "0.1.0") if f.check == "mtu"]
-    assert (found.subject, found.level, found.text, found.remedy) == (
+    (found,) = [f for f in judge_agents({"base": holed}, "0.1.0") if f.name == "mtu"]
+    assert (found.where, found.level, found.text, found.remedy) == (
         "base-joystick",
-        FindingLevel.WARN,
+        CheckLevel.WARN,
         "a hole",
         "mend it",
     )
@@ -70,28 +70,28 @@ def test_a_path_that_drops_large_packets() -> None:
 def test_alone_and_of_another_version() -> None:
     alone = msgspec.structs.replace(SNAPSHOT, peers=(), notes=())
     found = judge_agents({"base": alone}, "0.2.0")
-    warned = [f.text for f in found if f.level is FindingLevel.WARN]
+    warned = [f.text for f in found if f.level is CheckLevel.WARN]
     assert warned == ["it is RMPA 0.1.0, this command is 0.2.0", "knows no peer (domain 3, looking on wlan0)"]
 
 
-def test_the_descriptors_of_the_agent_are_judged_not_those_of_the_doctor() -> None:
-    def files(problem: str = "", *, near: bool = False) -> Finding:
+def test_the_agents_descriptors_are_judged() -> None:
+    def files(problem: str = "", *, near: bool = False) -> Check:
         few = FilesInfo(open=60, limit=64, hard=64, reserved=16, near=near, problem=problem)
         agent = msgspec.structs.replace(SNAPSHOT.agent, files=few)
         shown = msgspec.structs.replace(SNAPSHOT, agent=agent, notes=(problem,) if problem else ())
         found = judge_agents({"base": shown}, "0.1.0")
         assert not any(f.text == problem for f in found), "said once"
-        return next(f for f in found if f.check == "files")
+        return next(f for f in found if f.name == "files")
 
     assert (files().level, files().text) == (
-        FindingLevel.OK,
+        CheckLevel.OK,
         "60 of 64 file descriptors are open; the last 16 are kept for the core and the links",
     )
-    assert files(near=True).level is FindingLevel.WARN
+    assert files(near=True).level is CheckLevel.WARN
     assert "prlimit --pid 4242" in files(near=True).remedy
     bad = files("node /x has to wait: none left; raise it", near=True)
     assert (bad.level, bad.text, bad.remedy) == (
-        FindingLevel.FAIL,
+        CheckLevel.FAIL,
         "node /x has to wait: none left; 60 are open",
         "raise it",
     )

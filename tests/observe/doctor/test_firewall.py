@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rmpa.observe.doctor.finding import FindingLevel
+from rmpa.observe.check import CheckLevel
 from rmpa.observe.doctor.firewall import judge_rules, names_port, read_iptables, read_nft
 
 PORTS = frozenset({11411, 40001})
@@ -48,32 +48,32 @@ IPTABLES_UFW = """\
 @pytest.mark.parametrize(
     ("text", "level", "part"),
     [
-        ("", FindingLevel.OK, "0 rules"),
-        (NFT_OPEN, FindingLevel.OK, "1 rules, and none against agents"),
-        (NFT_CLOSED, FindingLevel.WARN, "inet filter input drops what no rule lets in"),
-        (NFT_OURS, FindingLevel.OK, "lets ours in: udp dport { 5353, 11400-11450 } accept"),
-        (NFT_AGAINST, FindingLevel.FAIL, "drops what agents send: udp dport 11411 counter"),
+        ("", CheckLevel.OK, "0 rules"),
+        (NFT_OPEN, CheckLevel.OK, "1 rules, and none against agents"),
+        (NFT_CLOSED, CheckLevel.WARN, "inet filter input drops what no rule lets in"),
+        (NFT_OURS, CheckLevel.OK, "lets ours in: udp dport { 5353, 11400-11450 } accept"),
+        (NFT_AGAINST, CheckLevel.FAIL, "drops what agents send: udp dport 11411 counter"),
     ],
 )
-def test_nft(text: str, level: FindingLevel, part: str) -> None:
+def test_nft(text: str, level: CheckLevel, part: str) -> None:
     found = judge_rules(read_nft(text, PORTS), "UDP port 11411")
-    assert (found.level, found.subject) == (level, "nft")
+    assert (found.level, found.where) == (level, "nft")
     assert part in found.text
-    assert bool(found.remedy) is (level is not FindingLevel.OK)
+    assert bool(found.remedy) is (level is not CheckLevel.OK)
 
 
 @pytest.mark.parametrize(
     ("text", "level"),
     [
-        ("-P INPUT ACCEPT\n-P FORWARD ACCEPT\n-P OUTPUT ACCEPT\n", FindingLevel.OK),
-        (IPTABLES_UFW, FindingLevel.WARN),
-        (IPTABLES_UFW + "-A ufw-user-input -p udp -m udp --dport 11411 -j ACCEPT\n", FindingLevel.OK),
-        (IPTABLES_UFW + "-A ufw-user-input -p tcp -m multiport --dports 40000:40010 -j ACCEPT\n", FindingLevel.OK),
-        ("-P INPUT ACCEPT\n-A INPUT -p tcp -m tcp --dport 40001 -j REJECT\n", FindingLevel.FAIL),
-        ("-P INPUT ACCEPT\n-A INPUT -p tcp -m tcp --dport 22 -j REJECT\n", FindingLevel.OK),
+        ("-P INPUT ACCEPT\n-P FORWARD ACCEPT\n-P OUTPUT ACCEPT\n", CheckLevel.OK),
+        (IPTABLES_UFW, CheckLevel.WARN),
+        (IPTABLES_UFW + "-A ufw-user-input -p udp -m udp --dport 11411 -j ACCEPT\n", CheckLevel.OK),
+        (IPTABLES_UFW + "-A ufw-user-input -p tcp -m multiport --dports 40000:40010 -j ACCEPT\n", CheckLevel.OK),
+        ("-P INPUT ACCEPT\n-A INPUT -p tcp -m tcp --dport 40001 -j REJECT\n", CheckLevel.FAIL),
+        ("-P INPUT ACCEPT\n-A INPUT -p tcp -m tcp --dport 22 -j REJECT\n", CheckLevel.OK),
     ],
 )
-def test_iptables(text: str, level: FindingLevel) -> None:
+def test_iptables(text: str, level: CheckLevel) -> None:
     assert judge_rules(read_iptables(text, PORTS), "UDP port 11411").level is level
 
 

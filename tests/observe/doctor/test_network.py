@@ -6,12 +6,12 @@ from ipaddress import IPv4Interface
 
 import pytest
 
-from rmpa.observe.doctor.finding import Finding, FindingLevel, exit_code
+from rmpa.observe.check import Check, CheckLevel, exit_code
 from rmpa.observe.doctor.network import (
     MulticastEcho,
     NetworkInterface,
     Port,
-    judge_cards,
+    judge_interfaces,
     judge_mtu_probing,
     judge_multicast,
     judge_ports,
@@ -24,70 +24,71 @@ WLAN = NetworkInterface("wlan0", (IPv4Interface("192.168.1.5/24"),))
 ETH = NetworkInterface("eth0", (IPv4Interface("10.0.0.5/24"),))
 
 
-def only(found: list[Finding], level: FindingLevel) -> Finding:
+def only(found: list[Check], level: CheckLevel) -> Check:
     (one,) = [finding for finding in found if finding.level is level]
-    if level in (FindingLevel.WARN, FindingLevel.FAIL):
+    if level in (CheckLevel.WARN, CheckLevel.FAIL):
         assert one.remedy, "who is told of trouble is told what to do"
     return one
 
 
 def test_two_ordinary_interfaces_are_fine() -> None:
-    found = judge_cards((LO, WLAN, ETH), ())
-    assert {finding.level for finding in found} == {FindingLevel.OK}
-    assert [finding.subject for finding in found] == ["wlan0", "eth0"]
+    found = judge_interfaces((LO, WLAN, ETH), ())
+    assert {finding.level for finding in found} == {CheckLevel.OK}
+    assert [finding.where for finding in found] == ["wlan0", "eth0"]
     assert exit_code(found) == 0
 
 
 def test_no_network_at_all() -> None:
-    warned = only(judge_cards((LO, NetworkInterface("eth0", up=False, used=False)), ()), FindingLevel.WARN)
+    warned = only(judge_interfaces((LO, NetworkInterface("eth0", up=False, used=False)), ()), CheckLevel.WARN)
     assert "none but loopback" in warned.text
     assert "eth0" in warned.remedy
-    assert only(judge_cards((LO,), ()), FindingLevel.WARN).remedy == "plug in a network"
+    assert only(judge_interfaces((LO,), ()), CheckLevel.WARN).remedy == "plug in a network"
 
 
 def test_settings_that_keep_to_loopback_mean_it() -> None:
-    (found,) = judge_cards((LO, NetworkInterface("eth0", ETH.networks, used=False)), ("lo",))
-    assert (found.subject, found.level) == ("lo", FindingLevel.OK)
+    (found,) = judge_interfaces((LO, NetworkInterface("eth0", ETH.networks, used=False)), ("lo",))
+    assert (found.where, found.level) == ("lo", CheckLevel.OK)
 
 
 def test_an_interface_that_the_settings_name_and_that_is_not_there() -> None:
-    warned = only(judge_cards((LO, WLAN), ("wlan0", "eth7")), FindingLevel.WARN)
-    assert warned.subject == "eth7"
+    warned = only(judge_interfaces((LO, WLAN), ("wlan0", "eth7")), CheckLevel.WARN)
+    assert warned.where == "eth7"
     assert "there are lo, wlan0" in warned.text
 
 
 @pytest.mark.parametrize("name", ["tun0", "wg0", "tailscale0", "ztabc"])
 def test_a_tunnel_carries_no_multicast(name: str) -> None:
     warned = only(
-        judge_cards((LO, WLAN, NetworkInterface(name, (IPv4Interface("10.8.0.2/32"),))), ()), FindingLevel.WARN
+        judge_interfaces((LO, WLAN, NetworkInterface(name, (IPv4Interface("10.8.0.2/32"),))), ()), CheckLevel.WARN
     )
-    assert warned.subject == name
+    assert warned.where == name
     assert "--seed" in warned.remedy
 
 
 def test_interfaces_of_containers_are_named_but_no_trouble() -> None:
-    found = judge_cards((LO, WLAN, NetworkInterface("docker0", (IPv4Interface("172.17.0.1/16"),))), ())
+    found = judge_interfaces((LO, WLAN, NetworkInterface("docker0", (IPv4Interface("172.17.0.1/16"),))), ())
     assert exit_code(found) == 0
-    assert "containers" in next(finding.text for finding in found if finding.subject == "docker0")
+    assert "containers" in next(finding.text for finding in found if finding.where == "docker0")
 
 
 def test_an_address_that_no_dhcp_gave() -> None:
     warned = only(
-        judge_cards((LO, NetworkInterface("eth0", (IPv4Interface("169.254.3.4/16"),))), ()), FindingLevel.WARN
+        judge_interfaces((LO, NetworkInterface("eth0", (IPv4Interface("169.254.3.4/16"),))), ()), CheckLevel.WARN
     )
     assert "DHCP" in warned.text
 
 
 def test_two_interfaces_in_one_network() -> None:
     warned = only(
-        judge_cards((LO, WLAN, NetworkInterface("eth0", (IPv4Interface("192.168.1.6/24"),))), ()), FindingLevel.WARN
+        judge_interfaces((LO, WLAN, NetworkInterface("eth0", (IPv4Interface("192.168.1.6/24"),))), ()),
+        CheckLevel.WARN,
     )
-    assert warned.subject == "wlan0+eth0"
+    assert warned.where == "wlan0+eth0"
     assert "192.168.1.0/24" in warned.text
 
 
 def test_a_container_with_a_network_of_its_own() -> None:
-    warned = only(judge_cards((LO, ETH), (), container=True), FindingLevel.WARN)
+    warned = only(judge_interfaces((LO, ETH), (), container=True), CheckLevel.WARN)
     assert "--network host" in warned.remedy
 
 
@@ -98,7 +99,7 @@ def test_multicast_by_interface() -> None:
         MulticastEcho("wlan0", "Operation not permitted"),
     )
     lo, eth, wlan = judge_multicast(echoes, "239.255.82.77", 11411)
-    assert (lo.level, eth.level, wlan.level) == (FindingLevel.OK, FindingLevel.FAIL, FindingLevel.FAIL)
+    assert (lo.level, eth.level, wlan.level) == (CheckLevel.OK, CheckLevel.FAIL, CheckLevel.FAIL)
     assert "heard 0.2 ms later" in lo.text
     assert "not heard" in eth.text
     assert "11411" in eth.remedy
@@ -106,21 +107,21 @@ def test_multicast_by_interface() -> None:
     assert exit_code([lo, eth]) == 1
 
 
-def test_strict_filters_matter_where_there_are_two_ways() -> None:
+def test_strict_filters_matter_with_two_interfaces() -> None:
     strict = {"all": 1, "wlan0": 0, "eth0": 0}
-    warned = only(judge_rp_filter(strict, (LO, WLAN, ETH)), FindingLevel.WARN)
+    warned = only(judge_rp_filter(strict, (LO, WLAN, ETH)), CheckLevel.WARN)
     assert "rp_filter=2" in warned.remedy
-    assert judge_rp_filter(strict, (LO, WLAN))[0].level is FindingLevel.OK
+    assert judge_rp_filter(strict, (LO, WLAN))[0].level is CheckLevel.OK
     # The greater of both counts: 2 is loose.
-    assert judge_rp_filter({"all": 2, "wlan0": 1, "eth0": 1}, (LO, WLAN, ETH))[0].level is FindingLevel.OK
-    assert judge_rp_filter({}, (LO, WLAN, ETH))[0].level is FindingLevel.SKIPPED
+    assert judge_rp_filter({"all": 2, "wlan0": 1, "eth0": 1}, (LO, WLAN, ETH))[0].level is CheckLevel.OK
+    assert judge_rp_filter({}, (LO, WLAN, ETH))[0].level is CheckLevel.SKIPPED
 
 
 def test_routes() -> None:
     found = judge_routes({"10.1.0.2 (arm)": "Network is unreachable", "10.0.0.2 (base)": ""})
-    assert only(found, FindingLevel.FAIL).subject == "10.1.0.2 (arm)"
-    assert only(found, FindingLevel.OK).subject == "10.0.0.2 (base)"
-    assert judge_routes({})[0].level is FindingLevel.SKIPPED
+    assert only(found, CheckLevel.FAIL).where == "10.1.0.2 (arm)"
+    assert only(found, CheckLevel.OK).where == "10.0.0.2 (base)"
+    assert judge_routes({})[0].level is CheckLevel.SKIPPED
 
 
 def test_ports() -> None:
@@ -131,19 +132,19 @@ def test_ports() -> None:
         Port("beacons (UDP)", 11412, owner="agent base and python3 (pid 7)"),
     )
     core, mesh, beacons, shared = judge_ports(ports)
-    assert (core.level, mesh.level, beacons.level) == (FindingLevel.FAIL, FindingLevel.OK, FindingLevel.OK)
+    assert (core.level, mesh.level, beacons.level) == (CheckLevel.FAIL, CheckLevel.OK, CheckLevel.OK)
     assert "roscore (pid 7)" in core.text
     assert "11311" in core.remedy
     assert "agent base" in mesh.text
     assert beacons.text == "beacons (UDP): free"
     text = "beacons (UDP): used by agent base and python3 (pid 7); others may use it too"
-    assert (shared.level, shared.text) == (FindingLevel.OK, text)
+    assert (shared.level, shared.text) == (CheckLevel.OK, text)
 
 
 def test_mtu_probing() -> None:
-    assert judge_mtu_probing(None, black_hole=True).level is FindingLevel.SKIPPED
-    assert judge_mtu_probing(1, black_hole=True).level is FindingLevel.OK
-    assert judge_mtu_probing(0, black_hole=False).level is FindingLevel.OK
+    assert judge_mtu_probing(None, black_hole=True).level is CheckLevel.SKIPPED
+    assert judge_mtu_probing(1, black_hole=True).level is CheckLevel.OK
+    assert judge_mtu_probing(0, black_hole=False).level is CheckLevel.OK
     warned = judge_mtu_probing(0, black_hole=True)
-    assert warned.level is FindingLevel.WARN
+    assert warned.level is CheckLevel.WARN
     assert "tcp_mtu_probing=1" in warned.remedy

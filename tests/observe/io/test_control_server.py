@@ -80,7 +80,7 @@ async def raw(path: Path, data: bytes) -> list[ControlReply]:
         await writer.wait_closed()
 
 
-async def test_socket_and_directory_are_ours_alone(server: ControlServer, place: Path) -> None:
+async def test_only_this_user_can_open_the_socket(server: ControlServer, place: Path) -> None:
     assert server.path.stat().st_mode & 0o777 == 0o600
     assert place.stat().st_mode & 0o777 == 0o700
 
@@ -189,7 +189,7 @@ async def test_closing_ends_clients(place: Path) -> None:
     await writer.wait_closed()
 
 
-async def test_a_second_agent_of_the_name_is_refused_and_harms_nothing(server: ControlServer, place: Path) -> None:
+async def test_a_second_agent_of_one_name_is_refused(server: ControlServer, place: Path) -> None:
     second = ControlServer(place, "base", {})
     with pytest.raises(StartError, match="already runs on this machine"):
         await second.start()

@@ -63,7 +63,7 @@ def test_somebody_elses_directory_is_refused(place: Path, monkeypatch: pytest.Mo
         make_runtime_dir(place)
 
 
-def test_root_finds_the_agent_of_a_service_with_its_own_user(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_root_finds_the_agent_of_a_services_user(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if os.geteuid() == 0:
         os.chown(place, 1234, -1)
     monkeypatch.setattr(os, "geteuid", lambda: 4321)  # and so the directory is somebody else's

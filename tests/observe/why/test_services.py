@@ -7,20 +7,23 @@ from dataclasses import replace
 import msgspec
 import pytest
 
-from rmpa.observe.why.diagnosis import Diagnosis, PathStage, StageResult
-from rmpa.observe.why.services import FarService, NearService, walk_service
+from rmpa.observe.check import Check, CheckLevel
+from rmpa.observe.why.diagnosis import Diagnosis
+from rmpa.observe.why.services import ServiceAtClient, ServiceAtServer, diagnose_service
 
-BEGIN = (PathStage("peer", StageResult.OK, "known"), PathStage("link", StageResult.OK, "linked"))
-FAR = FarService(node="/arm", service="/move", rule="services.allow has '/**'")
-NEAR = NearService(wire="/move", offered=True, node="/arm", registered=True, answer="a/Move, md5 123", calls=3)
+BEGIN = (Check("peer", CheckLevel.OK, "known"), Check("link", CheckLevel.OK, "linked"))
+THERE = ServiceAtServer(node="/arm", service="/move", rule="services.allow has '/**'")
+HERE = ServiceAtClient(wire="/move", offered=True, node="/arm", registered=True, answer="a/Move, md5 123", calls=3)
 ORDER = ("peer", "link", "server", "policy there", "offer", "shown", "graph", "answer", "calls")
 
 
-def walk(near: NearService = NEAR, far: FarService | None = FAR, begin: tuple[PathStage, ...] = BEGIN) -> Diagnosis:
-    return walk_service(begin, "base", "robot", "/move", near, far, "" if far else "it is older")
+def walk(
+    here: ServiceAtClient = HERE, there: ServiceAtServer | None = THERE, begin: tuple[Check, ...] = BEGIN
+) -> Diagnosis:
+    return diagnose_service(begin, "base", "robot", "/move", here, there, "" if there else "it is older")
 
 
-def test_what_can_be_called() -> None:
+def test_a_service_that_can_be_called() -> None:
     found = walk()
     assert found.flows
     assert (found.kind, found.name, found.peer, found.to, found.node) == ("service", "/move", "robot", "base", "/arm")
@@ -29,49 +32,55 @@ def test_what_can_be_called() -> None:
     assert msgspec.convert(msgspec.to_builtins(found), Diagnosis) == found
 
 
-FAILURES: dict[str, tuple[NearService, FarService | None, str, str, str]] = {
-    "nobody provides it": (NEAR, FarService(), "server", "no node of robot provides /move", "start its server"),
-    "nearly its name": (NEAR, FarService(near="/mov"), "server", "no node", "did you mean /mov?"),
+FAILURES: dict[str, tuple[ServiceAtClient, ServiceAtServer | None, str, str, str]] = {
+    "nobody provides it": (HERE, ServiceAtServer(), "server", "no node of robot provides /move", "start its server"),
+    "nearly its name": (HERE, ServiceAtServer(similar="/mov"), "server", "no node", "did you mean /mov?"),
     "its server is stuck": (
-        NEAR,
-        msgspec.structs.replace(FAR, refusal="no answer within 2 s"),
+        HERE,
+        msgspec.structs.replace(THERE, refusal="no answer within 2 s"),
         "server",
         "/arm on robot is registered for it, and does not answer: no answer within 2 s",
         "rosnode ping /arm",
     ),
-    "an older agent": (NearService(), None, "server", "it is older", "rosservice info /move"),
+    "an older agent": (ServiceAtClient(), None, "server", "it is older", "rosservice info /move"),
     "policy there": (
-        NEAR,
-        msgspec.structs.replace(FAR, crosses=False, rule="services.deny has '/move'"),
+        HERE,
+        msgspec.structs.replace(THERE, crosses=False, rule="services.deny has '/move'"),
         "policy there",
         "services.deny has '/move'",
         "rmpa.toml of robot",
     ),
-    "not offered yet": (NearService(wire="/move"), FAR, "offer", "has not come here", "both logs"),
+    "not offered yet": (ServiceAtClient(wire="/move"), THERE, "offer", "has not come here", "both logs"),
     "policy here": (
-        replace(NEAR, hidden="policy: services.deny has '/move'"),
-        FAR,
+        replace(HERE, hidden="policy: services.deny has '/move'"),
+        THERE,
         "shown",
         "services.deny has '/move'",
         "rmpa reload",
     ),
     "another provider": (
-        replace(NEAR, hidden="/local of this module provides it itself"),
-        FAR,
+        replace(HERE, hidden="/local of this module provides it itself"),
+        THERE,
         "shown",
         "/local of this module",
         "another name",
     ),
-    "not registered": (replace(NEAR, registered=False), FAR, "graph", "does not have it", "5 s"),
-    "no answer": (replace(NEAR, answer="", refusal="robot: its server has gone"), FAR, "answer", "has gone", "robot"),
+    "not registered": (replace(HERE, registered=False), THERE, "graph", "does not have it", "5 s"),
+    "no answer": (
+        replace(HERE, answer="", refusal="robot: its server has gone"),
+        THERE,
+        "answer",
+        "has gone",
+        "robot",
+    ),
 }
 
 
-@pytest.mark.parametrize(("near", "far", "stage", "text", "remedy"), FAILURES.values(), ids=FAILURES)
+@pytest.mark.parametrize(("here", "there", "stage", "text", "remedy"), FAILURES.values(), ids=FAILURES)
 def test_the_first_stage_that_fails(
-    near: NearService, far: FarService | None, stage: str, text: str, remedy: str
+    here: ServiceAtClient, there: ServiceAtServer | None, stage: str, text: str, remedy: str
 ) -> None:
-    found = walk(near, far)
+    found = walk(here, there)
     assert not found.flows
     assert found.failed is not None
     assert found.failed is found.stages[-1]
@@ -84,23 +93,23 @@ def test_every_stage_behind_the_link_can_fail_but_the_calls() -> None:
     assert {stage for _, _, stage, _, _ in FAILURES.values()} == set(ORDER) - {"peer", "link", "calls"}
 
 
-def test_nothing_is_looked_at_behind_a_link_that_is_not_there() -> None:
-    begin = (BEGIN[0], PathStage("link", StageResult.FAIL, "no link", "plug it in"))
+def test_without_a_link_nothing_else_is_judged() -> None:
+    begin = (BEGIN[0], Check("link", CheckLevel.FAIL, "no link", "plug it in"))
     assert walk(begin=begin).stages == begin
 
 
-def test_failed_calls_and_mismatches_are_warned_of() -> None:
-    for near, text in (
-        (replace(NEAR, failed=1, problem="took more than 60 s"), "took more than 60 s"),
-        (replace(NEAR, mismatch="/client wants 456"), "/client wants 456"),
+def test_failed_calls_and_mismatches_are_warnings() -> None:
+    for here, text in (
+        (replace(HERE, failed=1, problem="took more than 60 s"), "took more than 60 s"),
+        (replace(HERE, mismatch="/client wants 456"), "/client wants 456"),
     ):
-        found = walk(near)
+        found = walk(here)
         assert found.flows
-        assert found.stages[-1].verdict is StageResult.WARN
+        assert found.stages[-1].level is CheckLevel.WARN
         assert text in found.stages[-1].text
 
 
-def test_an_agent_that_does_not_tell_leaves_its_stage_open() -> None:
-    found = walk(far=None)
+def test_the_server_stage_is_unknown_without_an_answer() -> None:
+    found = walk(there=None)
     assert found.flows
-    assert found.stages[2].verdict is StageResult.UNKNOWN
+    assert found.stages[2].level is CheckLevel.UNKNOWN

@@ -12,18 +12,18 @@ from hypothesis import strategies as st
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.config import limits as config_limits
-from rmpa.observe.snapshot import FilesInfo, LatencySpread, LinkInfo, PeerInfo, RouteInfo, Snapshot, TopicInfo
+from rmpa.observe.check import Check, CheckLevel
+from rmpa.observe.snapshot import FilesInfo, LinkInfo, PeerInfo, RouteInfo, SampleSpread, Snapshot, TopicInfo
 from rmpa.observe.why.diagnosis import (
-    BothSides,
+    BothEnds,
     Diagnosis,
-    FarSource,
-    FarTopic,
-    NearTopic,
-    PathStage,
-    Reader,
-    StageResult,
+    ProxyState,
+    PublisherReport,
+    SubscriberConnection,
+    TopicAtPublisher,
+    TopicAtSubscriber,
 )
-from rmpa.observe.why.topics import walk_topic
+from rmpa.observe.why.topics import diagnose_topic
 from tests.observe.samples import SNAPSHOT
 
 if TYPE_CHECKING:
@@ -56,12 +56,18 @@ ROUTE = RouteInfo(
     messages=100,
     age=0.05,
     rate=20.0,
-    period=LatencySpread(count=99, mean=0.05, sd=0.001, min=0.049, max=0.052, p50=0.05, p99=0.0515),
+    period=SampleSpread(count=99, mean=0.05, sd=0.001, min=0.049, max=0.052, p50=0.05, p99=0.0515),
     lane="express",
 )
-SOURCE = FarSource(node="/joy", type="sensor_msgs/Joy", rule="bridge.allow has '/**'", route="open", messages=100)
+SOURCE = PublisherReport(
+    node="/joy", type="sensor_msgs/Joy", rule="bridge.allow has '/**'", route="open", messages=100
+)
 ROUTE_LATER = msgspec.structs.replace(ROUTE, messages=120, age=0.03)
 SOURCE_LATER = msgspec.structs.replace(SOURCE, messages=120)
+
+
+def connected(node: str, number: int = 1, **changes: Any) -> SubscriberConnection:
+    return SubscriberConnection(number=number, node=node, **changes)
 
 
 @dataclass(frozen=True)
@@ -71,21 +77,23 @@ class Case:
     peer: PeerInfo | None = PEER
     route: RouteInfo | None = ROUTE
     later: RouteInfo | None = ROUTE_LATER
-    source: FarSource | None = SOURCE
-    source_later: FarSource | None = SOURCE_LATER
-    far: FarTopic | None = field(default_factory=FarTopic)
+    source: PublisherReport | None = SOURCE
+    source_later: PublisherReport | None = SOURCE_LATER
+    there: TopicAtPublisher | None = field(default_factory=TopicAtPublisher)
     refusal: str = ""
     registered: bool = True
     conflict: bool = False
     subscribers: tuple[str, ...] = ("/base",)
-    readers: tuple[Reader, ...] = (Reader(number=1, node="/base", messages=100),)
-    readers_later: tuple[Reader, ...] | None = (Reader(number=1, node="/base", messages=120),)
+    readers: tuple[SubscriberConnection, ...] = (connected("/base", messages=100),)
+    readers_later: tuple[SubscriberConnection, ...] | None = (connected("/base", messages=120),)
     mismatches: tuple[str, ...] = ()
-    only: frozenset[str] | None = None
+    known: bool = True
     carrier: str = ""
     files: FilesInfo | None = None
 
-    def _sight(self, route: RouteInfo | None, source: FarSource | None, readers: tuple[Reader, ...]) -> BothSides:
+    def ends(
+        self, route: RouteInfo | None, source: PublisherReport | None, readers: tuple[SubscriberConnection, ...]
+    ) -> BothEnds:
         topic = TopicInfo(
             name="/cmd",
             type="sensor_msgs/Joy",
@@ -94,27 +102,21 @@ class Case:
         )
         agent = msgspec.structs.replace(SNAPSHOT.agent, files=self.files)
         snapshot = Snapshot(agent=agent, taken=0.0, peers=(self.peer,) if self.peer else (), topics=(topic,))
-        far = self.far
-        if far is not None and source is not None:
-            far = msgspec.structs.replace(far, sources=(source,))
-        nodes = frozenset({"/joy"})
-        near = NearTopic(
-            snapshot,
-            "/cmd",
-            only=self.only,
-            carrier=self.carrier,
-            registered=nodes if self.registered else frozenset(),
-            conflict=nodes if self.conflict else frozenset(),
-            readers={"/joy": readers},
-            mismatches={"/joy": self.mismatches},
+        there = self.there
+        if there is not None and source is not None:
+            there = msgspec.structs.replace(there, sources=(source,))
+        proxy = ProxyState(
+            registered=self.registered, conflict=self.conflict, connections=readers, mismatches=self.mismatches
         )
-        return BothSides(near, far, self.refusal)
+        proxies = {"/joy": proxy} if self.known else {}
+        here = TopicAtSubscriber(snapshot, "/cmd", self.carrier, proxies)
+        return BothEnds(here, there, self.refusal)
 
     def walk(self, peer: str = "joystick") -> tuple[Diagnosis, ...]:
-        first = self._sight(self.route, self.source, self.readers)
+        first = self.ends(self.route, self.source, self.readers)
         if self.readers_later is None:
-            return walk_topic(first, peer)
-        return walk_topic(first, peer, self._sight(self.later, self.source_later, self.readers_later))
+            return diagnose_topic(first, peer)
+        return diagnose_topic(first, peer, self.ends(self.later, self.source_later, self.readers_later))
 
 
 def one(case: Case, peer: str = "joystick") -> Diagnosis:
@@ -128,12 +130,12 @@ def route(**changes: object) -> dict[str, Any]:
     return {"route": changed, "later": changed}
 
 
-def test_what_flows_passes_every_stage_in_order() -> None:
+def test_a_flowing_topic_passes_all_stages() -> None:
     found = one(Case())
     assert found.flows
     assert found.failed is None
     assert [stage.name for stage in found.stages] == [name for name in ORDER if name not in ONLY_FAILS]
-    assert {stage.verdict for stage in found.stages} == {StageResult.OK}
+    assert {stage.level for stage in found.stages} == {CheckLevel.OK}
     assert (found.name, found.peer, found.to, found.node) == ("/cmd", "joystick", "base", "/joy")
     by_name = {stage.name: stage.text for stage in found.stages}
     assert by_name["arrived"] == "120 messages, the last 0.03 s ago, 20.0 Hz"
@@ -143,13 +145,13 @@ def test_what_flows_passes_every_stage_in_order() -> None:
 PATH = {"path_problem": "large packets do not get through", "path_remedy": "give it its true MTU"}
 
 
-def test_a_path_that_drops_large_packets_is_told_by_whichever_end_knows() -> None:
+def test_a_path_problem_of_either_end_is_shown() -> None:
     here = one(Case(peer=msgspec.structs.replace(PEER, link=msgspec.structs.replace(LINK, **PATH))))
-    (stage,) = [stage for stage in here.stages if stage.verdict is StageResult.WARN]
+    (stage,) = [stage for stage in here.stages if stage.level is CheckLevel.WARN]
     assert (stage.name, stage.remedy) == ("link", "give it its true MTU")
     assert stage.text.endswith("large packets do not get through")
-    there = one(Case(far=msgspec.structs.replace(FarTopic(), **PATH)))
-    (stage,) = [stage for stage in there.stages if stage.verdict is StageResult.WARN]
+    there = one(Case(there=msgspec.structs.replace(TopicAtPublisher(), **PATH)))
+    (stage,) = [stage for stage in there.stages if stage.level is CheckLevel.WARN]
     assert (stage.name, stage.text) == ("path", "joystick says: large packets do not get through")
     assert there.flows
 
@@ -195,25 +197,25 @@ FAILURES: dict[str, tuple[Case, str, str, str]] = {
     ),
     "nobody publishes": (Case(source=None, route=None), "publisher", "no node of joystick publishes", "start its"),
     "nearly its name": (
-        Case(source=None, route=None, far=FarTopic(near="/cmd_vel")),
+        Case(source=None, route=None, there=TopicAtPublisher(similar="/cmd_vel")),
         "publisher",
         "no node of joystick publishes /cmd",
         "did you mean /cmd_vel?",
     ),
     "only subscribed there": (
-        Case(source=None, route=None, far=FarTopic(subscribers=("/echo",))),
+        Case(source=None, route=None, there=TopicAtPublisher(subscribers=("/echo",))),
         "publisher",
         "/echo there only subscribe",
         "start its",
     ),
     "published before its agent was restarted": (
-        Case(source=None, route=None, far=FarTopic(awaited=("/talker at http://127.0.0.1:4001/",))),
+        Case(source=None, route=None, there=TopicAtPublisher(awaited=("/talker at http://127.0.0.1:4001/",))),
         "publisher",
         "/talker at http://127.0.0.1:4001/ published /cmd before the agent of joystick was restarted",
         "it is asked again by itself",
     ),
     "an older agent, nothing offered": (
-        Case(route=None, far=None, refusal="it does not know the question"),
+        Case(route=None, there=None, refusal="it does not know the question"),
         "publisher",
         "does not tell why (it does not know the question)",
         "rostopic info",
@@ -362,8 +364,8 @@ FAILURES: dict[str, tuple[Case, str, str, str]] = {
     "readers have left": (Case(readers_later=()), "reader", "have just left", "again"),
     "reader stuck": (
         Case(
-            readers=(Reader(number=1, node="/base", waiting=70_000),),
-            readers_later=(Reader(number=1, node="/base", waiting=90_000, dropped=3),),
+            readers=(connected("/base", waiting=70_000),),
+            readers_later=(connected("/base", waiting=90_000, dropped=3),),
         ),
         "reader",
         "/base (90000 B wait, 3 dropped) does not read",
@@ -426,14 +428,20 @@ WARNINGS: dict[str, tuple[Case, str, str]] = {
     ),
     "one reader of two is stuck": (
         Case(
-            readers=(Reader(number=1, node="/base"), Reader(number=2, node="/slow", waiting=1)),
-            readers_later=(Reader(number=1, node="/base"), Reader(number=2, node="/slow", waiting=1)),
+            readers=(
+                connected("/base"),
+                connected("/slow", number=2, waiting=1),
+            ),
+            readers_later=(
+                connected("/base"),
+                connected("/slow", number=2, waiting=1),
+            ),
         ),
         "reader",
         "/slow (1 B wait, 0 dropped) does not keep up",
     ),
     "a reader was slow": (
-        Case(readers_later=(Reader(number=1, node="/base", dropped=9),)),
+        Case(readers_later=(connected("/base", dropped=9),)),
         "reader",
         "/base has missed 9",
     ),
@@ -441,30 +449,30 @@ WARNINGS: dict[str, tuple[Case, str, str]] = {
 
 
 @pytest.mark.parametrize(("case", "stage", "text"), WARNINGS.values(), ids=WARNINGS)
-def test_what_is_worth_knowing_though_it_flows(case: Case, stage: str, text: str) -> None:
+def test_warnings_of_a_flowing_topic(case: Case, stage: str, text: str) -> None:
     found = one(case)
     assert found.flows
-    warned = [s for s in found.stages if s.verdict is StageResult.WARN]
+    warned = [s for s in found.stages if s.level is CheckLevel.WARN]
     assert [s.name for s in warned] == [stage]
     assert text in warned[0].text
 
 
-def test_bytes_that_wait_at_one_look_alone_are_on_their_way() -> None:
-    found = one(Case(readers_later=(Reader(number=1, node="/base", waiting=70_000),)))
-    assert found.stages[-1].verdict is StageResult.OK
+def test_bytes_that_wait_once_are_no_fault() -> None:
+    found = one(Case(readers_later=(connected("/base", waiting=70_000),)))
+    assert found.stages[-1].level is CheckLevel.OK
 
 
-def test_an_agent_that_does_not_tell_leaves_stages_open() -> None:
-    found = one(Case(far=None, refusal="it is older"))
+def test_stages_are_unknown_without_an_answer() -> None:
+    found = one(Case(there=None, refusal="it is older"))
     assert found.flows
-    unknown = [stage.name for stage in found.stages if stage.verdict is StageResult.UNKNOWN]
+    unknown = [stage.name for stage in found.stages if stage.level is CheckLevel.UNKNOWN]
     assert unknown == ["publisher", "policy there", "sent"]
 
 
 def test_a_latched_topic_of_one_old_message_flows() -> None:
     quiet = route(messages=1, age=3600.0, rate=None, period=None, latched=True)
     found = one(Case(**quiet, source_later=SOURCE))
-    assert {stage.verdict for stage in found.stages} == {StageResult.OK}
+    assert {stage.level for stage in found.stages} == {CheckLevel.OK}
 
 
 def test_a_message_that_is_on_its_way_is_not_missing() -> None:
@@ -479,22 +487,23 @@ def test_a_topic_that_is_thinned_out_is_not_missing() -> None:
     assert not one(Case(route=quick, later=quick)).flows
 
 
-def test_each_publisher_has_a_way_of_its_own() -> None:
-    far = FarTopic(sources=(SOURCE, msgspec.structs.replace(SOURCE, node="/second", crosses=False, rule="no")))
-    first, second = Case(far=far, source=None, source_later=None).walk()
+def test_each_publisher_has_its_diagnosis() -> None:
+    second = msgspec.structs.replace(SOURCE, node="/second", crosses=False, rule="no")
+    there = TopicAtPublisher(sources=(SOURCE, second))
+    first, other = Case(there=there, source=None, source_later=None).walk()
     assert (first.node, first.flows) == ("/joy", True)
-    assert (second.node, second.flows) == ("/second", False)
-    assert second.failed is not None
-    assert second.failed.name == "policy there"
+    assert (other.node, other.flows) == ("/second", False)
+    assert other.failed is not None
+    assert other.failed.name == "policy there"
 
 
-def test_no_more_ways_are_walked_than_a_user_reads() -> None:
+def test_the_number_of_diagnoses_is_bounded() -> None:
     many = tuple(msgspec.structs.replace(SOURCE, node=f"/n{i}") for i in range(10 * bridge_limits.WHY_SOURCES_MAX))
-    found = Case(far=FarTopic(sources=many), source=None, source_later=None).walk()
+    found = Case(there=TopicAtPublisher(sources=many), source=None, source_later=None).walk()
     assert len(found) == bridge_limits.WHY_SOURCES_MAX
 
 
-def test_a_peer_is_found_by_its_guid_and_a_wrong_name_by_the_nearest() -> None:
+def test_a_peer_is_found_by_guid_and_a_typo_gets_a_hint() -> None:
     assert one(Case(), "10.0.0.2:40002").flows
     assert one(Case(), "10.0.0.2:40002#1").peer == "joystick"
     found = one(Case(), "joystik")
@@ -504,32 +513,32 @@ def test_a_peer_is_found_by_its_guid_and_a_wrong_name_by_the_nearest() -> None:
 
 def test_a_relayed_module_has_no_link_of_its_own() -> None:
     relayed = msgspec.structs.replace(PEER, name="arm", state="relayed", via="joystick", link=None)
-    found = one(Case(peer=relayed, carrier="joystick", only=frozenset({"/joy"})), "arm")
+    found = one(Case(peer=relayed, carrier="joystick"), "arm")
     assert found.flows
     assert found.stages[1].text == "no link of its own; joystick passes on what it publishes"
     # What the relay brings of other modules is not this one's.
-    nothing = one(Case(peer=relayed, carrier="joystick", only=frozenset(), source=None, source_later=None), "arm")
+    nothing = one(Case(peer=relayed, carrier="joystick", known=False, source=None, source_later=None), "arm")
     assert nothing.failed is not None
     assert nothing.failed.name == "publisher"
 
 
-def test_names_of_both_sides_are_told() -> None:
+def test_names_at_both_ends_are_shown() -> None:
     renamed = Case(**route(wire="/stick"), source=msgspec.structs.replace(SOURCE, topic="/joy/stick"))
-    first = renamed._sight(renamed.route, renamed.source, renamed.readers)
-    (found,) = walk_topic(first, "joystick", None, "/stick")
+    first = renamed.ends(renamed.route, renamed.source, renamed.readers)
+    (found,) = diagnose_topic(first, "joystick", None, "/stick")
     texts = {stage.name: stage.text for stage in found.stages}
     assert texts["publisher"] == "/joy on joystick publishes /stick (/joy/stick over there)"
     assert texts["policy here"] == "this module takes it as /cmd (its /stick)"
 
 
-def test_one_look_alone_is_judged_too() -> None:
+def test_a_single_look_is_judged() -> None:
     found = one(replace(Case(), readers_later=None))
     assert found.flows
 
 
 _names = st.text(max_size=20)
 _sources = st.builds(
-    FarSource,
+    PublisherReport,
     node=st.sampled_from(["/joy", "/other"]),
     type=_names,
     crosses=st.booleans(),
@@ -539,8 +548,8 @@ _sources = st.builds(
     messages=st.integers(0, 1 << 40),
     dropped=st.integers(0, 1 << 40),
 )
-_fars = st.none() | st.builds(
-    FarTopic, sources=st.lists(_sources, max_size=3).map(tuple), subscribers=st.tuples(_names), near=_names
+_answers = st.none() | st.builds(
+    TopicAtPublisher, sources=st.lists(_sources, max_size=3).map(tuple), subscribers=st.tuples(_names), similar=_names
 )
 _routes: Callable[[], st.SearchStrategy[RouteInfo]] = lambda: st.builds(  # noqa: E731
     lambda **changes: msgspec.structs.replace(ROUTE, **changes),
@@ -552,26 +561,30 @@ _routes: Callable[[], st.SearchStrategy[RouteInfo]] = lambda: st.builds(  # noqa
 )
 
 
-@given(_fars, _fars, st.none() | _routes(), st.none() | _routes(), st.booleans())
-def test_whatever_another_agent_says_there_is_an_answer(
-    far: FarTopic | None, later: FarTopic | None, before: RouteInfo | None, after: RouteInfo | None, known: bool
+@given(_answers, _answers, st.none() | _routes(), st.none() | _routes(), st.booleans())
+def test_any_answer_of_a_peer_is_judged(
+    there: TopicAtPublisher | None,
+    later: TopicAtPublisher | None,
+    before: RouteInfo | None,
+    after: RouteInfo | None,
+    known: bool,
 ) -> None:
-    one_, other = Case(far=far, source=None, route=before), Case(far=later, source=None, route=after)
-    found = walk_topic(
-        one_._sight(before, None, one_.readers),
+    one_, other = Case(there=there, source=None, route=before), Case(there=later, source=None, route=after)
+    found = diagnose_topic(
+        one_.ends(before, None, one_.readers),
         "joystick",
-        other._sight(after, None, one_.readers) if known else None,
+        other.ends(after, None, one_.readers) if known else None,
     )
     assert found
     for diagnosis in found:
         assert diagnosis.flows is (diagnosis.failed is None)
         for stage in diagnosis.stages[:-1]:
-            assert stage.verdict is not StageResult.FAIL
+            assert stage.level is not CheckLevel.FAIL
         assert msgspec.convert(msgspec.to_builtins(diagnosis), Diagnosis) == diagnosis
 
 
 def test_a_stage_is_short_as_json() -> None:
-    assert msgspec.to_builtins(PathStage("peer", StageResult.OK, "known")) == {
+    assert msgspec.to_builtins(Check("peer", CheckLevel.OK, "known")) == {
         "name": "peer",
         "verdict": "ok",
         "text": "known",

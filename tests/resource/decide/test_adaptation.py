@@ -6,19 +6,11 @@ from dataclasses import replace
 import pytest
 
 from rmpa.core.errors import ConfigError, PeerRefused
-from rmpa.resource.decide.adaptation import (
-    Action,
-    Adaptation,
-    AdaptationSettings,
-    AlarmKind,
-    Apply,
-    Clear,
-    CoolDown,
-    ProfileState,
-    Raise,
-    Reacted,
-)
+from rmpa.resource.decide.actions import Action, AlarmKind, Apply, Clear, Raise, Reacted
+from rmpa.resource.decide.adaptation import Adaptation, ProfileState
+from rmpa.resource.decide.cool_downs import CoolDown
 from rmpa.resource.decide.decision import Decider
+from rmpa.resource.declare.adaptation_settings import AdaptationSettings
 from rmpa.resource.declare.attributes import LATENCY, RATE
 from rmpa.resource.declare.profiles import Profile
 from rmpa.resource.declare.requirements import Bound, Requirement, bound
@@ -103,7 +95,7 @@ def test_a_disturbance_takes_k_of_n_windows() -> None:
     assert alarms(actions) == [(AlarmKind.ADAPTATION, "middle", "fast")]
     assert applies(actions) == ["fast"]
     raised = next(a.alarm for a in actions if isinstance(a, Raise))
-    assert [(s.attribute, s.given) for s in raised.shortfalls] == [("rate", 8.0)]
+    assert [(s.attribute, s.offered) for s in raised.shortfalls] == [("rate", 8.0)]
     # From the first window that was violated to the profile that runs.
     assert one.applied("fast", 4.5)[0] == Reacted("fast", 2.5)
 
@@ -131,7 +123,7 @@ def test_an_alarm_is_over_when_the_windows_are_good_again() -> None:
     assert one.alarm is None
 
 
-def test_without_another_that_can_serve_the_alarm_is_non_adaptable_and_best_effort_runs() -> None:
+def test_best_effort_runs_if_no_profile_can_serve() -> None:
     one = running(30, FAST, SLOW, LIMP)
     one.window({"rate": 20.0}, 2.0)
     actions = one.window({"rate": 20.0}, 3.0)
@@ -153,19 +145,19 @@ def test_without_a_declared_best_effort_the_profile_stays() -> None:
     assert [type(a) for a in one.window({"rate": 39.0}, 6.0)] == [Clear]
 
 
-def test_what_no_profile_is_declared_to_meet_is_a_non_adaptable_event_at_once() -> None:
+def test_infeasible_request_is_non_adaptable_at_once() -> None:
     one = loop()
     one.start(0.0)
     finish(one, 0.0)
     actions = one.require(at_least(100, hard=True), 1.0)
     assert alarms(actions) == [(AlarmKind.NON_ADAPTABLE, "slow", "fast")]
     raised = next(a.alarm for a in actions if isinstance(a, Raise))
-    assert [(s.attribute, s.given) for s in raised.shortfalls] == [("rate", 40.0)]
+    assert [(s.attribute, s.offered) for s in raised.shortfalls] == [("rate", 40.0)]
     finish(one, 1.0)
     assert [type(a) for a in one.require(at_least(10, hard=True), 2.0)] == [Clear, Apply]
 
 
-def test_a_profile_that_fails_is_left_out_for_its_cool_down_and_the_next_best_taken() -> None:
+def test_failed_profile_is_excluded_for_its_cool_down() -> None:
     one = loop()
     one.start(0.0)
     finish(one, 0.0)
@@ -187,14 +179,14 @@ def test_a_profile_that_hangs_is_failed() -> None:
     assert one.applying == "middle"
 
 
-def test_a_failure_applies_the_profile_that_ran_before_again() -> None:
+def test_failure_reapplies_the_previous_profile() -> None:
     one = running(1)
     assert applies(one.pin("fast", 2.0)) == ["fast"]
     one.pin("", 2.5)
     assert applies(one.failed("fast", "broken", 3.0)) == ["slow"]
 
 
-def test_when_every_profile_fails_the_first_cool_down_that_ends_tries_again() -> None:
+def test_first_ended_cool_down_retries() -> None:
     one = loop(FAST, SLOW)
     one.start(0.0)
     assert applies(one.failed("slow", "broken", 1.0)) == ["fast"]
@@ -203,7 +195,7 @@ def test_when_every_profile_fails_the_first_cool_down_that_ends_tries_again() ->
     assert applies(one.handle_timer(one.next_timer() or 0.0)) == ["slow"]
 
 
-def test_a_profile_that_disappoints_again_and_again_is_left_out_for_longer() -> None:
+def test_cool_down_grows_with_each_violation() -> None:
     one = loop(FAST, SLOW)
     outs = []
     one.start(0.0)
@@ -238,17 +230,17 @@ def test_two_that_are_nearly_alike_do_not_alternate() -> None:
 
 def test_what_a_better_profile_waits_for_is_the_dwell_time() -> None:
     one = running(30, FAST, SLOW, hard=False)
-    one.bar({"fast": "battery low"}, 2.0)
+    one.block({"fast": "battery low"}, 2.0)
     finish(one, 2.0)
     assert one.profile == "slow"
-    assert one.bar({}, 3.0) == []
+    assert one.block({}, 3.0) == []
     assert applies(one.window({"latency": 0.1}, 3.5)) == []
     assert applies(one.window({"latency": 0.1}, 4.5)) == ["fast"]
 
 
 def test_a_barred_profile_is_left_at_once() -> None:
     one = running(30)
-    assert applies(one.bar({"fast": "battery low"}, 1.5)) == ["middle"]
+    assert applies(one.block({"fast": "battery low"}, 1.5)) == ["middle"]
 
 
 def test_a_choice_by_hand_holds_whatever_is_asked() -> None:
@@ -263,7 +255,7 @@ def test_a_choice_by_hand_holds_whatever_is_asked() -> None:
         one.pin("slwo", 8.0)
 
 
-def test_a_choice_by_hand_that_fails_is_tried_again_behind_its_cool_down() -> None:
+def test_failed_choice_is_retried_after_its_cool_down() -> None:
     one = running(1)
     assert applies(one.pin("fast", 2.0)) == ["fast"]
     assert applies(one.failed("fast", "broken", 2.0)) == ["slow"]  # not the broken one over and over
@@ -275,7 +267,7 @@ def test_a_choice_by_hand_that_fails_is_tried_again_behind_its_cool_down() -> No
     assert applies(one.pin("fast", 12.5)) == ["fast"]
 
 
-def test_what_none_can_serve_is_one_alarm_however_little_is_measured() -> None:
+def test_infeasible_request_raises_one_alarm() -> None:
     one = running(5)
     raised = one.require(Requirement("/c", {"latency": bound(LATENCY, at_most=0.001, hard=True)}), 2.0)
     assert [kind for kind, _, _ in alarms(raised)] == [AlarmKind.NON_ADAPTABLE]
@@ -286,7 +278,7 @@ def test_what_none_can_serve_is_one_alarm_however_little_is_measured() -> None:
     assert any(isinstance(action, Clear) for action in one.release("/c", 6.0))
 
 
-def test_what_is_asked_while_a_profile_is_applied_counts_when_it_runs() -> None:
+def test_request_while_applying_counts_afterwards() -> None:
     one = loop()
     one.start(0.0)
     assert one.require(at_least(30), 0.1) == []
@@ -294,7 +286,7 @@ def test_what_is_asked_while_a_profile_is_applied_counts_when_it_runs() -> None:
 
 
 @pytest.mark.parametrize("seed", range(200))
-def test_whatever_happens_one_profile_is_applied_at_a_time_and_none_that_is_left_out(seed: int) -> None:  # noqa: C901
+def test_one_allowed_profile_is_applied_at_a_time(seed: int) -> None:  # noqa: C901
     chance = random.Random(seed)
     one = loop(FAST, MIDDLE, SLOW, LIMP)
     now, outstanding = 0.0, ""
@@ -319,7 +311,7 @@ def test_whatever_happens_one_profile_is_applied_at_a_time_and_none_that_is_left
     for _ in range(300):
         now += chance.choice((0.0, 0.1, 1.0, 4.0))
         while (due := one.next_timer()) is not None and due <= now:
-            was, outstanding = outstanding, "" if outstanding and due == one._deadline else outstanding
+            was, outstanding = outstanding, "" if outstanding and due == one._apply_deadline else outstanding
             take(one.handle_timer(due))
         match chance.randrange(6):
             case 0:
@@ -336,7 +328,7 @@ def test_whatever_happens_one_profile_is_applied_at_a_time_and_none_that_is_left
                 take(one.failed(was, "by chance", now))
             case 5:
                 barred = {name: "by chance" for name in ("fast", "middle") if chance.random() < 0.3}
-                take(one.bar(barred, now))
+                take(one.block(barred, now))
 
 
 def _any_requirement(chance: random.Random, now: float) -> Requirement:
@@ -348,7 +340,7 @@ def _any_requirement(chance: random.Random, now: float) -> Requirement:
     )
 
 
-def test_a_reaction_counts_from_the_beginning_of_the_first_bad_window() -> None:
+def test_reaction_begins_with_the_first_violated_window() -> None:
     one = running(20.0, FAST, MIDDLE)
     assert one.profile == "middle"
     one.window({"rate": 20.0}, 2.0)
@@ -357,7 +349,7 @@ def test_a_reaction_counts_from_the_beginning_of_the_first_bad_window() -> None:
     assert one.applied("fast", 4.5)[0] == Reacted("fast", 2.5)
 
 
-def test_a_soft_bound_that_the_profile_is_known_to_fall_short_of_is_no_disturbance() -> None:
+def test_declared_soft_shortfall_is_no_disturbance() -> None:
     only = Profile("only", {"rate": 10.0, "latency": 0.1}, cost=1)
     one = running(20, only, hard=False)
     for second in range(2, 8):
@@ -366,9 +358,9 @@ def test_a_soft_bound_that_the_profile_is_known_to_fall_short_of_is_no_disturban
     assert [kind for kind, _, _ in alarms(one.window({"rate": 2.0}, 9.0))] == [AlarmKind.NON_ADAPTABLE]
 
 
-def test_a_restart_begins_with_what_was_asked_and_the_profile_that_ran() -> None:
+def test_restart_continues_with_profile_and_requirements() -> None:
     one = loop()
-    one.remember([at_least(15)], "fast")  # fast serves as well as middle does
+    one.restore([at_least(15)], "fast", {}, 0.0)  # fast serves as well as middle does
     assert applies(one.start(0.0)) == ["fast"]
     one.applied("fast", 0.1)
     assert one.requirements.keys() == {"/client"}
@@ -376,17 +368,17 @@ def test_a_restart_begins_with_what_was_asked_and_the_profile_that_ran() -> None
     assert applies(one.release("/client", 6.0)) == ["slow"]
 
     worse = loop()
-    worse.remember([at_least(15, hard=True)], "slow")
+    worse.restore([at_least(15, hard=True)], "slow", {}, 0.0)
     assert applies(worse.start(0.0)) == ["middle"]
     pinned = loop()
-    pinned.remember([], "fast")
+    pinned.restore([], "fast", {}, 0.0)
     assert applies(pinned.pin("middle", 0.0)) == ["middle"]
     barred = loop()
-    barred.remember([], "fast")
-    assert applies(barred.bar({"fast": "no power"}, 0.0)) == ["slow"]
+    barred.restore([], "fast", {}, 0.0)
+    assert applies(barred.block({"fast": "no power"}, 0.0)) == ["slow"]
 
 
-def test_who_says_the_same_again_and_again_hides_no_disturbance() -> None:
+def test_repeated_request_hides_no_disturbance() -> None:
     one = running(20.0, FAST, MIDDLE)
     actions: list[Action] = []
     for turn in range(3):  # rostopic pub -r 10
@@ -398,15 +390,15 @@ def test_who_says_the_same_again_and_again_hides_no_disturbance() -> None:
 
 def test_who_says_the_same_again_does_not_skip_the_dwell() -> None:
     one = running(20.0)
-    one.bar({"middle": "no current"}, 1.5)
+    one.block({"middle": "no current"}, 1.5)
     finish(one, 1.5)
     assert one.profile == "fast"
-    one.bar({}, 1.6)
+    one.block({}, 1.6)
     assert one.require(at_least(20.0, hard=True), 1.7) == []
     assert one.profile == "fast"
 
 
-def test_what_the_profile_before_left_in_queues_is_not_held_against_the_next_one() -> None:
+def test_windows_within_the_settling_time_do_not_count() -> None:
     one = Adaptation(ATTRIBUTES, Decider("camera", ATTRIBUTES, (FAST, MIDDLE, LIMP)), replace(SETTINGS, settle=1.5))
     one.start(0.0)
     one.require(at_least(15, hard=True), 0.0)
@@ -435,7 +427,7 @@ def hung(now: float) -> Adaptation:
     return one
 
 
-def test_a_profile_whose_function_still_hangs_is_not_taken_again() -> None:
+def test_hanging_profile_is_not_taken_again() -> None:
     one = hung(5.0)
     finish(one, 5.1)
     assert not applies(one.handle_timer(100.0))  # its cool-down is over
@@ -447,7 +439,7 @@ def test_a_profile_whose_function_still_hangs_is_not_taken_again() -> None:
     assert applies(one.ended_late("fast", 101.0, touched=False)) == ["fast"]
 
 
-def test_what_runs_is_applied_once_more_when_a_hung_function_has_ended() -> None:
+def test_late_end_reapplies_the_running_profile() -> None:
     one = hung(5.0)
     finish(one, 5.1)
     assert applies(one.ended_late("fast", 7.0, touched=True)) == ["middle"]
@@ -455,7 +447,7 @@ def test_what_runs_is_applied_once_more_when_a_hung_function_has_ended() -> None
     assert not one.applying
 
 
-def test_a_hung_function_that_ends_amid_the_next_one_has_that_applied_twice() -> None:
+def test_late_end_during_the_next_applies_it_twice() -> None:
     one = hung(5.0)
     assert one.ended_late("fast", 5.5, touched=True) == []
     assert applies(one.applied("middle", 6.0)) == ["middle"]
@@ -463,7 +455,7 @@ def test_a_hung_function_that_ends_amid_the_next_one_has_that_applied_twice() ->
     assert not one.applying
 
 
-def test_a_hung_function_that_ends_amid_another_question_has_nothing_applied_for_nothing() -> None:
+def test_late_end_during_a_new_request_applies_only_that() -> None:
     one = hung(5.0)
     one.ended_late("fast", 5.5, touched=True)
     one.require(at_least(1), 5.6)
@@ -471,13 +463,13 @@ def test_a_hung_function_that_ends_amid_another_question_has_nothing_applied_for
     assert not applies(one.applied("slow", 6.5))
 
 
-def test_a_hung_function_that_ended_before_the_next_one_began_changes_nothing() -> None:
+def test_late_end_before_the_next_begins_changes_nothing() -> None:
     one = hung(5.0)
     assert one.ended_late("fast", 5.1, touched=False) == []
     assert finish(one, 5.2) == [Reacted("middle", 5.2)]
 
 
-def test_what_was_left_out_before_a_restart_is_left_out_for_the_rest_of_it() -> None:
+def test_restored_cool_down_runs_to_its_end() -> None:
     one = loop()
     one.start(0.0)
     finish(one, 0.0)
@@ -486,7 +478,7 @@ def test_what_was_left_out_before_a_restart_is_left_out_for_the_rest_of_it() -> 
     cooling = one.cooling(4.0)
     assert {name: (cool.until, cool.cool_down) for name, cool in cooling.items()} == {"fast": (13.0, 10.0)}
     again = loop()
-    again.remember([at_least(30)], "middle", cooling, 4.0)
+    again.restore([at_least(30)], "middle", cooling, 4.0)
     assert applies(again.start(4.0)) == ["middle"]
     finish(again, 4.0)
     assert again.explain(5.0)[0].excluded == "no bus"
@@ -499,14 +491,14 @@ def test_what_was_left_out_before_a_restart_is_left_out_for_the_rest_of_it() -> 
 
 def test_a_cool_down_of_a_file_is_no_longer_than_any_may_be() -> None:
     one = loop()
-    one.remember([at_least(30)], "", {"fast": CoolDown(1e9, 1e9, "odd")}, 1.0)
+    one.restore([at_least(30)], "", {"fast": CoolDown(1e9, 1e9, "odd")}, 1.0)
     assert one.cooling(1.0)["fast"].until == 161.0
 
 
-def test_a_profile_chosen_before_a_restart_waits_for_its_cool_down_and_one_chosen_now_does_not() -> None:
+def test_only_a_new_choice_ends_a_cool_down() -> None:
     cooling = {"fast": CoolDown(13.0, 10.0, "no bus")}
     before, now = loop(), loop()
-    before.remember([], "", cooling, 4.0)
-    assert applies(before.pin("fast", 4.0, anew=False)) == ["slow"]
-    now.remember([], "", cooling, 4.0)
+    before.restore([], "", cooling, 4.0)
+    assert applies(before.pin("fast", 4.0, restored=True)) == ["slow"]
+    now.restore([], "", cooling, 4.0)
     assert applies(now.pin("fast", 4.0)) == ["fast"]

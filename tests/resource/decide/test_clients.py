@@ -15,9 +15,9 @@ def clients() -> Clients:
     return Clients("camera", {"rate": RATE, "latency": LATENCY})
 
 
-def test_what_cannot_be_is_remembered_until_something_better_is_said() -> None:
+def test_refusal_lasts_until_a_valid_request() -> None:
     one = clients()
-    one.speaks("/a", "m" * 9999, "")
+    one.received("/a", "m" * 9999, "")
     assert len(one.mark("/a")) == limits.REQUIREMENT_TEXT_MAX
     with pytest.raises(ConfigError):
         one.read("/a", [("rat", ">= 20 Hz")], 1.0)
@@ -30,67 +30,67 @@ def test_what_cannot_be_is_remembered_until_something_better_is_said() -> None:
     assert (one.refusal("/b"), one.mark("/b")) == ("", "")
 
 
-def test_a_latched_request_that_comes_again_does_not_begin_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_repeated_latched_request_keeps_its_expiry(monkeypatch: pytest.MonkeyPatch) -> None:
     one = clients()
     for now, expires in ((1.0, 31.0), (20.0, 31.0), (31.0, None)):
-        one.speaks("/a", "m", "5.000000000")
+        one.received("/a", "m", "5.000000000")
         found = one.read("/a", ASKS, now)
         assert (found and found.expires) == expires
-    one.speaks("/a", "m", "6.000000000")
+    one.received("/a", "m", "6.000000000")
     again = one.read("/a", ASKS, 40.0)
     assert again is not None
     assert again.expires == 70.0
-    one.speaks("/a", "m", "")  # without a stamp each one is new
+    one.received("/a", "m", "")  # without a stamp each one is new
     unstamped = one.read("/a", ASKS, 50.0)
     assert unstamped is not None
     assert unstamped.expires == 80.0
     monkeypatch.setattr(limits, "RESOURCE_STAMPS_MAX", 2)
     for number in range(5):
-        one.speaks("/a", "m", f"{number}.5")
+        one.received("/a", "m", f"{number}.5")
         one.read("/a", ASKS, 60.0)
     assert list(one.expiries) == [("/a", "3.5"), ("/a", "4.5")]
 
 
-def test_one_that_is_away_for_two_looks_is_gone_and_nothing_of_it_stays() -> None:
+def test_absent_client_is_removed() -> None:
     one = clients()
-    one.speaks("/a", "m", "")
-    one.speaks("/b", "n", "")
-    assert one.gone({"/a"}, 1.0) == []
-    assert one.gone({"/a", "/b"}, 2.0) == []  # it was only connecting anew
-    assert one.gone({"/a"}, 3.0) == []
-    assert one.gone({"/a"}, 4.0) == ["/b"]
+    one.received("/a", "m", "")
+    one.received("/b", "n", "")
+    assert one.remove_absent({"/a"}, 1.0) == []
+    assert one.remove_absent({"/a", "/b"}, 2.0) == []  # it was only connecting anew
+    assert one.remove_absent({"/a"}, 3.0) == []
+    assert one.remove_absent({"/a"}, 4.0) == ["/b"]
     assert one.mark("/b") == ""
-    assert one.gone(set(), 5.0) == []
-    assert one.gone(set(), 6.0) == ["/a"]  # also one that asked for nothing any more
+    assert one.remove_absent(set(), 5.0) == []
+    assert one.remove_absent(set(), 6.0) == ["/a"]  # also one that asked for nothing any more
 
 
-def test_what_was_asked_survives_a_restart_for_those_that_come_back() -> None:
+def test_requirements_wait_for_their_clients_after_a_restart() -> None:
     before = clients()
-    before.speaks("/a", "m", "5.0")
-    before.speaks("/b", "n", "")
+    before.received("/a", "m", "5.0")
+    before.received("/b", "n", "")
     requirements = {}
     for name, values in (("/a", ASKS), ("/b", [("latency", "<= 1 s")])):
         requirement = before.read(name, values, 10.0)
         assert requirement is not None
         requirements[name] = requirement
-    asked = before.asked(requirements | {"context lab": requirements["/a"]}, 12.0, NOW_NS)
+    asked = before.save(requirements | {"context lab": requirements["/a"]}, 12.0, NOW_NS)
     assert [(a.client, a.mark, a.stamp, a.expires_ns) for a in asked] == [
         ("/a", "m", "5.0", NOW_NS + 28 * 10**9),
         ("/b", "n", "", None),
     ]
     after = clients()
-    found = after.recall(asked, 100.0, NOW_NS + 8 * 10**9)
+    found = after.restore(asked, 100.0, NOW_NS + 8 * 10**9)
     assert [(r.client, r.expires) for r in found] == [("/a", 120.0), ("/b", None)]
     grace = 100.0 + limits.RESOURCE_CLIENT_GRACE
-    after.speaks("/b", "n", "")  # it is back
+    after.received("/b", "n", "")  # it is back
     for now in (101.0, 102.0):
-        assert after.gone({"/b"}, now) == []
-    after.speaks("/a", "m", "5.0")
+        assert after.remove_absent({"/b"}, now) == []
+    after.received("/a", "m", "5.0")
     again = after.read("/a", ASKS, 110.0)
     assert again is not None
     assert again.expires == 120.0
     silent = clients()
-    silent.recall(asked, 100.0, NOW_NS)
-    assert silent.gone(set(), grace - 1) == []
-    assert silent.gone(set(), grace) == []
-    assert silent.gone(set(), grace + 1) == ["/a", "/b"]
+    silent.restore(asked, 100.0, NOW_NS)
+    assert silent.remove_absent(set(), grace - 1) == []
+    assert silent.remove_absent(set(), grace) == []
+    assert silent.remove_absent(set(), grace + 1) == ["/a", "/b"]

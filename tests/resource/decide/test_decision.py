@@ -69,7 +69,7 @@ def test_without_a_range_a_shortfall_is_all_or_nothing() -> None:
     assert one.distance("slow", {"rate": bound(RATE, at_least=9)}) == 0.0
 
 
-def test_where_no_profile_meets_the_hard_requirements_the_best_effort_one_serves() -> None:
+def test_best_effort_serves_if_none_is_feasible() -> None:
     bounds = {"rate": bound(RATE, at_least=100, hard=True)}
     declared = Profile("limp", {"rate": 1.0}, best_effort=True)
     decision = decider(FAST, SHARP, declared).decide(bounds)
@@ -138,13 +138,13 @@ def test_every_term_is_explained() -> None:
         ),
     ],
 )
-def test_a_declaration_that_cannot_be_is_refused(profiles: list[Profile], said: str) -> None:
+def test_invalid_profiles_are_refused(profiles: list[Profile], said: str) -> None:
     with pytest.raises(ConfigError) as caught:
         Decider("camera", ATTRIBUTES, profiles)
     assert said in str(caught.value)
 
 
-def test_an_unknown_profile_is_named_with_the_one_that_was_meant() -> None:
+def test_unknown_profile_has_a_suggestion() -> None:
     with pytest.raises(ConfigError, match="camera has no such profile; did you mean sharp"):
         decider().profile("shrap")
 
@@ -168,13 +168,13 @@ def plane(profiles: list[Profile]) -> Decider:
 
 
 @given(_profiles, _asked)
-def test_better_than_asked_is_never_penalised(profiles: list[Profile], asked: dict[str, Bound]) -> None:
+def test_better_values_have_no_shortfall(profiles: list[Profile], asked: dict[str, Bound]) -> None:
     enough = {name: Bound(0.0, weight=b.weight, hard=b.hard) for name, b in asked.items()}
     assert all(score.distance == 0.0 and score.feasible for score in plane(profiles).explain(enough))
 
 
 @given(_profiles, _asked)
-def test_the_one_taken_is_feasible_whenever_one_is(profiles: list[Profile], asked: dict[str, Bound]) -> None:
+def test_decision_is_feasible_if_any_profile_is(profiles: list[Profile], asked: dict[str, Bound]) -> None:
     decider = plane(profiles)
     scores = decider.explain(asked)
     decision = decider.decide(asked)
@@ -205,7 +205,7 @@ def test_a_greater_weight_never_favours_who_falls_shorter(
 
 
 @given(_profiles, _asked, st.integers(0, 5), st.floats(0, 1), st.floats(0, 1))
-def test_a_profile_that_serves_worse_within_the_known_range_changes_nothing(
+def test_worse_profile_within_the_range_changes_nothing(
     profiles: list[Profile], asked: dict[str, Bound], which: int, dx: float, dy: float
 ) -> None:
     before = plane(profiles).decide(asked)

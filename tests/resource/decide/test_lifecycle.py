@@ -21,9 +21,7 @@ def at(state: LifecycleState) -> LifeCycle:
 
 @pytest.mark.parametrize("state", LifecycleState)
 @pytest.mark.parametrize("transition", Transition)
-def test_every_transition_leads_where_the_table_says_or_nowhere(
-    state: LifecycleState, transition: Transition
-) -> None:
+def test_transitions_follow_the_table(state: LifecycleState, transition: Transition) -> None:
     one = at(state)
     assert one.state is state
     if (state, transition) in TRANSITIONS:
@@ -42,7 +40,7 @@ def test_one_transition_at_a_time() -> None:
         one.begin(Transition.FINALIZE)
 
 
-def test_a_hook_that_raises_leaves_the_state_and_is_said() -> None:
+def test_failing_hook_leaves_the_state() -> None:
     one = at(LifecycleState.INACTIVE)
     one.begin(Transition.ACTIVATE)
     assert one.failed("no such device") is LifecycleState.INACTIVE

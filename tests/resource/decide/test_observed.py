@@ -6,8 +6,9 @@ import pytest
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource.decide.observed import MissingInputs, ObservedQualities
+from rmpa.resource.declare.qos_request import at_least
 from rmpa.resource.declare.requirements import Requirement
-from rmpa.resource.declare.resource import Resource, at_least
+from rmpa.resource.declare.resource import Resource
 
 if TYPE_CHECKING:
     from rmpa.resource.declare.attributes import Value
@@ -32,25 +33,24 @@ def asks(client: str) -> dict[str, Requirement]:
 def judged(
     observed: ObservedQualities, measured: dict[str, Value], client: str, now: float = 0.0
 ) -> dict[str, Value]:
-    observed.judge(measured, asks(client), now)
-    return measured
+    return observed.worst(measured, asks(client), now)
 
 
-def test_the_worse_of_what_is_sent_and_what_arrives_counts(observed: ObservedQualities) -> None:
-    observed.told("/viewer", [("rate", "4 Hz"), ("latency", "300 ms"), ("light", "night")], 0.0)
+def test_worse_of_measured_and_observed_counts(observed: ObservedQualities) -> None:
+    observed.report("/viewer", [("rate", "4 Hz"), ("latency", "300 ms"), ("light", "night")], 0.0)
     sent: dict[str, Value] = {"rate": 20.0, "latency": 0.001, "loss": 0.0}
     assert judged(observed, dict(sent), "/viewer") == {"rate": 4.0, "latency": 0.3, "loss": 0.0, "light": "night"}
     assert judged(observed, {"rate": 3.0}, "/viewer")["rate"] == 3.0
-    assert observed.given("/viewer", "rate") == 4.0
-    assert observed.given("/viewer", "loss") is observed.given("/other", "rate") is None
+    assert observed.observed("/viewer", "rate") == 4.0
+    assert observed.observed("/viewer", "loss") is observed.observed("/other", "rate") is None
 
 
-def test_only_those_who_ask_count_and_not_for_ever(observed: ObservedQualities) -> None:
-    observed.told("/viewer", [("rate", "4 Hz")], 0.0)
+def test_reports_count_for_clients_and_expire(observed: ObservedQualities) -> None:
+    observed.report("/viewer", [("rate", "4 Hz")], 0.0)
     assert judged(observed, {"rate": 20.0}, "/driver") == {"rate": 20.0}
     assert judged(observed, {"rate": 20.0}, "/viewer", 3.0) == {"rate": 4.0}
     assert judged(observed, {"rate": 20.0}, "/viewer", 3.1) == {"rate": 20.0}
-    observed.told("/viewer", [("rate", "4 Hz")], 5.0)
+    observed.report("/viewer", [("rate", "4 Hz")], 5.0)
     observed.clear()
     assert judged(observed, {"rate": 20.0}, "/viewer", 5.0) == {"rate": 20.0}
 
@@ -65,16 +65,16 @@ def test_only_those_who_ask_count_and_not_for_ever(observed: ObservedQualities) 
         ([("rate", "4 Hz")] * 300, "more than 256"),
     ],
 )
-def test_what_cannot_be_is_refused_and_what_was_before_stays(
+def test_invalid_report_keeps_the_previous_one(
     observed: ObservedQualities, values: list[tuple[str, str]], said: str
 ) -> None:
-    observed.told("/viewer", [("rate", "4 Hz")], 0.0)
+    observed.report("/viewer", [("rate", "4 Hz")], 0.0)
     with pytest.raises(ConfigError, match=said):
-        observed.told("/viewer", values, 1.0)
-    assert observed.given("/viewer", "rate") == 4.0
+        observed.report("/viewer", values, 1.0)
+    assert observed.observed("/viewer", "rate") == 4.0
 
 
-def test_what_is_missing_is_said_once_and_when_it_is_back() -> None:
+def test_missing_input_is_reported_once() -> None:
     missing = MissingInputs()
-    news = [missing.look(texts) for texts in (["a"], [], ["a"], ["a", "b"], ["a", "b"], ["b"], [])]
+    news = [missing.update(texts) for texts in (["a"], [], ["a"], ["a", "b"], ["a", "b"], ["b"], [])]
     assert news == [[], [], [], [("a", True)], [("b", True)], [("a", False)], [("b", False)]]

@@ -48,7 +48,7 @@ def test_a_period_reaches_over_the_border_of_two_windows() -> None:
     assert quality.window(1.5)["rate"] == pytest.approx(2.0)
 
 
-def test_a_stream_that_stops_is_slow_at_once_and_slower_with_each_window() -> None:
+def test_rate_falls_as_soon_as_messages_stop() -> None:
     quality = TopicQuality(0.0, deadline=0.15)
     feed(quality, [0.1, 0.2, 0.3])
     assert quality.window(1.3)["rate"] == pytest.approx(1.0)

@@ -1,8 +1,9 @@
 from __future__ import annotations
 
-from rmpa.resource.decide.adaptation import Adaptation, Alarm, AlarmKind, Shortfall
+from rmpa.resource.decide.actions import Alarm, AlarmKind, Shortfall
+from rmpa.resource.decide.adaptation import Adaptation
 from rmpa.resource.decide.decision import Decider
-from rmpa.resource.decide.reports import alarm_values, answer_to, decision_of, health, told
+from rmpa.resource.decide.reports import alarm_values, answer_to, decision_report, describe_alarm, health
 from rmpa.resource.declare.attributes import LATENCY, RATE
 from rmpa.resource.declare.profiles import Profile
 from rmpa.resource.declare.requirements import Bound, Requirement, bound
@@ -27,19 +28,19 @@ def asked(rate: float = 20.0, client: str = "/a", priority: int = 0) -> Requirem
     return Requirement(client, bounds, priority=priority)
 
 
-def test_an_alarm_in_words_and_figures() -> None:
+def test_alarm_text_and_values() -> None:
     alarm = Alarm(AlarmKind.ADAPTATION, (Shortfall("rate", WANTED, 3.5),), "fast", "slow", 0.0)
-    assert told(alarm) == "adaptation: rate fell short under fast; slow takes over"
+    assert describe_alarm(alarm) == "adaptation: rate fell short under fast; slow takes over"
     assert alarm_values(alarm, ATTRIBUTES, cleared=False, reaction=2.0) == {
         "before": "fast", "after": "slow", "cleared": "false", "rate": "wanted at least 20 Hz, given 3.5 Hz",
     }  # fmt: skip
     assert alarm_values(alarm, ATTRIBUTES, cleared=True, reaction=2.0)["reaction"] == "2 s"
     none = Alarm(AlarmKind.NON_ADAPTABLE, (Shortfall("rate", WANTED, None),), "", "limp", 0.0)
-    assert told(none) == "non-adaptable: no profile gives rate as asked; limp is the best there is"
+    assert describe_alarm(none) == "non-adaptable: no profile gives rate as asked; limp is the best there is"
     assert alarm_values(none, ATTRIBUTES, cleared=False, reaction=None)["rate"].endswith("given nothing")
 
 
-def test_how_a_resource_is_the_worst_first() -> None:
+def test_health_reports_the_worst() -> None:
     assert health(loop(), [], []) == (DiagnosticLevel.OK, "profile fast")
     assert health(loop(), [], ["task a stuck"]) == (DiagnosticLevel.WARN, "task a stuck")
     assert health(loop(), ["nobody publishes /b"], ["c"]) == (DiagnosticLevel.STALE, "nobody publishes /b; c")
@@ -50,7 +51,7 @@ def test_how_a_resource_is_the_worst_first() -> None:
     )  # fmt: skip
 
 
-def test_what_a_client_is_told() -> None:
+def test_answer_to_a_client() -> None:
     level, message, values = answer_to(asked(), loop(), ATTRIBUTES, {"rate": 30.0})
     assert (level, message) == (DiagnosticLevel.OK, "profile fast")
     assert values == {
@@ -63,15 +64,15 @@ def test_what_a_client_is_told() -> None:
     assert answer_to(asked(), loop(runs=False), ATTRIBUTES, {})[:2] == (DiagnosticLevel.WARN, "no profile runs yet")
     assert answer_to(asked(90.0), loop(rate=90.0), ATTRIBUTES, {})[0] is DiagnosticLevel.ERROR
     contradicted = loop()
-    contradicted.require(Requirement("/b", {"rate": Bound(high=RATE.place(5.0), hard=True)}, priority=1), 0.0)
+    contradicted.require(Requirement("/b", {"rate": Bound(high=RATE.position(5.0), hard=True)}, priority=1), 0.0)
     level, message, _ = answer_to(asked(), contradicted, ATTRIBUTES, {"rate": 30.0})
     assert level is not DiagnosticLevel.OK
     assert "/b" in message
 
 
-def test_a_decision_tells_each_term() -> None:
+def test_decision_report_has_each_term() -> None:
     one = loop()
-    found = decision_of(one, one.explain(0.0), 0.25)
+    found = decision_report(one, one.explain(0.0), 0.25)
     assert (found["profile"], found["applying"], found["reaction"], found["clients"]) == ("fast", "", 0.25, ["/a"])
     (score,) = found["scores"]
     assert {term["attribute"] for term in score["terms"]} == {"rate", "latency"}

@@ -5,7 +5,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.decide.saved_state import CHOSEN, CONTEXT, COOL_DOWN, LAST, SavedCoolDown, SavedRequirement, recall
+from rmpa.resource.decide.saved_state import (
+    CHOSEN,
+    CONTEXT,
+    COOL_DOWN,
+    LAST,
+    SavedCoolDown,
+    SavedRequirement,
+    read_saved_state,
+)
 from rmpa.resource.declare.resource import Resource
 
 NOW = 1_800_000_000_000_000_000
@@ -38,21 +46,21 @@ def test_what_was_kept_comes_back() -> None:
         LAST: '"fine"',
         CONTEXT: '"docked"',
     }
-    found = recall(rows, sonar(), NOW)
+    found = read_saved_state(rows, sonar(), NOW)
     assert found.lost == ()
     assert found.parameters == {"gain": 2.0, "frame": "sonar_link"}
     assert isinstance(found.parameters["gain"], float)
     assert (found.chosen, found.last, found.context) == ("fine", "fine", "docked")
-    (one,) = found.asked
+    (one,) = found.requirements
     requirement = one.requirement(sonar().attributes, "sonar", 100.0, NOW)
     assert requirement is not None
     assert (requirement.client, requirement.priority, requirement.expires) == ("/driver", 2, 112.0)
     assert requirement.bounds["noise"].hard
 
 
-def test_what_has_expired_meanwhile_is_forgotten() -> None:
-    found = recall({("requirement", "/driver"): asked(expires_ns=NOW - 1).serialize()}, sonar(), NOW)
-    assert (found.asked, found.lost) == ((), ())
+def test_expired_requirement_is_not_restored() -> None:
+    found = read_saved_state({("requirement", "/driver"): asked(expires_ns=NOW - 1).serialize()}, sonar(), NOW)
+    assert (found.requirements, found.lost) == ((), ())
 
 
 @pytest.mark.parametrize(
@@ -72,8 +80,8 @@ def test_what_has_expired_meanwhile_is_forgotten() -> None:
         (("requirement", "/a"), "[" * 100_000, "requirement /a"),
     ],
 )
-def test_what_no_longer_fits_is_left_out_and_said(key: tuple[str, str], text: str, said: str) -> None:
-    found = recall({key: text, ("parameter", "count"): "7"}, sonar(), NOW)
+def test_invalid_rows_are_left_out_and_reported(key: tuple[str, str], text: str, said: str) -> None:
+    found = read_saved_state({key: text, ("parameter", "count"): "7"}, sonar(), NOW)
     assert found.parameters == {"count": 7}
     (lost,) = found.lost
     assert said in lost
@@ -81,7 +89,7 @@ def test_what_no_longer_fits_is_left_out_and_said(key: tuple[str, str], text: st
 
 @given(st.dictionaries(st.tuples(st.sampled_from(["parameter", "requirement", "profile"]), st.text()), st.text()))
 def test_any_file_can_be_read(rows: dict[tuple[str, str], str]) -> None:
-    found = recall(rows, sonar(), NOW)
+    found = read_saved_state(rows, sonar(), NOW)
     assert found.parameters.keys() <= {"gain", "count", "frame"}
 
 
@@ -100,10 +108,10 @@ def test_an_expiry_is_the_wall_clocks() -> None:
     [(12, 12), (20, 20), (500, 20), (10**9, 20), (0, None), (-1, None), (-(10**9), None)],
     ids=["running", "just begun", "set back", "set back by decades", "over", "long over", "set forward by decades"],
 )
-def test_a_cool_down_is_the_wall_clocks_and_never_longer_than_it_was(ahead: int, left: int | None) -> None:
+def test_restored_cool_down_is_never_longer(ahead: int, left: int | None) -> None:
     row = SavedCoolDown(until_ns=NOW + ahead * SECOND, cool_down=20.0, why="no bus").serialize()
-    found = recall({(COOL_DOWN, "fine"): row}, sonar(), NOW)
-    one = found.cooling["fine"].left(100.0, NOW)
+    found = read_saved_state({(COOL_DOWN, "fine"): row}, sonar(), NOW)
+    one = found.cool_downs["fine"].left(100.0, NOW)
     assert (one and (one.until, one.cool_down, one.why)) == (left and (100.0 + left, 20.0, "no bus"))
 
 

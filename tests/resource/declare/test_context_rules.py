@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource import limits
-from rmpa.resource.declare.context_rules import Chooser, ContextRule, Reference, Scalar, parse_rule
+from rmpa.resource.declare.context_rules import ContextRule, ContextSelector, Reference, Scalar, parse_rule
 from rmpa.resource.declare.resource import Resource
 
 PARAMETERS = ("gain", "name", "on")
@@ -82,7 +82,7 @@ def test_a_text_is_no_number() -> None:
         ("~on or " * 200 + "~on", "1403 characters"),
     ],
 )
-def test_a_rule_that_cannot_be_is_said(text: str, said: str) -> None:
+def test_invalid_rule_is_refused(text: str, said: str) -> None:
     with pytest.raises(ConfigError) as error:
         rule(text)
     assert said in str(error.value)
@@ -112,12 +112,12 @@ def test_the_graph_tells_which_part_is_the_topic() -> None:
 
 
 def test_the_first_rule_that_holds_wins_and_stays_a_while() -> None:
-    chooser = Chooser({"low": rule("~gain < 2"), "on": rule("~on")}, dwell=1.0)
-    assert chooser.choose("", {"~gain": 1, "~on": True}, 0.0) == "low"
+    chooser = ContextSelector({"low": rule("~gain < 2"), "on": rule("~on")}, dwell=1.0)
+    assert chooser.select("", {"~gain": 1, "~on": True}, 0.0) == "low"
     chooser.since = 0.0
-    assert chooser.choose("low", {"~gain": 3, "~on": True}, 0.9) == "low"  # it must not flutter
-    assert chooser.choose("low", {"~gain": 3, "~on": True}, 1.0) == "on"
+    assert chooser.select("low", {"~gain": 3, "~on": True}, 0.9) == "low"  # it must not flutter
+    assert chooser.select("low", {"~gain": 3, "~on": True}, 1.0) == "on"
     chooser.since = 1.0
-    assert chooser.choose("on", {"~gain": 3, "~on": False}, 2.0) == ""
+    assert chooser.select("on", {"~gain": 3, "~on": False}, 2.0) == ""
     chooser.chosen = "other"
-    assert chooser.choose("on", {"~gain": 1, "~on": True}, 1.1) == "other"
+    assert chooser.select("on", {"~gain": 1, "~on": True}, 1.1) == "other"

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource.declare.attributes import LATENCY, RATE, Attribute, Direction, Scale
-from rmpa.resource.declare.requirement_text import parse_bound, parse_requirement, parse_wish
+from rmpa.resource.declare.qos_request import QoSRequest, at_least, at_most, between, exactly
+from rmpa.resource.declare.requirement_text import parse_bound, parse_request, parse_requirement
 from rmpa.resource.declare.requirements import Bound, Requirement
-from rmpa.resource.declare.resource import QoSRequest, at_least, at_most, between, exactly
 
 ATTRIBUTES = {
     "rate": RATE,
@@ -35,7 +35,7 @@ ATTRIBUTES = {
     ],
 )
 def test_what_people_write_is_read(text: str, wish: QoSRequest) -> None:
-    assert parse_wish(text, "x") == wish
+    assert parse_request(text, "x") == wish
 
 
 def test_an_interval_has_one_unit() -> None:
@@ -62,7 +62,7 @@ def test_an_interval_has_one_unit() -> None:
         ("rate", "x" * 2000, "2000 characters"),
     ],
 )
-def test_what_cannot_be_read_is_said(key: str, text: str, said: str) -> None:
+def test_unreadable_requirement_is_refused(key: str, text: str, said: str) -> None:
     with pytest.raises(ConfigError) as caught:
         parse_requirement("/c", [(key, text)], ATTRIBUTES, "camera", 0.0)
     assert said in str(caught.value)
@@ -88,7 +88,7 @@ _wishes = st.one_of(
 
 @given(_wishes)
 def test_what_a_wish_shows_is_read_as_the_same(wish: QoSRequest) -> None:
-    assert parse_wish(str(wish), "x") == wish
+    assert parse_request(str(wish), "x") == wish
 
 
 @given(st.text(max_size=80))

@@ -54,14 +54,14 @@ def test_an_exact_value_where_more_is_better_is_a_lower_bound() -> None:
         (RATE, {"at_least": 5, "weight": math.nan}, "a weight of nan"),
     ],
 )
-def test_a_request_that_makes_no_sense_is_refused(attribute: Attribute, asked: dict[str, object], said: str) -> None:
+def test_invalid_request_is_refused(attribute: Attribute, asked: dict[str, object], said: str) -> None:
     with pytest.raises(ConfigError) as caught:
         bound(attribute, **asked)  # type: ignore[arg-type] # on purpose
     assert said in str(caught.value)
     assert f"requirement of {attribute.name}" in str(caught.value)
 
 
-def test_an_unknown_attribute_is_named_with_the_one_that_was_meant() -> None:
+def test_unknown_attribute_has_a_suggestion() -> None:
     with pytest.raises(ConfigError, match="camera has no such attribute; did you mean rate"):
         find_attribute({"rate": RATE}, "rates", "camera")
 
@@ -99,7 +99,7 @@ _requirements = st.lists(
 
 
 @given(_requirements)
-def test_what_is_merged_satisfies_all_but_those_that_were_told(requirements: list[Requirement]) -> None:
+def test_merge_satisfies_all_but_reported_conflicts(requirements: list[Requirement]) -> None:
     merged = merge(requirements)
     told = {(conflict.client, conflict.attribute) for conflict in merged.conflicts}
     for requirement in requirements:
@@ -111,7 +111,7 @@ def test_what_is_merged_satisfies_all_but_those_that_were_told(requirements: lis
 
 
 @given(_requirements)
-def test_the_most_important_client_never_gives_way(requirements: list[Requirement]) -> None:
+def test_highest_priority_never_conflicts(requirements: list[Requirement]) -> None:
     merged = merge(requirements)
     if requirements:
         highest = max(requirements, key=lambda requirement: requirement.priority)

@@ -6,7 +6,9 @@ import pytest
 
 from rmpa.core.contract import Contract, Reliability
 from rmpa.core.errors import ConfigError, LimitExceeded, LocalProtocolError, RemoteProtocolError
-from rmpa.resource.declare.resource import Parameter, Resource, at_least, at_most, between, exactly
+from rmpa.resource.declare.parameters import Parameter
+from rmpa.resource.declare.qos_request import at_least, at_most, between, exactly
+from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.descriptor import Descriptor, describe
 
 if TYPE_CHECKING:
@@ -76,7 +78,7 @@ def test_what_is_no_descriptor_is_refused(text: bytes) -> None:
         Descriptor.parse(text)
 
 
-def test_a_descriptor_of_another_version_or_without_end_is_refused() -> None:
+def test_foreign_or_endless_descriptor_is_refused() -> None:
     text = describe(sonar(), "/sonar").serialize()
     with pytest.raises(RemoteProtocolError, match="version 9; this release reads 1"):
         Descriptor.parse(text.replace('"version":1', '"version":9', 1))
@@ -158,7 +160,7 @@ MISTAKES: list[tuple[Callable[[Resource], object], str]] = [
 
 
 @pytest.mark.parametrize(("mistake", "said"), MISTAKES, ids=[said[:40] for _, said in MISTAKES])
-def test_a_mistake_is_said_where_it_is_made(mistake: Callable[[Resource], object], said: str) -> None:
+def test_invalid_declaration_is_refused(mistake: Callable[[Resource], object], said: str) -> None:
     one = sonar()
     before = describe(one, "/sonar")
     with pytest.raises(ConfigError) as caught:
@@ -189,6 +191,6 @@ def test_what_has_one_name_in_two_namespaces_is_measured_apart() -> None:
 
 
 @pytest.mark.parametrize("value", [None, "far", True, float("nan"), [1.0]])
-def test_what_is_no_value_is_said_by_observe(value: Any) -> None:
+def test_observe_refuses_invalid_values(value: Any) -> None:
     with pytest.raises(ConfigError, match="is no number"):
         sonar().declared_attributes["accuracy"].observe(value)

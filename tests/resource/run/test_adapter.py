@@ -8,8 +8,9 @@ import msgspec
 import pytest
 
 from rmpa.core.errors import PeerRefused, UnreachableError
-from rmpa.resource.decide.adaptation import AdaptationSettings
-from rmpa.resource.declare.resource import Resource, at_least, at_most
+from rmpa.resource.declare.adaptation_settings import AdaptationSettings
+from rmpa.resource.declare.qos_request import at_least, at_most
+from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.adapter import Adapter
 from rmpa.resource.run.client import ResourceClient
 from rmpa.resource.run.runtime import Runtime
@@ -60,7 +61,6 @@ class Sonar:
         self.problems: list[object] = []
         self.tasks = Tasks(self.runtime, on_problem=self.problems.append, on_deactivate=self.problems.append)
         self.adapter = Adapter(self.runtime, self.tasks, window=0.2, settings=QUICK)
-        self.runtime.parts += [self.tasks, self.adapter]
 
     def _applier(self, name: str) -> Callable[[], None]:
         def apply() -> None:
@@ -78,7 +78,7 @@ class Sonar:
 @pytest.fixture
 async def sonar(core: RosCore) -> AsyncIterator[Sonar]:
     one = Sonar(core)
-    await one.runtime.start()
+    await one.runtime.start([one.tasks, one.adapter])
     one.tasks.activate()
     yield one
     for problem in one.broken.values():
@@ -118,7 +118,7 @@ def pairs(one: Any) -> dict[str, str]:
     return {pair.key: pair.value for pair in one.values}
 
 
-async def test_a_client_asks_is_served_and_told(sonar: Sonar, client: Node) -> None:
+async def test_client_is_served_and_answered(sonar: Sonar, client: Node) -> None:
     responses = await client.subscribe("/sonar/responses", ARRAY)
     profile = await client.subscribe("/sonar/profile", "std_msgs/String")
     await ask(client, noise="<= 5 cm", rate=">= 1 Hz")
@@ -143,7 +143,7 @@ async def test_a_client_asks_is_served_and_told(sonar: Sonar, client: Node) -> N
     ]
 
 
-async def test_quality_that_falls_is_an_alarm_and_another_profile_takes_over(sonar: Sonar, client: Node) -> None:
+async def test_violation_raises_an_alarm_and_changes_the_profile(sonar: Sonar, client: Node) -> None:
     alarms = await client.subscribe("/sonar/alarms", ARRAY)
     quality = await client.subscribe("/diagnostics", ARRAY)
     responses = await client.subscribe("/sonar/responses", ARRAY)
@@ -173,7 +173,7 @@ async def test_quality_that_falls_is_an_alarm_and_another_profile_takes_over(son
     assert sonar.adapter.reaction < 5
 
 
-async def test_what_cannot_be_asked_is_said_to_who_asked_and_changes_nothing(sonar: Sonar, client: Node) -> None:
+async def test_invalid_requirement_is_answered_and_changes_nothing(sonar: Sonar, client: Node) -> None:
     responses = await client.subscribe("/sonar/responses", ARRAY)
     publisher = await ask(client, noise="<= 5 cm")
     await status(responses, lambda s: s.name == "/client" and s.level == OK)
@@ -186,7 +186,7 @@ async def test_what_cannot_be_asked_is_said_to_who_asked_and_changes_nothing(son
     await status(responses, lambda s: s.name == "/client" and s.level == OK)
 
 
-async def test_a_stranger_that_asks_nonsense_is_answered(sonar: Sonar, client: Node) -> None:
+async def test_invalid_first_requirement_is_answered(sonar: Sonar, client: Node) -> None:
     responses = await client.subscribe("/sonar/responses", ARRAY)
     await ask(client, noise=">= 5 cm")
     told = await status(responses, lambda s: s.name == "/client")
@@ -195,7 +195,7 @@ async def test_a_stranger_that_asks_nonsense_is_answered(sonar: Sonar, client: N
     assert not sonar.adapter.loop.requirements
 
 
-async def test_a_client_that_dies_is_forgotten(sonar: Sonar, core: RosCore) -> None:
+async def test_dead_client_is_released(sonar: Sonar, core: RosCore) -> None:
     async with Node("mortal", master_uri=core.uri) as node:
         responses = await node.subscribe("/sonar/responses", ARRAY)
         await ask(node, noise="<= 5 cm")
@@ -206,7 +206,7 @@ async def test_a_client_that_dies_is_forgotten(sonar: Sonar, core: RosCore) -> N
             await asyncio.sleep(0.05)
 
 
-async def test_a_profile_that_raises_or_hangs_gives_way_to_the_next_best(sonar: Sonar, client: Node) -> None:
+async def test_failed_or_hung_profile_is_replaced(sonar: Sonar, client: Node) -> None:
     responses = await client.subscribe("/sonar/responses", ARRAY)
     sonar.broken["fine"] = OSError("no such mode")
     publisher = await ask(client, noise="<= 5 cm")
@@ -230,7 +230,7 @@ async def test_a_profile_that_raises_or_hangs_gives_way_to_the_next_best(sonar: 
     await status(responses, lambda s: True)
 
 
-async def test_a_profile_chosen_by_hand_and_a_context(sonar: Sonar) -> None:
+async def test_choice_by_hand_and_context_change_the_profile(sonar: Sonar) -> None:
     async def until(profile: str) -> None:
         async with asyncio.timeout(30):
             while sonar.adapter.loop.profile != profile:
@@ -241,13 +241,13 @@ async def test_a_profile_chosen_by_hand_and_a_context(sonar: Sonar) -> None:
     await until("fine")
     sonar.adapter.pin("")
     await until("coarse")
-    sonar.adapter.shift("lab", {}, {"coarse": "not in the lab"})
+    sonar.adapter.enter_context("lab", {}, {"coarse": "not in the lab"})
     await until("fine")
-    sonar.adapter.shift("", {}, {})
+    sonar.adapter.enter_context("", {}, {})
     await until("coarse")
 
 
-async def test_the_client_api_asks_and_is_told(sonar: Sonar, client: Node) -> None:
+async def test_resource_client_requests_and_answers(sonar: Sonar, client: Node) -> None:
     async with ResourceClient(client, "sonar") as one:
         answer = await one.require(noise=at_most("5 cm", hard=True), timeout=30)
         assert answer.values["noise"].startswith("wanted at most 0.05 m")
@@ -272,7 +272,7 @@ async def test_the_client_api_asks_and_is_told(sonar: Sonar, client: Node) -> No
             await asyncio.sleep(0.05)
 
 
-async def test_a_resource_that_is_not_there_is_said(client: Node) -> None:
+async def test_missing_resource_is_unreachable(client: Node) -> None:
     async with ResourceClient(client, "nowhere") as one:
         with pytest.raises(UnreachableError, match="/nowhere"):
             await one.require(noise=at_most(1), timeout=0.2)

@@ -8,15 +8,18 @@ import pytest
 
 from rmpa.core.errors import LocalProtocolError, PeerRefused
 from rmpa.resource import limits
-from rmpa.resource.declare.resource import Output, Resource, at_least
-from rmpa.resource.run.fenced_call import Call
-from rmpa.resource.run.member import Member
+from rmpa.resource.declare.qos_request import at_least
+from rmpa.resource.declare.resource import Resource
+from rmpa.resource.run.fenced_call import FencedCall
+from rmpa.resource.run.resource_node import ResourceNode
 from rmpa.resource.run.runtime import RuntimePart
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
+
+    from rmpa.resource.declare.connections import Output
 
 
 @pytest.fixture
@@ -54,7 +57,7 @@ class Sonar:
         self.resource.profile(offers={"noise": 0.1}, cost=1)(self.coarse)
         self.resource.profile(offers={"noise": 0.5}, cost=9, name="asynchronous")(self.later)
         self.resource.adaptation(window="100 ms", apply_timeout="2 s", cool_down="60 s", dwell=0)
-        self.member = Member(self.resource, core.uri)
+        self.member = ResourceNode(self.resource, core.uri)
 
     def attempt(self, act: Callable[[], None]) -> None:
         try:
@@ -104,7 +107,7 @@ async def client(core: RosCore) -> AsyncIterator[Node]:
         yield node
 
 
-async def test_what_a_hung_profile_does_late_has_no_effect_and_is_said(
+async def test_late_actions_of_a_hung_profile_have_no_effect(
     sonar: Sonar, client: Node, caplog: pytest.LogCaptureFixture
 ) -> None:
     adapter = sonar.member.adapter
@@ -114,14 +117,14 @@ async def test_what_a_hung_profile_does_late_has_no_effect_and_is_said(
     await client.subscribe(
         "/sonar/alarms", "diagnostic_msgs/DiagnosticArray", lambda m: alarms.append(m.message.status[0].message)
     )
-    await sonar.until(lambda: adapter._publishers["alarms"].subscribers and modes)
+    await sonar.until(lambda: adapter.reports.publishers["alarms"].subscribers and modes)
     adapter.pin("fine")
     await sonar.until(sonar.hangs.is_set)
     await sonar.until(lambda: adapter.loop.profile == "coarse" and not adapter.loop.applying)
     assert sonar.device == ["coarse", "coarse"]
     # It is not begun a second time while it hangs, whatever its cool-down.
     assert "its function still runs" in adapter.explain()[0].excluded
-    await sonar.until(lambda: "the function of profile fine hangs; it was given up" in adapter._health()[1])
+    await sonar.until(lambda: "the function of profile fine hangs; it was given up" in adapter.health()[1])
     adapter.pin("coarse")
     sonar.goes_on.set()
     await sonar.until(lambda: sonar.device[2:] == ["fine", "coarse"])
@@ -132,7 +135,7 @@ async def test_what_a_hung_profile_does_late_has_no_effect_and_is_said(
         "observe noise",
         "ask /eye",
     ]
-    assert (sonar.gain.value, sonar.eye.wishes, set(modes)) == (1.0, {}, {"coarse"})
+    assert (sonar.gain.value, sonar.eye.requests, set(modes)) == (1.0, {}, {"coarse"})
     await sonar.until(lambda: len(alarms) >= 5)
     assert alarms[0] == "the function of profile fine was given up; it has no effect: publish on mode"
     assert alarms[4].startswith("the function of profile fine, which was given up, has ended after ")
@@ -140,13 +143,15 @@ async def test_what_a_hung_profile_does_late_has_no_effect_and_is_said(
     assert alarms[0] in caplog.text
     # Once, and not again and again.
     windows: list[object] = []
-    adapter.on_window.append(lambda *_: windows.append(None))
+    watcher = RuntimePart()
+    watcher.window_ended = lambda *_: windows.append(None)  # type: ignore[method-assign]
+    sonar.member.runtime.parts.append(watcher)
     await sonar.until(lambda: len(windows) >= 3)
     assert sonar.device == ["coarse", "coarse", "fine", "coarse"]
-    assert "hangs" not in adapter._health()[1]
+    assert "hangs" not in adapter.health()[1]
 
 
-async def test_a_coroutine_that_is_given_up_is_cancelled_and_nothing_is_applied_twice(sonar: Sonar) -> None:
+async def test_hung_coroutine_is_cancelled(sonar: Sonar) -> None:
     adapter = sonar.member.adapter
     adapter.pin("asynchronous")
     await sonar.until(lambda: sonar.refused)
@@ -156,20 +161,21 @@ async def test_a_coroutine_that_is_given_up_is_cancelled_and_nothing_is_applied_
     assert not adapter._applier.hanging
 
 
-async def test_a_message_that_was_on_its_way_is_dropped(sonar: Sonar) -> None:
+async def test_queued_message_of_a_hung_profile_is_dropped(sonar: Sonar) -> None:
     """It was handed to the loop before the function was given up, and arrives behind that."""
     said: list[str] = []
     sent = Sent()
-    sonar.member.add(sent)
+    sonar.member.runtime.parts.append(sent)
     raw = sonar.mode.type.serialize(sonar.mode.type.make({"data": "late"}))
-    call = Call("profile", "fine", lambda _call, what: said.append(what))
+    call = FencedCall("profile", "fine", lambda _call, what: said.append(what))
     sonar.member.runtime.send(sonar.mode, raw, call)
     call.give_up()
     sonar.member.runtime.send(sonar.mode, raw, call)
-    assert (sent.count, said) == (1, ["publish on mode"])
+    assert (sent.count, len(said)) == (1, 1)
+    assert said[0].endswith("it has no effect: publish on mode")
 
 
-async def test_a_context_that_is_given_up_has_no_effect_either(
+async def test_late_actions_of_a_hung_context_have_no_effect(
     core: RosCore, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(limits, "CONTEXT_ENTER_TIMEOUT", 0.1)
@@ -182,7 +188,7 @@ async def test_a_context_that_is_given_up_has_no_effect_either(
         over.set()
 
     one.resource.context("docked", enter=enter)
-    one.member = Member(one.resource, core.uri)
+    one.member = ResourceNode(one.resource, core.uri)
     await one.member.start()
     with pytest.raises(PeerRefused, match=r"has not ended after 0\.1 s"):
         await one.member.contexts.choose("docked")

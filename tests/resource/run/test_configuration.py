@@ -11,9 +11,10 @@ import pytest
 
 from rmpa.core.errors import ConfigError, PeerRefused
 from rmpa.resource import limits
-from rmpa.resource.declare.resource import Resource, at_least
+from rmpa.resource.declare.qos_request import at_least
+from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.dynamic_reconfigure import CONFIG_TYPE, DESCRIPTION_TYPE, SERVICE_TYPE, read_config
-from rmpa.resource.run.member import Member
+from rmpa.resource.run.resource_node import ResourceNode
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.messages import MessageType
@@ -77,7 +78,7 @@ class Lamp:
             said.publish(data=" ".join(w or "-" for w in words))
             other.publish(data="here")
 
-        self.member = Member(one, core.uri, window=0.2)
+        self.member = ResourceNode(one, core.uri, window=0.2)
 
     def _apply(self, name: str) -> Callable[[], None]:
         def apply() -> None:
@@ -140,7 +141,7 @@ async def ask(node: Node, **values: object) -> dict[str, Any]:
     return read_config(reply.config)
 
 
-async def test_parameters_are_set_together_said_once_and_mirrored(lamp: Lamp, node: Node) -> None:
+async def test_parameters_are_set_and_published_together(lamp: Lamp, node: Node) -> None:
     _, updates = await listen(node, "/lamp/parameter_updates", CONFIG_TYPE)
     _, described = await listen(node, "/lamp/parameter_descriptions", DESCRIPTION_TYPE)
     _, said = await listen(node, "/lamp/said")
@@ -167,7 +168,7 @@ async def test_parameters_are_set_together_said_once_and_mirrored(lamp: Lamp, no
             await asyncio.sleep(0.02)
 
 
-async def test_a_profile_is_chosen_by_hand_until_it_is_not(lamp: Lamp, node: Node) -> None:
+async def test_profile_is_chosen_by_hand_and_released(lamp: Lamp, node: Node) -> None:
     loop = lamp.member.adapter.loop
     await until(lambda: loop.profile == "slow", "the cheapest does not run")
     assert (await ask(node, profile="fast"))["profile"] == "fast"
@@ -184,7 +185,7 @@ async def test_a_profile_is_chosen_by_hand_until_it_is_not(lamp: Lamp, node: Nod
     await until(lambda: loop.profile == "slow", "it does not decide again")
 
 
-async def test_what_the_parameter_server_holds_counts_at_the_start(core: RosCore, node: Node) -> None:
+async def test_parameter_server_values_are_loaded(core: RosCore, node: Node) -> None:
     chosen = {"profile": "fast", "context": "away"}
     await node.set_param("/lamp", {"level": 20, "red": "much", "green": 4, "else": [1], **chosen})
     lamp = Lamp(core)
@@ -198,7 +199,7 @@ async def test_what_the_parameter_server_holds_counts_at_the_start(core: RosCore
     await lamp.member.close()
 
 
-async def test_rules_over_parameters_and_topics_choose_a_context(lamp: Lamp, node: Node) -> None:
+async def test_rules_select_a_context(lamp: Lamp, node: Node) -> None:
     _, contexts = await listen(node, "/lamp/context")
     _, said = await listen(node, "/lamp/said")
     _, other = await listen(node, "/lamp/other")
@@ -231,7 +232,7 @@ async def test_rules_over_parameters_and_topics_choose_a_context(lamp: Lamp, nod
     assert ("fast", "-") not in seen
 
 
-async def test_a_context_by_hand_stands_above_rules(lamp: Lamp, node: Node) -> None:
+async def test_choice_by_hand_overrides_rules(lamp: Lamp, node: Node) -> None:
     _, contexts = await listen(node, "/lamp/context")
     _, answers = await listen(node, "/lamp/responses", "diagnostic_msgs/DiagnosticArray")
     setter = await node.advertise("/lamp/set_context", TEXT)
@@ -272,7 +273,7 @@ async def test_a_context_that_cannot_begin_changes_nothing(
     assert contexts.current == "away"
 
 
-async def test_a_field_that_is_not_there_is_said(lamp: Lamp, node: Node) -> None:
+async def test_missing_field_of_a_rule_is_reported(lamp: Lamp, node: Node) -> None:
     charging = await node.advertise("/charging", TEXT, latch=True)
     charging.publish(charging.make({"data": "yes"}))
     battery = await node.advertise("/battery", "std_msgs/Bool", latch=True)
@@ -290,8 +291,8 @@ async def test_a_rule_over_its_own_topics(core: RosCore, node: Node) -> None:
     one.profile(offers={}, name="plain")(lambda: None)
     one.task(on=orders, name="repeat")(lambda message: said.publish(data=message.data))
     one.context("told", when="/orders == 'go' and /gauge/said.data == 'go'")
-    member = Member(one, core.uri)
-    member.contexts.chosen = "gone"  # of an earlier version of the file
+    member = ResourceNode(one, core.uri)
+    member.contexts.preset("gone")  # of an earlier version of the file
     await member.start()
     assert member.contexts.chosen == member.contexts.current == ""
     sender = await node.advertise("/orders", TEXT)

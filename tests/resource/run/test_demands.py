@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core.errors import ConfigError
-from rmpa.resource.declare.resource import Resource, at_least, at_most
+from rmpa.resource.declare.qos_request import at_least, at_most
+from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.descriptor import Descriptor
-from rmpa.resource.run.member import Member
+from rmpa.resource.run.resource_node import ResourceNode
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
 from rmpa.ros.types.diagnostic_array import DiagnosticLevel
@@ -43,32 +44,32 @@ def eye() -> Resource:
     return one
 
 
-async def test_a_controller_asks_as_much_as_its_profile_needs(core: RosCore) -> None:
+async def test_profiles_change_the_requests_to_others(core: RosCore) -> None:
     hand = Resource("hand", role="controlling", physical=False)
     hand.attribute("slip", better="min", unit="m")
     needs = hand.asks("eye", blur=at_most("4 px", hard=True), priority=2)
     hand.profile(offers={"slip": "5 cm"}, cost=1, name="coarse")(lambda: needs.ask(blur=at_most("9 px")))
     hand.profile(offers={"slip": "1 mm"}, cost=2, name="fine")(lambda: needs.ask(blur=at_most("2 px", hard=True)))
-    member = Member(hand, core.uri, window=0.2)
+    member = ResourceNode(hand, core.uri, window=0.2)
     await member.start()
-    await until(lambda: member.demands.troubles() == (["there is no resource /eye"], []), "nobody is there yet")
-    other = Member(eye(), core.uri, window=0.2)
+    await until(lambda: member.demands.problems() == (["there is no resource /eye"], []), "nobody is there yet")
+    other = ResourceNode(eye(), core.uri, window=0.2)
     await other.start()
     await until(lambda: needs.answer is not None and needs.answer.message == "profile wide", "it is answered")
-    assert member.demands.troubles() == ([], [])
+    assert member.demands.problems() == ([], [])
     member.adapter.pin("fine")
     await until(lambda: needs.answer is not None and needs.answer.message == "profile sharp", "more is asked")
     assert other.adapter.loop.requirements["/hand"].bounds["blur"].hard
     needs.ask(blur=at_most("0.1 px", hard=True))
-    await until(lambda: member.demands.troubles()[1], "it cannot be had")
+    await until(lambda: member.demands.problems()[1], "it cannot be had")
     assert needs.answer is not None
     assert needs.answer.level is DiagnosticLevel.ERROR
-    assert "/eye: non-adaptable: no profile gives blur as asked" in member.demands.troubles()[1][0]
+    assert "/eye: non-adaptable: no profile gives blur as asked" in member.demands.problems()[1][0]
     needs.ask(blurr=at_most("2 px"))
-    await until(lambda: "did you mean blur?" in "".join(member.demands.troubles()[1]), "what cannot be asked is said")
+    await until(lambda: "did you mean blur?" in "".join(member.demands.problems()[1]), "what cannot be asked is said")
     needs.ask()
     await until(lambda: not other.adapter.loop.requirements, "nothing is asked")
-    assert member.demands.troubles() == ([], [])
+    assert member.demands.problems() == ([], [])
     needs.ask(blur=at_most("2 px"))
     await until(lambda: other.adapter.loop.requirements, "something is asked again")
     # Its descriptor says what it asks at present, to everybody.
@@ -81,7 +82,7 @@ async def test_a_controller_asks_as_much_as_its_profile_needs(core: RosCore) -> 
     await other.close()
 
 
-def test_what_cannot_be_asked_is_said_where_it_is_written() -> None:
+def test_invalid_demand_is_refused() -> None:
     one = eye()
     one.asks("hand", rate=at_least("5 Hz"))
     for name, said in (

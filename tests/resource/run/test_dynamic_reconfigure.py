@@ -125,7 +125,7 @@ def test_a_profile_is_chosen_by_value_or_name() -> None:
         ({"context": "moon"}, "there is no context 'moon'; it is one of automatic, docked"),
     ],
 )
-def test_what_cannot_be_is_said(values: dict[str, Any], said: str) -> None:
+def test_invalid_value_is_refused(values: dict[str, Any], said: str) -> None:
     with pytest.raises(ConfigError) as error:
         checked({"echoes": 2, **values}, KNOWN, ONE.parameters)
     assert said in str(error.value)

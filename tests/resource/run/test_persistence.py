@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.resource import limits
-from rmpa.resource.declare.resource import Resource, at_least, at_most
+from rmpa.resource.declare.qos_request import at_least, at_most
+from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.client import ResourceClient
-from rmpa.resource.run.member import Member
+from rmpa.resource.run.resource_node import ResourceNode
+from rmpa.resource.run.runtime import RuntimePart
 from rmpa.resource.run.store import ResourceStore
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.node.node import Node
@@ -39,8 +41,8 @@ def sonar(**more: Any) -> Resource:
     return one
 
 
-async def started(core: RosCore, path: Path, resource: Resource | None = None) -> Member:
-    member = Member(resource or sonar(), core.uri, store=ResourceStore(path))
+async def started(core: RosCore, path: Path, resource: Resource | None = None) -> ResourceNode:
+    member = ResourceNode(resource or sonar(), core.uri, store=ResourceStore(path))
     await member.start()
     return member
 
@@ -51,7 +53,7 @@ async def until(fits: Any) -> None:
             await asyncio.sleep(0.01)
 
 
-async def test_the_configuration_and_what_was_chosen_are_back(core: RosCore, tmp_path: Path) -> None:
+async def test_configuration_survives_a_restart(core: RosCore, tmp_path: Path) -> None:
     path = tmp_path / "sonar.sqlite"
     first = await started(core, path)
     await first.configuration.set({"gain": 2.5, "profile": "fine", "context": "docked"})
@@ -77,9 +79,7 @@ async def test_the_configuration_and_what_was_chosen_are_back(core: RosCore, tmp
     await fourth.close()
 
 
-async def test_what_clients_asked_is_back_for_those_that_come_back(
-    core: RosCore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_requirements_survive_a_restart(core: RosCore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "sonar.sqlite"
     first = await started(core, path)
     async with Node("stays", master_uri=core.uri) as stays, ResourceClient(stays, "sonar") as one:
@@ -101,25 +101,27 @@ async def test_what_clients_asked_is_back_for_those_that_come_back(
         await again.close()
 
 
-async def test_a_latched_request_that_has_expired_does_not_come_again(core: RosCore, tmp_path: Path) -> None:
+async def test_expired_latched_request_stays_expired(core: RosCore, tmp_path: Path) -> None:
     member = await started(core, tmp_path / "sonar.sqlite")
     async with Node("client", master_uri=core.uri) as node, ResourceClient(node, "sonar") as client:
         await client.require(noise=at_most("5 cm"), expires="300 ms")
         assert "/client" in member.adapter.loop.requirements
         await until(lambda: not member.adapter.loop.requirements)
         seen: list[object] = []
-        member.adapter.on_asked.append(lambda: seen.append(dict(member.adapter.loop.requirements)))
-        assert client._asking is not None
+        watcher = RuntimePart()
+        watcher.requirements_changed = lambda: seen.append(dict(member.adapter.loop.requirements))  # type: ignore[method-assign]
+        member.runtime.parts.append(watcher)
+        assert client._requirements is not None
         again: Any = {"header": {"stamp": float(next(iter(member.adapter.clients.expiries))[1])}}
         pairs: Any = [{"key": "noise", "value": "<= 5 cm"}, {"key": "expires", "value": "300 ms"}]
-        message = client._asking.make({**again, "status": [{"name": "x", "values": pairs}]})
-        client._asking.publish(message)
+        message = client._requirements.make({**again, "status": [{"name": "x", "values": pairs}]})
+        client._requirements.publish(message)
         await asyncio.sleep(0.5)
         assert not any(seen)
     await member.close()
 
 
-async def test_a_profile_that_failed_is_not_tried_at_once_because_of_a_restart(core: RosCore, tmp_path: Path) -> None:
+async def test_cool_down_survives_a_restart(core: RosCore, tmp_path: Path) -> None:
     def broken() -> Resource:
         one = Resource("sonar", role="sensing")
         one.attribute("noise", better="min", unit="m")
@@ -136,11 +138,11 @@ async def test_a_profile_that_failed_is_not_tried_at_once_because_of_a_restart(c
     path = tmp_path / "sonar.sqlite"
     first = await started(core, path, broken())
     await until(lambda: first.adapter.loop.profile == "coarse")
-    (before,) = first.adapter.cooling(time.time_ns()).values()
+    (before,) = first.adapter.saved_cool_downs(time.time_ns()).values()
     await first.close()
     again = await started(core, path, broken())
     await until(lambda: again.adapter.loop.profile == "coarse")
-    (after,) = again.adapter.cooling(time.time_ns()).values()
+    (after,) = again.adapter.saved_cool_downs(time.time_ns()).values()
     assert after.until_ns == pytest.approx(before.until_ns, abs=2e9)
     assert (after.cool_down, after.why) == (60.0, "OSError: no bus")
     assert tried == ["fine"]
@@ -151,7 +153,7 @@ async def test_a_profile_that_failed_is_not_tried_at_once_because_of_a_restart(c
     await again.close()
 
 
-async def test_a_store_that_cannot_be_is_said_and_the_resource_runs(core: RosCore, tmp_path: Path) -> None:
+async def test_resource_runs_without_a_usable_store(core: RosCore, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     member = await started(core, tmp_path / "file" / "sonar.sqlite")
     async with Node("watcher", master_uri=core.uri) as node:

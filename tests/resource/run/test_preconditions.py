@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.resource import limits
-from rmpa.resource.declare.resource import Resource, at_most
-from rmpa.resource.run.member import Member
+from rmpa.resource.declare.qos_request import at_most
+from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.preconditions import Preconditions
+from rmpa.resource.run.resource_node import ResourceNode
+from rmpa.resource.run.runtime import RuntimePart
 from rmpa.ros.core.embedded import RosCore
 
 if TYPE_CHECKING:
@@ -40,9 +42,7 @@ def declared(needs: Callable[[], str | bool | None]) -> Resource:
     return one
 
 
-async def test_one_that_blocks_holds_up_neither_the_start_nor_the_loop(
-    core: RosCore, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_blocking_precondition_delays_nothing(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "PRECONDITION_TIMEOUT", 0.3)
     goes_on, threads = threading.Event(), set()
     calls: list[float] = []
@@ -52,13 +52,15 @@ async def test_one_that_blocks_holds_up_neither_the_start_nor_the_loop(
         threads.add(threading.get_ident())
         return goes_on.wait(40)
 
-    member = Member(declared(needs), core.uri)
+    member = ResourceNode(declared(needs), core.uri)
     await member.start()
     loop = member.adapter.loop
     windows: list[None] = []
-    member.adapter.on_window.append(lambda *_: windows.append(None))
+    watcher = RuntimePart()
+    watcher.window_ended = lambda *_: windows.append(None)  # type: ignore[method-assign]
+    member.runtime.parts.append(watcher)
     noise = member.resource.attributes["noise"]
-    member.adapter.shift("lab", {"noise": at_most("5 cm").bound(noise)}, {})
+    member.adapter.enter_context("lab", {"noise": at_most("5 cm").bound(noise)}, {})
     await until(lambda: loop.profile == "coarse")
     await until(lambda: len(windows) >= 5)
     assert member.adapter.explain()[0].excluded == "its precondition has not answered for 0.3 s"
@@ -69,10 +71,11 @@ async def test_one_that_blocks_holds_up_neither_the_start_nor_the_loop(
     await member.close()
 
 
-async def test_the_first_decision_knows_the_answers(core: RosCore) -> None:
-    member = Member(declared(lambda: "the lid is shut"), core.uri)
+async def test_first_decision_waits_for_preconditions(core: RosCore) -> None:
     applied: list[str] = []
-    member.adapter.listeners.append(lambda action: applied.append(getattr(action, "profile", "")))
+    watcher = RuntimePart()
+    watcher.acted = lambda action: applied.append(getattr(action, "profile", ""))  # type: ignore[method-assign]
+    member = ResourceNode(declared(lambda: "the lid is shut"), core.uri, observers=[watcher])
     await member.start()
     await until(lambda: applied)
     assert applied[0] == "coarse"
@@ -84,14 +87,14 @@ async def test_the_first_decision_knows_the_answers(core: RosCore) -> None:
     ("answer", "why"),
     [(True, None), (None, None), (False, "its precondition does not hold"), ("no lens", "no lens"), ("", None)],
 )
-async def test_what_an_answer_means(answer: str | bool | None, why: str | None) -> None:
+async def test_precondition_results(answer: str | bool | None, why: str | None) -> None:
     one = Preconditions(declared(lambda: answer).profiles, lambda: None)
     await one.start()
-    assert one.barred().get("fine") == why
+    assert one.blocked().get("fine") == why
     await one.close()
 
 
-async def test_one_that_raises_does_not_hold_and_another_answer_is_told() -> None:
+async def test_raising_precondition_does_not_hold() -> None:
     answers: list[Exception | bool] = [OSError("no bus"), True, True, False]
     changes: list[dict[str, str]] = []
 
@@ -101,12 +104,12 @@ async def test_one_that_raises_does_not_hold_and_another_answer_is_told() -> Non
             raise answer
         return answer
 
-    one = Preconditions(declared(needs).profiles, lambda: changes.append(one.barred()))
+    one = Preconditions(declared(needs).profiles, lambda: changes.append(one.blocked()))
     await one.start()
-    assert one.barred() == {"fine": "its precondition failed: OSError: no bus"}
+    assert one.blocked() == {"fine": "its precondition failed: OSError: no bus"}
     for left in (2, 1, 0):
-        one.look()
-        while len(answers) > left or one._asked:
+        one.check()
+        while len(answers) > left or one._calls:
             await asyncio.sleep(0.01)
     assert changes == [{}, {"fine": "its precondition does not hold"}]
     await one.close()

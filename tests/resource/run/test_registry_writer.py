@@ -8,8 +8,8 @@ import pytest
 from rmpa.resource import limits
 from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.descriptor import describe
-from rmpa.resource.run.member import Member, run_all
 from rmpa.resource.run.registry_writer import FILE
+from rmpa.resource.run.resource_node import ResourceNode, run_all
 from rmpa.resource.run.resource_registry import ResourceRegistry
 from rmpa.resource.run.store import ResourceStore, read_state
 from rmpa.ros.core.embedded import RosCore
@@ -48,7 +48,7 @@ async def until_seen(path: Path, wanted: dict[tuple[str, str], str]) -> None:
             await asyncio.sleep(0.02)
 
 
-async def test_resources_of_others_are_kept_when_all_are_gone(core: RosCore, tmp_path: Path) -> None:
+async def test_registry_keeps_resources_that_are_gone(core: RosCore, tmp_path: Path) -> None:
     stop, ready = asyncio.Event(), asyncio.Event()
     running = asyncio.create_task(run_all([declared("ear"), declared("eye")], core.uri, stop, ready.set, tmp_path))
     await asyncio.wait_for(ready.wait(), 30)
@@ -71,33 +71,30 @@ async def test_resources_of_others_are_kept_when_all_are_gone(core: RosCore, tmp
     times = {each.path: each.last_ns for each in rows}
     assert times["/lidar"] < times["/ear"]
     # They are there again for the next one, although only one of them runs.
-    again = Member(declared("ear"), core.uri)
-    again.keep_others(ResourceStore(tmp_path / FILE))
+    again = ResourceNode(declared("ear"), core.uri, registry=ResourceStore(tmp_path / FILE))
     await again.start()
-    assert again.known is not None
-    assert again.known._sightings is not None
-    assert {each.path for each in again.known._sightings.all} == {"/ear", "/eye", "/lidar"}
+    assert again.registry is not None
+    assert again.registry.registry is not None
+    assert {each.path for each in again.registry.registry.all} == {"/ear", "/eye", "/lidar"}
     await again.close()
 
 
-async def test_one_that_is_asked_for_something_is_kept_too(core: RosCore, tmp_path: Path) -> None:
+async def test_registry_shares_the_subscription_of_demands(core: RosCore, tmp_path: Path) -> None:
     """What it asks listens to that descriptor already, and a node listens to a topic once."""
-    eye, keeper = Member(declared("eye"), core.uri), declared("keeper")
+    eye, keeper = ResourceNode(declared("eye"), core.uri), declared("keeper")
     await eye.start()
     keeper.input("/eye/picture", "std_msgs/String")
     keeper.asks("eye")
-    member = Member(keeper, core.uri)
-    member.keep_others(ResourceStore(tmp_path / FILE))
+    member = ResourceNode(keeper, core.uri, registry=ResourceStore(tmp_path / FILE))
     await member.start()
     await until_seen(tmp_path / FILE, {("/keeper", "/keeper"): "keeper", ("/eye", "/eye"): "eye"})
     await member.close()
     await eye.close()
 
 
-async def test_a_disk_that_takes_nothing_is_said(core: RosCore, tmp_path: Path) -> None:
+async def test_unusable_registry_is_reported(core: RosCore, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    member = Member(declared("ear"), core.uri)
-    member.keep_others(ResourceStore(tmp_path / "file" / FILE))
+    member = ResourceNode(declared("ear"), core.uri, registry=ResourceStore(tmp_path / "file" / FILE))
     await member.start()
-    assert "other resources are not kept: " in member._troubles()[1][0]
+    assert "other resources are not kept: " in member.problems()[1][0]
     await member.close()

@@ -32,9 +32,9 @@ def kept(store: dict[tuple[str, str], str], rows: dict[tuple[str, str], str | No
 def test_what_was_seen_outlives_a_restart() -> None:
     store: dict[tuple[str, str], str] = {}
     one = ResourceRegistry()
-    assert kept(store, one.heard("/sonar", PROXY, text(), NOW)) == {DESCRIPTOR, SEEN}
-    assert kept(store, one.look({("/sonar", PROXY)}, NOW + 5 * SECOND)) == set()
-    assert kept(store, one.end()) == {SEEN}
+    assert kept(store, one.record("/sonar", PROXY, text(), NOW)) == {DESCRIPTOR, SEEN}
+    assert kept(store, one.update({("/sonar", PROXY)}, NOW + 5 * SECOND)) == set()
+    assert kept(store, one.flush()) == {SEEN}
     (found,) = ResourceRegistry(store).all
     assert (found.path, found.caller, found.descriptor.name) == ("/sonar", PROXY, "sonar")
     assert (found.first_ns, found.last_ns) == (NOW, NOW + 5 * SECOND)
@@ -42,31 +42,31 @@ def test_what_was_seen_outlives_a_restart() -> None:
 
 def test_two_of_one_name_of_two_modules_are_two() -> None:
     one = ResourceRegistry()
-    one.heard("/sonar", "/sonar", text(description="ours"), NOW)
-    one.heard("/sonar", PROXY, text(description="theirs"), NOW + 1)
+    one.record("/sonar", "/sonar", text(description="ours"), NOW)
+    one.record("/sonar", PROXY, text(description="theirs"), NOW + 1)
     assert [each.descriptor.description for each in one.all] == ["theirs", "ours"]
 
 
-def test_the_time_is_written_seldom_and_at_once_when_one_goes_or_the_clock_is_set() -> None:
+def test_times_are_written_seldom() -> None:
     store: dict[tuple[str, str], str] = {}
     one, here = ResourceRegistry(), {("/sonar", PROXY)}
-    one.heard("/sonar", PROXY, text(), NOW)
+    one.record("/sonar", PROXY, text(), NOW)
     late = NOW + int(limits.KNOWN_WRITE) * SECOND
-    assert not one.look(here, late - SECOND)
-    assert kept(store, one.look(here, late)) == {SEEN}
-    assert not one.look(here, late + SECOND)
-    assert kept(store, one.look(set(), late + 2 * SECOND)) == {SEEN}
-    assert not one.look(set(), late + 900 * SECOND)
+    assert not one.update(here, late - SECOND)
+    assert kept(store, one.update(here, late)) == {SEEN}
+    assert not one.update(here, late + SECOND)
+    assert kept(store, one.update(set(), late + 2 * SECOND)) == {SEEN}
+    assert not one.update(set(), late + 900 * SECOND)
     assert one.all[0].last_ns == late + SECOND
-    one.heard("/sonar", PROXY, text(), late)
-    assert kept(store, one.look(here, NOW - 10**9 * SECOND)) == {SEEN}
+    one.record("/sonar", PROXY, text(), late)
+    assert kept(store, one.update(here, NOW - 10**9 * SECOND)) == {SEEN}
 
 
 def test_another_descriptor_takes_the_place_of_the_last_one() -> None:
     one = ResourceRegistry()
-    one.heard("/sonar", PROXY, text(), NOW)
-    assert not one.heard("/sonar", PROXY, text(), NOW + 1)  # said again, as a module's own is: nothing to write
-    assert (DESCRIPTOR, f"/sonar {PROXY}") in one.heard("/sonar", PROXY, text(description="new"), NOW + 2)
+    one.record("/sonar", PROXY, text(), NOW)
+    assert not one.record("/sonar", PROXY, text(), NOW + 1)  # said again, as a module's own is: nothing to write
+    assert (DESCRIPTOR, f"/sonar {PROXY}") in one.record("/sonar", PROXY, text(description="new"), NOW + 2)
     (found,) = one.all
     assert (found.descriptor.description, found.first_ns) == ("new", NOW)
 
@@ -76,18 +76,18 @@ def test_the_oldest_gives_way(monkeypatch: pytest.MonkeyPatch) -> None:
     store: dict[tuple[str, str], str] = {}
     one = ResourceRegistry()
     for number in range(5):
-        kept(store, one.heard(f"/r{number}", f"/r{number}", text(f"r{number}"), NOW + number))
+        kept(store, one.record(f"/r{number}", f"/r{number}", text(f"r{number}"), NOW + number))
     assert [each.path for each in one.all] == ["/r4", "/r3", "/r2"]
     assert len(store) == 6
     monkeypatch.setattr(limits, "KNOWN_TEXT_MAX", len(text("r9")) + 10)
-    kept(store, one.heard("/r9", "/r9", text("r9"), NOW + 9))
+    kept(store, one.record("/r9", "/r9", text("r9"), NOW + 9))
     assert [each.path for each in ResourceRegistry(store).all] == ["/r9"]
 
 
 def test_what_is_no_descriptor_is_refused_and_nothing_is_kept() -> None:
     one = ResourceRegistry()
     with pytest.raises(RmpaError):
-        one.heard("/strange", "/strange", "{}", NOW)
+        one.record("/strange", "/strange", "{}", NOW)
     assert not one.all
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rmpa.core.errors import LocalProtocolError
-from rmpa.resource.declare.resource import Input, Output, Resource
+from rmpa.resource.declare.resource import Resource
 from rmpa.resource.run.descriptor import Descriptor
 from rmpa.resource.run.runtime import Runtime, RuntimePart
 from rmpa.ros.core.embedded import RosCore
@@ -16,6 +16,7 @@ from rmpa.ros.types.messages import MessageError
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from rmpa.resource.declare.connections import Input, Output
     from rmpa.ros.node.topics import Received
 
 
@@ -64,8 +65,7 @@ class Ear(RuntimePart):
 async def test_a_resource_is_an_ordinary_node_of_its_core(core: RosCore, one: Resource) -> None:
     runtime = Runtime(one, Node("speaker", master_uri=core.uri))
     ear = Ear()
-    runtime.parts.append(ear)
-    await runtime.start()
+    await runtime.start([ear])
     async with Node("listener", master_uri=core.uri) as node, asyncio.timeout(20):
         words = await node.subscribe("/speaker/words", "std_msgs/String")
         described = await node.subscribe("/speaker/descriptor", "std_msgs/String")
@@ -93,7 +93,7 @@ async def test_a_resource_is_an_ordinary_node_of_its_core(core: RosCore, one: Re
         one.outputs["words"].publish(data="too late")
 
 
-async def test_a_message_that_does_not_fit_is_refused_where_it_is_published(core: RosCore, one: Resource) -> None:
+async def test_publish_refuses_a_message_of_another_type(core: RosCore, one: Resource) -> None:
     runtime = Runtime(one, Node("speaker", master_uri=core.uri))
     await runtime.start()
     words = one.outputs["words"]
@@ -108,11 +108,10 @@ async def test_a_message_that_does_not_fit_is_refused_where_it_is_published(core
         await runtime.close()
 
 
-async def test_what_is_published_while_a_profile_is_applied_waits(core: RosCore, one: Resource) -> None:
+async def test_messages_are_held_while_a_profile_is_applied(core: RosCore, one: Resource) -> None:
     runtime = Runtime(one, Node("speaker", master_uri=core.uri))
     ear = Ear()
-    runtime.parts.append(ear)
-    await runtime.start()
+    await runtime.start([ear])
     words = one.outputs["words"]
     try:
         runtime.hold()
@@ -128,14 +127,13 @@ async def test_what_is_published_while_a_profile_is_applied_waits(core: RosCore,
         await runtime.close()
 
 
-async def test_what_waits_is_bounded_and_the_oldest_gives_way(
+async def test_held_messages_are_bounded_drop_oldest(
     core: RosCore, one: Resource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("rmpa.resource.limits.RESOURCE_HELD_MAX", 40)
     runtime = Runtime(one, Node("speaker", master_uri=core.uri))
     ear = Ear()
-    runtime.parts.append(ear)
-    await runtime.start()
+    await runtime.start([ear])
     try:
         runtime.hold()
         for _ in range(10):
@@ -156,8 +154,7 @@ async def test_messages_are_numbered_so_that_losses_are_seen(core: RosCore) -> N
         def published(self, output: Output, raw: bytes, now_ns: int) -> None:
             sent.append(int.from_bytes(raw[:4], "little"))
 
-    runtime.parts.append(Eye())
-    await runtime.start()
+    await runtime.start([Eye()])
     try:
         again = smells.type.make({"range": 1.0})
         smells.publish(range=1.0)

@@ -23,7 +23,7 @@ def test_a_time_that_is_a_whole_period_past_is_left_out() -> None:
 
 
 @given(st.floats(1e-4, 10), st.lists(st.floats(0, 100), max_size=30))
-def test_every_time_is_there_once_or_missed(period: float, works: list[float]) -> None:
+def test_each_due_time_is_met_or_missed(period: float, works: list[float]) -> None:
     schedule = Schedule(period, 0.0)
     now, dues = 0.0, []
     for work in works:

@@ -8,7 +8,8 @@ import pytest
 
 from rmpa.resource import limits
 from rmpa.resource.run import store as store_module
-from rmpa.resource.run.store import ResourceStore, module_dir, state_dir
+from rmpa.resource.run.store import ResourceStore
+from rmpa.runtime.state_dir import module_dir, state_dir
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,7 +35,7 @@ def read(path: Path, query: str) -> list[tuple[object, ...]]:
     return rows
 
 
-def test_where_a_store_lies(tmp_path: Path) -> None:
+def test_path_of_the_state(tmp_path: Path) -> None:
     assert str(state_dir({"HOME": "/h"})) == "/h/.local/state/rmpa"
     assert str(state_dir({"HOME": "/h", "XDG_STATE_HOME": "/x"})) == "/x/rmpa"
     assert str(state_dir({"HOME": "/h", "RMPA_STATE_DIR": "/r"})) == "/r"
@@ -43,7 +44,7 @@ def test_where_a_store_lies(tmp_path: Path) -> None:
     assert module_dir(tmp_path, "../a b") == tmp_path / "_a_b"
 
 
-async def test_what_is_put_survives_and_what_is_taken_back_does_not(path: Path) -> None:
+async def test_state_survives_and_deleted_rows_do_not(path: Path) -> None:
     store = ResourceStore(path)
     assert await store.open() == {}
     store.put(GAIN, "2.5")
@@ -76,9 +77,7 @@ async def test_the_history_is_bounded(path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("damage", [b"this is no data base", b"", "middle", "newer"])
-async def test_a_damaged_file_is_set_aside_and_said(
-    path: Path, damage: bytes | str, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_damaged_file_is_renamed(path: Path, damage: bytes | str, caplog: pytest.LogCaptureFixture) -> None:
     store = ResourceStore(path)
     await store.open()
     store.put(GAIN, "2.5")
@@ -104,9 +103,7 @@ async def test_a_damaged_file_is_set_aside_and_said(
     assert again.problem == ""
 
 
-async def test_one_that_is_damaged_or_removed_while_it_runs_is_begun_anew_with_all_that_is_known(
-    path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_removed_file_is_written_anew(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     store = ResourceStore(path, interval=0.02)
     await store.open()
     store.put(GAIN, "2.5")
@@ -119,7 +116,7 @@ async def test_one_that_is_damaged_or_removed_while_it_runs_is_begun_anew_with_a
     assert "was taken away" in caplog.text
 
 
-async def test_a_full_disk_is_said_once_and_lived_with(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+async def test_full_disk_is_reported_once(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     store = ResourceStore(path, interval=0.02, bytes_max=32 * 4096)
     await store.open()
@@ -136,7 +133,7 @@ async def test_a_full_disk_is_said_once_and_lived_with(path: Path, caplog: pytes
     assert "everything is kept again" in caplog.text
 
 
-async def test_no_place_and_a_place_in_use_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+async def test_unusable_path_and_used_file_are_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "file").touch()
     nowhere = ResourceStore(tmp_path / "file" / "sonar.sqlite", interval=0.02)
     assert await nowhere.open() == {}

@@ -10,10 +10,13 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rmpa.resource.declare.resource import Resource
-from rmpa.resource.run.tasks import TaskProblem, Tasks
+from rmpa.resource.run.tasks import Tasks
+from rmpa.ros.types.diagnostic_array import DiagnosticLevel
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
+
+    from rmpa.resource.run.task_runners import TaskProblem
 
 
 class Bench:
@@ -91,7 +94,7 @@ async def test_a_periodic_task_keeps_to_its_schedule(bench: Bench, kind: str) ->
 
 
 @pytest.mark.parametrize("kind", ["thread", "coroutine"])
-async def test_a_task_follows_the_parameter_that_is_its_rate(bench: Bench, kind: str) -> None:
+async def test_task_follows_its_rate_parameter(bench: Bench, kind: str) -> None:
     rate = bench.resource.parameter("hz", 0.01, low=0.01, high=500, unit="Hz")
     count = Counter(21)
 
@@ -121,7 +124,7 @@ async def test_a_task_follows_the_parameter_that_is_its_rate(bench: Bench, kind:
 
 
 @pytest.mark.parametrize("kind", ["thread", "coroutine"])
-async def test_a_task_that_raises_is_reported_and_goes_on(bench: Bench, kind: str) -> None:
+async def test_failing_task_is_restarted(bench: Bench, kind: str) -> None:
     count = Counter(4)
 
     def fail_twice() -> None:
@@ -156,7 +159,7 @@ async def test_a_task_can_end_at_its_first_failure(bench: Bench, kind: str) -> N
 
 
 @pytest.mark.parametrize("kind", ["thread", "coroutine"])
-async def test_a_task_that_is_stuck_is_reported_and_replaced(bench: Bench, kind: str) -> None:
+async def test_stuck_task_is_replaced(bench: Bench, kind: str) -> None:
     count = Counter(3)
     free = threading.Event()
 
@@ -174,16 +177,16 @@ async def test_a_task_that_is_stuck_is_reported_and_replaced(bench: Bench, kind:
     bench.tasks.activate()
     assert "a run has not ended for" in (await bench.problem("stuck")).text
     assert list(bench.tasks.running.values()) == ["stuck"], "until a run has come back"
-    (trouble,) = bench.tasks.troubles
+    (trouble,) = bench.tasks.problems
     assert "stuck: a run has not ended for" in trouble
     await count.wait()
     free.set()
     async with asyncio.timeout(30):
-        while bench.tasks.troubles:
+        while bench.tasks.problems:
             await asyncio.sleep(0.01)
 
 
-async def test_a_task_that_is_stuck_again_and_again_is_begun_ever_less_often(bench: Bench) -> None:
+async def test_repeatedly_stuck_task_backs_off(bench: Bench) -> None:
     count, free = Counter(5), threading.Event()
 
     def plain() -> None:
@@ -200,7 +203,7 @@ async def test_a_task_that_is_stuck_again_and_again_is_begun_ever_less_often(ben
 
 
 @pytest.mark.parametrize("kind", ["thread", "coroutine"])
-async def test_a_task_that_overruns_its_period_is_reported_once_and_goes_on(bench: Bench, kind: str) -> None:
+async def test_overruns_are_reported_once(bench: Bench, kind: str) -> None:
     slow = threading.Event()
     slow.set()
     count = Counter(4)
@@ -218,21 +221,21 @@ async def test_a_task_that_overruns_its_period_is_reported_once_and_goes_on(benc
     bench.resource.task(rate=100, name="t")(plain if kind == "thread" else coroutine)
     bench.tasks.activate()
     await count.wait()
-    bench.tasks.judge()
+    bench.tasks.window_ended(DiagnosticLevel.OK, "", {})
     assert bench.problems == [], "one window may be the machine's business"
     for _ in range(2):
         count = Counter(4)
         await count.wait()
-        bench.tasks.judge()
+        bench.tasks.window_ended(DiagnosticLevel.OK, "", {})
     assert [problem.kind for problem in bench.problems] == ["too slow"]
-    (trouble,) = bench.tasks.troubles
+    (trouble,) = bench.tasks.problems
     assert "task t too slow:" in trouble
     assert "runs took longer than its period of 0.01 s" in trouble
     slow.clear()
     async with asyncio.timeout(60):
-        while bench.tasks.troubles:
+        while bench.tasks.problems:
             await asyncio.sleep(0.1)
-            bench.tasks.judge()
+            bench.tasks.window_ended(DiagnosticLevel.OK, "", {})
 
 
 async def test_the_same_failure_has_one_traceback(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
@@ -286,7 +289,7 @@ async def test_a_task_on_an_input_gets_the_newest_messages(bench: Bench, kind: s
 
 
 @pytest.mark.parametrize("kind", ["thread", "coroutine"])
-async def test_between_pause_and_resume_no_run_is_under_way(bench: Bench, kind: str) -> None:
+async def test_no_task_runs_while_paused(bench: Bench, kind: str) -> None:
     count = Counter(20)
     within: list[int] = []
     lock = threading.Lock()
@@ -319,7 +322,7 @@ async def test_between_pause_and_resume_no_run_is_under_way(bench: Bench, kind: 
 
 
 @pytest.mark.parametrize("kind", ["thread", "coroutine"])
-async def test_a_task_that_leaves_by_the_back_door_is_seen_and_goes_on(bench: Bench, kind: str) -> None:
+async def test_system_exit_in_a_task_is_a_failure(bench: Bench, kind: str) -> None:
     count = Counter(2)
 
     def plain() -> None:

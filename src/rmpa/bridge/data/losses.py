@@ -103,7 +103,7 @@ class _Record:
         """Messages of the ended numbering, as far as is known."""
         if self.ended is None:
             return 0
-        return self.ended.told if self.wished else self.ended.lost()
+        return self.ended.seen_as_gaps if self.wished else self.ended.lost()
 
 
 class LossRecords:
@@ -154,12 +154,12 @@ class LossRecords:
         ended, record.ended = record.ended, None
         if ended.epoch == epoch:
             record.settled += ended.lost(after)
-            return Missed(ended.untold(after), record.at_least)
+            return Missed(ended.unseen(after), record.at_least)
         if inherited and not epoch and not record.wished:
             record.settled += ended.lost()
-            return Missed(ended.untold(), record.at_least)
+            return Missed(ended.unseen(), record.at_least)
         # It did not want what it has not got, or it has forgotten what it had.
-        record.settled += ended.told if record.wished or not epoch else ended.lost()
+        record.settled += ended.seen_as_gaps if record.wished or not epoch else ended.lost()
         if not record.settled:
             del self._records[peer, source]
         return None
@@ -173,7 +173,7 @@ class LossRecords:
         """A peer that was away has not asked for what it missed: nobody there wants that."""
         for (owner, source), record in list(self._records.items()):
             if owner == peer and record.ended is not None:
-                record.settled += record.ended.told
+                record.settled += record.ended.seen_as_gaps
                 record.ended = None
                 if not record.settled:
                     del self._records[owner, source]

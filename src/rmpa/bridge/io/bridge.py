@@ -59,12 +59,12 @@ from rmpa.runtime.event_loop import yield_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rmpa.bridge.data.io.flows import ExportFlow
+    from rmpa.bridge.data.io.export_flow import ExportFlow
     from rmpa.bridge.data.qos_events import QosEvent
     from rmpa.bridge.relay import Place
     from rmpa.bridge.session.part import DataHandler, Part
     from rmpa.config.settings import Settings
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.mesh.io.link import PeerLink
     from rmpa.ros.core.api import Core
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
@@ -79,7 +79,7 @@ class PeerSession:
     """One link and what came of it."""
 
     peer: int
-    link: MeshLink
+    link: PeerLink
     inbound: PeerProxies
     away: asyncio.TimerHandle | None = None
     """Runs while the link is gone and reliable routes wait for the peer; ``link`` is the last one."""
@@ -152,7 +152,7 @@ class Bridge:
         self._absent = AbsentPeers(lambda peer: self._act(self._exports.unclaimed(peer)), self._outbound.forget)
         self._numbers = itertools.count(1)
         self._by_number: dict[int, PeerSession] = {}
-        self._by_link: dict[MeshLink, PeerSession] = {}
+        self._by_link: dict[PeerLink, PeerSession] = {}
         self._closing: set[asyncio.Task[None]] = set()
         self._timer: asyncio.TimerHandle | None = None
         self._ticker: asyncio.TimerHandle | None = None
@@ -265,7 +265,7 @@ class Bridge:
 
     # --- the mesh's side ---------------------------------------------------------------------------------------
 
-    def link_up(self, link: MeshLink) -> None:
+    def link_up(self, link: PeerLink) -> None:
         """A link is up: tell what we have, and let what it has appear, or go on where its last link ended."""
         back = self._claim(link)
         if back is not None:
@@ -333,7 +333,7 @@ class Bridge:
         for part in self._parts:
             part.link_up(attached)
 
-    def link_down(self, link: MeshLink) -> None:
+    def link_down(self, link: PeerLink) -> None:
         """A link is gone: retract what came over it, but for what a reliable route brings back."""
         attached = self._by_link.pop(link, None)
         if attached is None:
@@ -405,13 +405,13 @@ class Bridge:
         self._act(self._exports.unclaimed(attached.peer))
         self._outbound.unclaimed(attached.peer)
 
-    def clock(self, link: MeshLink) -> None:
+    def clock(self, link: PeerLink) -> None:
         """A link knows its peer's clock better."""
         attached = self._by_link.get(link)
         if attached is not None:
             attached.inbound.time.set(link.clock_offset, link.clock_error)
 
-    def lane_lost(self, link: MeshLink) -> None:
+    def lane_lost(self, link: PeerLink) -> None:
         """A link has lost its bulk lane's connection, and half a message perhaps on either side."""
         attached = self._by_link.get(link)
         if attached is not None:
@@ -422,7 +422,7 @@ class Bridge:
             for part in self._parts:
                 part.lane_lost(attached)
 
-    def mark(self, link: MeshLink, kind: FrameKind, route: int, sequence: int) -> None:
+    def mark(self, link: PeerLink, kind: FrameKind, route: int, sequence: int) -> None:
         """An acknowledgement or the answer to a fence came; one for a route that was closed meanwhile is dropped."""
         attached = self._by_link.get(link)
         leg = self._outbound.leg(attached.peer, route) if attached is not None else None
@@ -433,7 +433,7 @@ class Bridge:
         elif kind is FrameKind.FENCED:
             leg.fenced(sequence)
 
-    def control(self, link: MeshLink, payload: bytes | bytearray | memoryview) -> None:
+    def control(self, link: PeerLink, payload: bytes | bytearray | memoryview) -> None:
         """A control frame came.
 
         Raises:
@@ -456,7 +456,7 @@ class Bridge:
         while self._learning_bytes > limits.ADVERTISED_WAITING_BYTES:
             self._learn(*self._learning.popleft())
 
-    def data(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
+    def data(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, payload: memoryview) -> None:
         """A data frame came: the hot path. One for a route that was closed meanwhile is dropped."""
         attached = self._by_link.get(link)
         flow: DataHandler | None = attached.inbound.flows.get(route) if attached is not None else None
@@ -471,7 +471,7 @@ class Bridge:
             )
         flow.message(sequence, stamp_ns, payload)
 
-    def part(self, link: MeshLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
+    def part(self, link: PeerLink, route: int, sequence: int, stamp_ns: int, flags: int, part: memoryview) -> None:
         """A part of a large message came; one for a route that was closed meanwhile is dropped."""
         attached = self._by_link.get(link)
         if attached is None:
@@ -515,7 +515,7 @@ class Bridge:
         who = f"{attached.link.name}: {source}"
         self._warn("mismatch.remote", who, f"{who}: {message.text}")
 
-    def _claim(self, link: MeshLink) -> PeerSession | None:
+    def _claim(self, link: PeerLink) -> PeerSession | None:
         """The peer that was away, if it is this one; another instance in its place shows that it will not come."""
         for attached in list(self._by_number.values()):
             if attached.away is None:

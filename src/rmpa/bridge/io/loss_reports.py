@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rmpa.bridge.data.io.absent_peers import AbsentPeers
-    from rmpa.bridge.data.io.flows import ExportFlow
+    from rmpa.bridge.data.io.export_flow import ExportFlow
     from rmpa.bridge.io.bridge import PeerSession
     from rmpa.bridge.session.peer_rpc import PeerRpc
     from rmpa.bridge.topics.exports import Exports

@@ -20,6 +20,7 @@ from rmpa.bridge import limits
 from rmpa.bridge.messages import Notification, Request, Response, encode
 from rmpa.bridge.session.part import Part
 from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
+from rmpa.core.sizes import UINT32_MAX
 from rmpa.mesh import limits as mesh_limits
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ class PeerRpc(Part):
 
     def __init__(self, counters: Counters) -> None:
         self._counters = counters
-        self._numbers = itertools.cycle(range(1, 1 << 32))
+        self._numbers = itertools.cycle(range(1, UINT32_MAX + 1))
         self._waiting: dict[tuple[int, int], tuple[asyncio.Future[Any], str]] = {}
         self._handlers: dict[str, Handler] = {}
         self._listeners: dict[str, Listener] = {}

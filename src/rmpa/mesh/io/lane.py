@@ -1,6 +1,6 @@
-"""The sending end of one lane: where a route's messages go, whether its connection stands or not.
+"""The sending end of one lane of a link, whether the lane has its connection or not.
 
-What is sent while there is no connection waits within the lane's bounds, and leaves first when there is one.
+What is sent while there is no connection waits within the lane's bounds, and is sent first when there is one.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.core import limits as core_limits
 from rmpa.core.outbox import FIRST, LAST, Outbox, QueuedMessage
+from rmpa.core.serial_number import SERIAL_MASK
 from rmpa.mesh import limits
 from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pack_fragment_header
 
@@ -28,9 +29,10 @@ class LaneSender:
         self.name = name
         self.outbox = Outbox(core_limits.ROUTE_QUEUE_MESSAGES, limits.LINK_QUEUE_BYTES, frame=pack_fragment_header)
         self.ended = False
-        """Whether the link is leaving: nothing is sent, nothing waits."""
+        """Whether the link is closing: nothing is sent or queued any more."""
         self._stream: Stream | None = None
         self._open: dict[int, QueuedMessage] = {}
+        """By route: messages that were begun by ``open``."""
         self._loop = asyncio.get_running_loop()
 
     @property
@@ -44,7 +46,7 @@ class LaneSender:
         stream.adopt(self.outbox, pack_fragment_header)
 
     def disconnect(self) -> int:
-        """The connection is gone; return how many messages were torn, those on their way not counted."""
+        """The connection is gone; return how many messages were cut in two, those in the kernel not counted."""
         self._stream = None
         for parcel in self._open.values():
             if 0 < parcel.sent < parcel.size:
@@ -53,12 +55,12 @@ class LaneSender:
         return self.outbox.reset()
 
     def end(self) -> None:
-        """The link leaves; what waits has its drain time to follow."""
+        """The link closes; what waits is sent within the drain time."""
         self.ended = True
         self._stream = None
 
     def clear(self) -> None:
-        """The link is gone: let go of what its drain time was too short for."""
+        """The link is gone: drop what the drain time was too short for."""
         self.outbox.clear()
         self._open.clear()
 
@@ -72,7 +74,7 @@ class LaneSender:
             payload: Its bytes, not kept after the call.
 
         Returns:
-            How many older messages were dropped to make room. Without effect (0) once the link is leaving.
+            How many older messages were dropped to make room. Without effect (0) once the link is closing.
         """
         size = len(payload)
         if size > core_limits.FRAGMENT_BYTES:
@@ -88,7 +90,7 @@ class LaneSender:
         return parcel
 
     def _parcel(self, route: int, size: int, sequence: int, stamp_ns: int) -> QueuedMessage:
-        return QueuedMessage(route, size, sequence & 0xFFFFFFFF, stamp_ns, self._loop.time())
+        return QueuedMessage(route, size, sequence & SERIAL_MASK, stamp_ns, self._loop.time())
 
     def extend(self, parcel: QueuedMessage, data: Buffer) -> int:
         """Send further bytes of a message; return as for ``send``."""
@@ -122,7 +124,7 @@ class LaneSender:
         self.outbox.set_terms(route, depth, max_age, strict=strict, spared=max_age is None)
 
     def discard(self, route: int) -> None:
-        """Let go of what waits of a route, and of its terms; it goes on."""
+        """Drop what waits of a route, and its bounds; the route goes on."""
         self.outbox.discard(route)
         self._open.pop(route, None)
         if self._stream is not None:

@@ -1,4 +1,4 @@
-"""What a link's socket is asked for, and what the system does not grant."""
+"""Options and kernel statistics of the connections' sockets."""
 
 from __future__ import annotations
 
@@ -29,20 +29,17 @@ _TIME_STAMPS: Final = 12
 
 
 def tune_express(sock: socket.socket, lanes: LaneSettings, counters: Counters) -> None:
-    """Set up the express lane: no Nagle, dead peers noticed, little waits in the kernel, first in every queue."""
+    """Set up the express lane: no Nagle, a time-out for dead peers, a short kernel queue, a high priority."""
     _tune(sock, limits.LINK_UNSENT_BYTES, lanes.express_dscp, lanes.express_priority, counters)
 
 
 def tune_bulk(sock: socket.socket, lanes: LaneSettings, counters: Counters) -> None:
-    """Set up the bulk lane: as little as possible waits in the kernel, behind everything else."""
+    """Set up the bulk lane: the shortest kernel queue, a low priority."""
     _tune(sock, limits.BULK_UNSENT_BYTES, lanes.bulk_dscp, lanes.bulk_priority, counters)
 
 
 def unacknowledged(sock: socket.socket) -> int:
-    """Bytes that were sent and that the other side's kernel has not acknowledged, those not sent yet included.
-
-    0 for a socket that is closed.
-    """
+    """Bytes written to a socket that the remote kernel has not acknowledged, unsent ones included; 0 if closed."""
     if sock.fileno() < 0:
         return 0
     try:
@@ -52,7 +49,7 @@ def unacknowledged(sock: socket.socket) -> int:
 
 
 def sample(sock: socket.socket) -> TcpSample | None:
-    """How the data of a connection gets on; ``None`` where the kernel does not tell, or the socket is closed."""
+    """The kernel's statistics of a connection; ``None`` where it has none, or the socket is closed."""
     try:
         info = sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _INFO_BYTES)
         return TcpSample(
@@ -78,7 +75,7 @@ def packet_bytes(sock: socket.socket) -> int | None:
 
 
 def limit_segments(sock: socket.socket, segment: int, counters: Counters) -> None:
-    """Before it connects: both sides send segments of at most so many bytes (TCP_MAXSEG)."""
+    """Before connecting: let both sides send segments of at most ``segment`` bytes (TCP_MAXSEG)."""
     try:
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, segment + _TIME_STAMPS)
     except OSError:
@@ -86,7 +83,7 @@ def limit_segments(sock: socket.socket, segment: int, counters: Counters) -> Non
 
 
 def reset_at_close(sock: socket.socket) -> None:
-    """Let ``close`` throw away what waits and reset the connection: an orderly end would wait behind lost data."""
+    """Let ``close`` drop what waits and reset the connection: an orderly end would wait behind lost data."""
     with contextlib.suppress(OSError):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 

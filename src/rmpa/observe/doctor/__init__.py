@@ -1,1 +1,1 @@
-"""TODO room."""
+"""What ``rmpa doctor`` reads of a machine, and what that means."""

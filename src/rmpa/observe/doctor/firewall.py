@@ -1,7 +1,7 @@
-"""Reads the rules of nftables and iptables for signs that they keep agents apart.
+"""Searches the rules of nftables and iptables for signs that they drop agents' packets.
 
-Signs, not proofs: what a packet meets is decided by the whole set of rules. A chain that drops what no rule lets in,
-and rules that name our ports, are what is looked for; the check of multicast sends a packet besides.
+These are signs, not proofs: only all rules together decide about a packet. A sign is a chain for incoming packets
+whose policy is to drop, or a rule that names a port of ours. The multicast check sends a real packet besides.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import re
 from dataclasses import dataclass, field
 from typing import Final
 
-from rmpa.observe.doctor.finding import Finding, FindingLevel
+from rmpa.observe.check import FAIL, OK, WARN, Check
 
 _DROPS: Final = re.compile(r"\b(drop|reject|DROP|REJECT)\b")
 _ACCEPTS: Final = re.compile(r"\b(accept|ACCEPT)\b")
@@ -22,14 +22,14 @@ _NUMBER: Final = re.compile(r"\b\d{1,5}\b")
 
 @dataclass(slots=True)
 class FirewallRules:
-    """What is looked for in a set of rules.
+    """The signs found in a set of rules.
 
     Args:
-        source: The program that showed them.
-        closed: Chains for what comes in whose policy is to drop it.
-        drops: Rules that drop what is for a port of ours.
-        accepts: Rules that let such in.
-        count: Of all rules.
+        source: The program that printed them.
+        closed: Chains for incoming packets whose policy is to drop.
+        drops: Rules that drop packets for a port of ours.
+        accepts: Rules that accept packets for a port of ours.
+        count: The number of all rules.
     """
 
     source: str
@@ -38,8 +38,8 @@ class FirewallRules:
     accepts: list[str] = field(default_factory=list)
     count: int = 0
 
-    def take(self, rule: str, ports: frozenset[int]) -> None:
-        """Look at one rule."""
+    def add(self, rule: str, ports: frozenset[int]) -> None:
+        """Count one rule, and keep it if it names a port of ours."""
         self.count += 1
         if not names_port(rule, ports):
             return
@@ -50,7 +50,7 @@ class FirewallRules:
 
 
 def names_port(rule: str, ports: frozenset[int]) -> bool:
-    """Whether a rule is about one of the ports, by number or within a range."""
+    """Whether a rule names one of the ports as destination, by number or within a range."""
     _, found, behind = rule.partition("dport")
     if not found:
         return False
@@ -61,7 +61,7 @@ def names_port(rule: str, ports: frozenset[int]) -> bool:
 
 
 def read_nft(text: str, ports: frozenset[int]) -> FirewallRules:
-    """Read what ``nft list ruleset`` prints."""
+    """Parse the output of ``nft list ruleset``."""
     rules = FirewallRules("nft")
     table = chain = ""
     for line in map(str.strip, text.splitlines()):
@@ -72,39 +72,35 @@ def read_nft(text: str, ports: frozenset[int]) -> FirewallRules:
             if hook[1] == "drop":
                 rules.closed.append(f"{table} {chain}".strip())
         elif line and line != "}" and chain and not line.startswith("type "):
-            rules.take(line, ports)
+            rules.add(line, ports)
     return rules
 
 
 def read_iptables(text: str, ports: frozenset[int]) -> FirewallRules:
-    """Read what ``iptables -S`` prints."""
+    """Parse the output of ``iptables -S``."""
     rules = FirewallRules("iptables")
     for line in map(str.strip, text.splitlines()):
         if line in ("-P INPUT DROP", "-P INPUT REJECT"):
             rules.closed.append("INPUT")
         elif line.startswith("-A "):
-            rules.take(line, ports)
+            rules.add(line, ports)
     return rules
 
 
-def judge_rules(rules: FirewallRules, ports: str) -> Finding:
-    """Say what the rules mean for agents.
+def judge_rules(rules: FirewallRules, ports: str) -> Check:
+    """Whether the rules let agents' packets in.
 
     Args:
-        rules: As read.
-        ports: Those that must be open, ready to read.
+        rules: As parsed.
+        ports: The ports that must be open, ready to read.
     """
     if rules.drops:
         remedy = f"take it out, or let {ports} in before it"
-        return Finding(
-            "firewall", rules.source, FindingLevel.FAIL, f"drops what agents send: {rules.drops[0]}", remedy
-        )
+        return Check("firewall", FAIL, f"drops what agents send: {rules.drops[0]}", remedy, where=rules.source)
     if rules.closed and not rules.accepts:
         text = f"{', '.join(rules.closed)} drops what no rule lets in, and no rule names our ports"
         remedy = f"let in {ports}; `rmpa up --port N` gives the mesh a port that rules can name"
-        return Finding("firewall", rules.source, FindingLevel.WARN, text, remedy)
+        return Check("firewall", WARN, text, remedy, where=rules.source)
     if rules.closed:
-        return Finding("firewall", rules.source, FindingLevel.OK, f"lets ours in: {rules.accepts[0]}")
-    return Finding(
-        "firewall", rules.source, FindingLevel.OK, f"{rules.count} rules, and none against agents that we see"
-    )
+        return Check("firewall", OK, f"lets ours in: {rules.accepts[0]}", where=rules.source)
+    return Check("firewall", OK, f"{rules.count} rules, and none against agents that we see", where=rules.source)

@@ -1,4 +1,4 @@
-"""Judges the network: interfaces, multicast on each, routes, filters of the kernel, ports."""
+"""Judges the network: interfaces, multicast on each, filters of the kernel, routes, ports."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rmpa.observe.doctor.finding import Finding, FindingLevel
+from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _CONTAINERS: Final = re.compile(r"(docker|br-|veth|virbr|lxc|lxd|cni|flannel|podman|cali)")
 _TUNNELS: Final = re.compile(r"(tun|tap|wg|zt|tailscale|ppp|utun|nordlynx|proton)")
 _STRICT: Final = 1
-"""Of rp_filter: packets must come by the way that answers would go (RFC 3704)."""
+"""The value of rp_filter that drops a packet whose answer would leave by another interface (RFC 3704)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,163 +42,155 @@ class NetworkInterface:
 
 @dataclass(frozen=True, slots=True)
 class MulticastEcho:
-    """What became of a packet that an interface sent to ourselves.
+    """Whether a packet that was sent to the group on an interface was received there.
 
     Args:
-        card: The interface's name.
-        problem: Why it could not be sent or joined; empty if it could.
-        after: Seconds until it was heard; ``None`` if it was not.
+        interface: Its name.
+        problem: Why it could not be sent, or the group not be joined; empty if nothing failed.
+        after: Seconds until it was received; ``None`` if it was not.
     """
 
-    card: str
+    interface: str
     problem: str = ""
     after: float | None = None
 
 
-def judge_cards(
-    cards: Sequence[NetworkInterface], wanted: Sequence[str], *, container: bool = False
-) -> list[Finding]:
-    """Which interfaces there are for agents, and which of them are not what they seem.
+def judge_interfaces(
+    interfaces: Sequence[NetworkInterface], wanted: Sequence[str], *, container: bool = False
+) -> list[Check]:
+    """Which interfaces an agent can use, and which of these are likely to make trouble.
 
     Args:
-        cards: All.
-        wanted: Those that the settings name; empty for all usable ones.
-        container: Whether this is a container with a network of its own.
+        interfaces: All of them.
+        wanted: The names that the settings give; empty for all that can be used.
+        container: Whether this is a container with a network namespace of its own.
     """
     found = []
-    missing = [name for name in wanted if name not in {card.name for card in cards}]
+    missing = [name for name in wanted if name not in {one.name for one in interfaces}]
     for name in missing:
-        have = ", ".join(card.name for card in cards)
+        have = ", ".join(one.name for one in interfaces)
         text = f"the settings name it, and it is not here (there are {have})"
-        found.append(
-            Finding("interface", name, FindingLevel.WARN, text, "correct discovery.interfaces, or plug it in")
-        )
-    outer = [card for card in cards if card.used and not card.loopback]
-    kept = [card.name for card in cards if card.loopback and card.name in wanted]
+        found.append(Check("interface", WARN, text, "correct discovery.interfaces, or plug it in", where=name))
+    outer = [one for one in interfaces if one.used and not one.loopback]
+    kept = [one.name for one in interfaces if one.loopback and one.name in wanted]
     if not outer and kept and not missing:
         text = "the settings keep agents to this machine"
-        found.append(Finding("interface", kept[0], FindingLevel.OK, text))
+        found.append(Check("interface", OK, text, where=kept[0]))
     elif not outer:
-        down = [card.name for card in cards if not card.loopback]
+        down = [one.name for one in interfaces if not one.loopback]
         text = "none but loopback can be used: agents of other machines are not found"
         remedy = f"see `ip address`: {', '.join(down)} need to be up and have an IPv4 address" if down else ""
-        found.append(Finding("interface", "", FindingLevel.WARN, text, remedy or "plug in a network"))
-    found += [_card(card) for card in outer]
+        found.append(Check("interface", WARN, text, remedy or "plug in a network"))
+    found += [_judge_interface(one) for one in outer]
     found += _shared(outer)
     if container and outer:
         text = "this is a container with a network of its own: no multicast of the outside comes in"
         remedy = "start it with --network host, or reach the others by --seed HOST:PORT"
-        found.append(Finding("interface", outer[0].name, FindingLevel.WARN, text, remedy))
+        found.append(Check("interface", WARN, text, remedy, where=outer[0].name))
     return found
 
 
-def _card(card: NetworkInterface) -> Finding:
-    addresses = ", ".join(str(network) for network in card.networks)
-    if _TUNNELS.match(card.name) or not card.multicast:
+def _judge_interface(one: NetworkInterface) -> Check:
+    addresses = ", ".join(str(network) for network in one.networks)
+    if _TUNNELS.match(one.name) or not one.multicast:
         text = f"{addresses}: a tunnel; most of them carry no multicast"
-        return Finding(
-            "interface", card.name, FindingLevel.WARN, text, "name one agent behind it by --seed HOST:PORT"
-        )
-    if _CONTAINERS.match(card.name):
+        return Check("interface", WARN, text, "name one agent behind it by --seed HOST:PORT", where=one.name)
+    if _CONTAINERS.match(one.name):
         text = f"{addresses}: belongs to containers or virtual machines; agents send beacons there too"
-        return Finding("interface", card.name, FindingLevel.OK, text, "to keep to one network: --interface NAME")
-    if all(network.is_link_local for network in card.networks):
+        return Check("interface", OK, text, "to keep to one network: --interface NAME", where=one.name)
+    if all(network.is_link_local for network in one.networks):
         text = f"{addresses}: it gave itself this address, for no DHCP server answered"
-        return Finding("interface", card.name, FindingLevel.WARN, text, "is the cable in the right network?")
-    return Finding("interface", card.name, FindingLevel.OK, addresses)
+        return Check("interface", WARN, text, "is the cable in the right network?", where=one.name)
+    return Check("interface", OK, addresses, where=one.name)
 
 
-def _shared(cards: Sequence[NetworkInterface]) -> list[Finding]:
-    """Two interfaces in one network: the kernel answers by whichever it likes."""
+def _shared(interfaces: Sequence[NetworkInterface]) -> list[Check]:
+    """Interfaces that share a network: the kernel may answer by either."""
     networks = Counter(
-        network.network for card in cards for network in {n.network: n for n in card.networks}.values()
+        network.network for one in interfaces for network in {n.network: n for n in one.networks}.values()
     )
     found = []
     for network in (network for network, count in networks.items() if count > 1 and network.prefixlen < 32):
-        names = [card.name for card in cards if any(n.network == network for n in card.networks)]
+        names = [one.name for one in interfaces if any(n.network == network for n in one.networks)]
         text = f"{' and '.join(names)} are both in {network}: answers may leave by the other one, and be dropped"
-        found.append(
-            Finding("interface", "+".join(names), FindingLevel.WARN, text, "keep one of them, or --interface NAME")
-        )
+        found.append(Check("interface", WARN, text, "keep one of them, or --interface NAME", where="+".join(names)))
     return found
 
 
-def judge_multicast(echoes: Iterable[MulticastEcho], group: str, port: int) -> list[Finding]:
-    """Whether each interface sends to the group, and hears what it sends."""
+def judge_multicast(echoes: Iterable[MulticastEcho], group: str, port: int) -> list[Check]:
+    """Whether each interface can send to the group and receives what was sent."""
     found = []
     for echo in echoes:
         if echo.problem:
             text = f"{group}:{port} cannot be used: {echo.problem}"
             remedy = "an OUTPUT rule of the firewall, or no multicast on this interface: --seed HOST:PORT needs none"
-            found.append(Finding("multicast", echo.card, FindingLevel.FAIL, text, remedy))
+            found.append(Check("multicast", FAIL, text, remedy, where=echo.interface))
         elif echo.after is None:
             text = f"sent to {group}:{port}, but not heard: something on this machine drops it"
             remedy = f"let UDP port {port} in (ufw allow {port}/udp; nft or iptables: see the check firewall)"
-            found.append(Finding("multicast", echo.card, FindingLevel.FAIL, text, remedy))
+            found.append(Check("multicast", FAIL, text, remedy, where=echo.interface))
         else:
             text = f"{group}:{port} sent, and heard {echo.after * 1e3:.1f} ms later"
-            found.append(Finding("multicast", echo.card, FindingLevel.OK, text))
+            found.append(Check("multicast", OK, text, where=echo.interface))
     return found
 
 
-def judge_rp_filter(values: Mapping[str, int], cards: Sequence[NetworkInterface]) -> list[Finding]:
-    """Whether the kernel drops what comes by another interface than answers would leave by.
+def judge_rp_filter(values: Mapping[str, int], interfaces: Sequence[NetworkInterface]) -> list[Check]:
+    """Whether the kernel drops packets that come in on another interface than answers would leave by.
 
     Args:
         values: ``net.ipv4.conf.NAME.rp_filter`` by name, ``all`` among them.
-        cards: All interfaces.
+        interfaces: All of them.
     """
-    outer = [card.name for card in cards if card.used and not card.loopback]
+    outer = [one.name for one in interfaces if one.used and not one.loopback]
     strict = [name for name in outer if max(values.get("all", 0), values.get(name, 0)) == _STRICT]
     if not values:
-        return [Finding("rp_filter", "", FindingLevel.SKIPPED, "this kernel does not tell")]
+        return [Check("rp_filter", SKIPPED, "this kernel does not tell")]
     if len(outer) > 1 and strict:
         text = (
             f"strict on {', '.join(strict)}, and there are {len(outer)} interfaces: packets of a peer that is routed "
             "by another one are dropped without a word"
         )
         remedy = "sudo sysctl -w net.ipv4.conf.all.rp_filter=2 (and of each interface)"
-        return [Finding("rp_filter", "", FindingLevel.WARN, text, remedy)]
-    return [Finding("rp_filter", "", FindingLevel.OK, "nothing is dropped for coming by the wrong interface")]
+        return [Check("rp_filter", WARN, text, remedy)]
+    return [Check("rp_filter", OK, "nothing is dropped for coming by the wrong interface")]
 
 
-def judge_mtu_probing(value: int | None, *, black_hole: bool) -> Finding:
-    """Whether the kernel finds the MTU of a path that drops large packets without a word.
+def judge_mtu_probing(value: int | None, *, black_hole: bool) -> Check:
+    """Whether the kernel finds the MTU of a path that silently drops large packets (RFC 4821).
 
     Agents do it for their own links; this is about all other TCP connections.
 
     Args:
         value: ``net.ipv4.tcp_mtu_probing``: 0 never, 1 behind a black hole, 2 always; ``None``: not known.
-        black_hole: Whether an agent has met such a path.
+        black_hole: Whether an agent of this machine has a peer behind such a path.
     """
     if value is None:
-        return Finding("mtu", "probing", FindingLevel.SKIPPED, "this kernel does not tell")
+        return Check("mtu", SKIPPED, "this kernel does not tell", where="probing")
     name = "net.ipv4.tcp_mtu_probing"
     if value:
-        return Finding("mtu", "probing", FindingLevel.OK, f"{name} is {value}: TCP finds a path's MTU itself")
+        return Check("mtu", OK, f"{name} is {value}: TCP finds a path's MTU itself", where="probing")
     if black_hole:
         text = f"a path drops large packets, and {name} is 0: ssh and other programs hang on it"
-        return Finding("mtu", "probing", FindingLevel.WARN, text, f"sudo sysctl -w {name}=1 (on both machines)")
+        return Check("mtu", WARN, text, f"sudo sysctl -w {name}=1 (on both machines)", where="probing")
     text = f"{name} is 0, Linux's default; agents find a path that drops large packets themselves"
-    return Finding("mtu", "probing", FindingLevel.OK, text)
+    return Check("mtu", OK, text, where="probing")
 
 
-def judge_routes(routes: Mapping[str, str]) -> list[Finding]:
-    """Whether the kernel has a way to each address that agents want to reach.
+def judge_routes(routes: Mapping[str, str]) -> list[Check]:
+    """Whether the kernel has a route to each address of a peer or seed.
 
     Args:
-        routes: By address, ready to read (a peer's name behind it perhaps): why there is none, or empty.
+        routes: Why there is none, or empty, by the address, ready to read (with the peer's name).
     """
     found = []
     for target, problem in routes.items():
         if problem:
             remedy = "`ip route get ADDRESS`; a gateway is missing, or the interface of that network is down"
-            found.append(Finding("route", target, FindingLevel.FAIL, f"there is no way: {problem}", remedy))
+            found.append(Check("route", FAIL, f"there is no way: {problem}", remedy, where=target))
         else:
-            found.append(Finding("route", target, FindingLevel.OK, "there is a way"))
-    return found or [
-        Finding("route", "", FindingLevel.SKIPPED, "no peer and no seed is known whose way could be looked for")
-    ]
+            found.append(Check("route", OK, "there is a way", where=target))
+    return found or [Check("route", SKIPPED, "no peer and no seed is known whose way could be looked for")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,12 +198,12 @@ class Port:
     """One port that an agent needs.
 
     Args:
-        what: For what, ready to read.
+        what: Its use, ready to read.
         number: Its number.
-        taken: Why it cannot be had, or empty.
-        owner: Who has it, ready to read; empty if nobody or unknown. A port that is not ``taken`` may have one too:
-            agents share the port of the beacons.
-        ours: Whether that is an agent, or an agent's core, of this machine.
+        taken: Why it cannot be bound, or empty.
+        owner: The program that has it, ready to read; empty if none or unknown. A port that is not ``taken`` may have
+            one too: agents share the port of the beacons.
+        ours: Whether the owner is an agent of this machine, or its core.
     """
 
     what: str
@@ -221,18 +213,18 @@ class Port:
     ours: bool = False
 
 
-def judge_ports(ports: Iterable[Port]) -> list[Finding]:
-    """Whether an agent can have the ports that it needs."""
+def judge_ports(ports: Iterable[Port]) -> list[Check]:
+    """Whether an agent can bind the ports that it needs."""
     found = []
     for port in ports:
         if not port.taken:
             text = f"used by {port.owner}; others may use it too" if port.owner else "free"
-            found.append(Finding("port", str(port.number), FindingLevel.OK, f"{port.what}: {text}"))
+            found.append(Check("port", OK, f"{port.what}: {text}", where=str(port.number)))
         elif port.ours:
-            found.append(Finding("port", str(port.number), FindingLevel.OK, f"{port.what}: {port.owner} has it"))
+            found.append(Check("port", OK, f"{port.what}: {port.owner} has it", where=str(port.number)))
         else:
             owner = f" by {port.owner}" if port.owner else ""
             text = f"{port.what}: taken{owner} ({port.taken})"
             remedy = f"end that program (`ss -lptun | grep :{port.number}` names it), or choose another port"
-            found.append(Finding("port", str(port.number), FindingLevel.FAIL, text, remedy))
+            found.append(Check("port", FAIL, text, remedy, where=str(port.number)))
     return found

@@ -1,1 +1,1 @@
-"""TODO room."""
+"""Builds the snapshot from the rooms, and serves it: control socket and ``/diagnostics``."""

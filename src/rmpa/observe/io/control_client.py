@@ -1,7 +1,4 @@
-"""Finds this machine's agents and asks them; blocking, for the command line.
-
-Only the standard library's sockets: a command that asks one question needs no event loop.
-"""
+"""The blocking client of the control socket, and the search for this machine's agents; for the command line."""
 
 from __future__ import annotations
 
@@ -37,7 +34,7 @@ class ControlClient:
         timeout: Seconds for each call.
 
     Raises:
-        UnreachableError: Nobody answers there.
+        UnreachableError: No agent accepts the connection.
     """
 
     def __init__(self, path: Path, timeout: float = limits.CONTROL_CALL_TIMEOUT) -> None:
@@ -65,21 +62,21 @@ class ControlClient:
         self.close()
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         self._sock.close()
 
     def call(self, op: str, type: type[_T], **args: object) -> _T:  # noqa: A002 - as msgspec calls it
-        """Ask, and wait for the answer.
+        """Send a request, and wait for the reply.
 
         Args:
-            op: The handler's name.
-            type: What its value is.
-            args: What it wants.
+            op: The name of the operation (``control_operations.OPERATIONS``).
+            type: The type of its value.
+            args: Its arguments.
 
         Raises:
-            PeerRefused: The agent said no, and why.
-            UnreachableError: It hung up, or did not answer in time.
-            RemoteProtocolError: It answered something else.
+            PeerRefused: The agent refused, and said why.
+            UnreachableError: It closed the connection, or did not reply in time.
+            RemoteProtocolError: Its value has another type.
         """
         try:
             self._sock.sendall(ControlRequest(op, args).serialize())
@@ -126,7 +123,7 @@ class FoundAgent:
 
 
 def find_agents(environ: Mapping[str, str]) -> list[FoundAgent]:
-    """The agents of this machine that answer a connection, by name; sockets of killed ones are skipped."""
+    """The agents of this machine that accept a connection, by name; sockets of killed agents are left out."""
     found = []
     for place in runtime_dirs(environ):
         for path in sorted(place.glob("*.sock")):
@@ -136,11 +133,11 @@ def find_agents(environ: Mapping[str, str]) -> list[FoundAgent]:
 
 
 def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAgent:
-    """The agent that is meant: the one named, the one in RMPA_AGENT, the only one, or ROS_MASTER_URI's.
+    """The agent named, or that of RMPA_AGENT, or the only one, or the one whose core is ROS_MASTER_URI.
 
     Raises:
-        UnreachableError: There is none, or none of that name.
-        RmpaError: There are several, and nothing tells which; they are listed.
+        UnreachableError: No agent runs, or none of that name.
+        RmpaError: Several agents run, and nothing says which is meant; they are listed.
     """
     agents = find_agents(environ)
     wanted = name or environ.get("RMPA_AGENT")
@@ -166,7 +163,7 @@ def choose_agent(environ: Mapping[str, str], name: str | None = None) -> FoundAg
 
 
 def same_core(one: str, other: str) -> bool:
-    """Whether two URIs of ROS cores on this machine are one: the port decides, all names of this machine are one."""
+    """Whether two URIs name the same ROS core: equal ports, and equal hosts or two names of this machine."""
     try:
         first, second = urlsplit(one), urlsplit(other)
         hosts = {_local(u.hostname or "") for u in (first, second)}

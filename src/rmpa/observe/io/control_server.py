@@ -1,4 +1,4 @@
-"""Serves the control socket: the CLI asks, the agent's handlers answer (``observe.control`` has the words)."""
+"""The server of the control socket (protocol: ``observe.control``)."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _log = logging.getLogger(__name__)
-_breathing: Final = functools.partial(yielding_to_data, every=1)
+_yielder: Final = functools.partial(yielding_to_data, every=1)
 
 Handler = Callable[[dict[str, object]], Awaitable[object] | object]
 
 
 class ControlServer:
-    """A UNIX stream socket ``<name>.sock``, for this user alone, and the lock on its name.
+    """A UNIX stream socket ``<name>.sock`` that only this user can open, and the lock on its name.
 
     Args:
         place: The runtime directory; made if needed.
         name: The agent's name.
-        handlers: By op; each gets the request's ``args`` and returns what JSON can say (``msgspec`` structs too),
-            at once or as an awaitable. An ``RmpaError`` becomes the error that the client shows.
+        handlers: By operation; each gets the request's ``args`` and returns a value for JSON (``msgspec`` structs
+            too) or an awaitable of one. An ``RmpaError`` becomes the error that the client shows.
         counters: Where refusals are counted: ``control.refused``, ``control.busy``, ``control.failed``.
 
     Raises:
-        StartError: By ``lock()`` and ``start()``, if an agent of this name runs already, or the socket cannot be.
+        StartError: By ``lock()`` and ``start()``, if an agent of this name runs or the socket cannot be made.
     """
 
     def __init__(
@@ -59,12 +59,12 @@ class ControlServer:
         self.path = place / f"{name}.sock"
 
     def lock(self) -> None:
-        """Take the name, before anything else starts; ``start()`` does it otherwise."""
+        """Lock the name, before anything else of the agent starts; else ``start()`` does it."""
         if self._lock is None:
             self._lock = NameLock(self._place, self._name)
 
     async def start(self) -> None:
-        """Bind and serve. A socket left by an agent that was killed is replaced: we hold its name's lock."""
+        """Bind and serve. The socket of an agent that was killed is replaced, since its name's lock is ours."""
         if len(os.fsencode(self.path)) > limits.CONTROL_PATH_MAX:
             problem = f"longer than the {limits.CONTROL_PATH_MAX} bytes that a socket's path may have"
             raise StartError(str(self.path), problem, "set RMPA_RUNTIME_DIR to a shorter directory")
@@ -79,7 +79,7 @@ class ControlServer:
             self.path.unlink()
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            # The directory is ours alone already (0700), so nobody can connect between bind and chmod.
+            # The directory's mode is 0700, so no other user can connect between bind and chmod.
             sock.bind(str(self.path))
             self.path.chmod(0o600)
             sock.listen(limits.CONTROL_BACKLOG)
@@ -89,12 +89,12 @@ class ControlServer:
         return sock
 
     async def close(self) -> None:
-        """End all clients, remove socket and lock; twice does no harm."""
+        """Close all clients, remove socket and lock; twice does no harm."""
         served = self._acceptor is not None
         if self._acceptor is not None:
             self._acceptor.close()
             self._acceptor = None
-        await asyncio.sleep(0)  # a client that was accepted just now closes its socket only if its task has begun
+        await asyncio.sleep(0)  # lets tasks of clients accepted just now begin: only then do they close their sockets
         clients = list(self._clients)
         for task in clients:
             task.cancel()
@@ -134,7 +134,7 @@ class ControlServer:
             while await self._one(reader, writer):
                 pass
         except (OSError, TimeoutError, asyncio.IncompleteReadError):
-            pass  # gone, idle, or hung up half-way: all are a client's right
+            pass  # gone, idle, or closed half-way: none is an error
         except Exception:  # noqa: BLE001 - a task's top
             _log.exception("! control client failed")
         finally:
@@ -143,7 +143,7 @@ class ControlServer:
                 await writer.wait_closed()
 
     async def _one(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
-        """Serve one request; whether to go on."""
+        """Serve one request; returns whether the connection stays open."""
         try:
             async with asyncio.timeout(limits.CONTROL_IDLE_TIMEOUT):
                 line = await reader.readuntil(b"\n")
@@ -180,7 +180,7 @@ class ControlServer:
 
     async def _send(self, writer: asyncio.StreamWriter, reply: ControlReply) -> bool:
         try:
-            line = reply.serialize(_breathing)
+            line = reply.serialize(_yielder)
         except RmpaError as error:
             _log.exception("! control reply")
             line = ControlReply(ok=False, error=str(error)).serialize()

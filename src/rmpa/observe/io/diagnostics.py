@@ -1,6 +1,6 @@
-"""Tells the local graph how the agent, its links and what comes over them are: ``/diagnostics``, once a second.
+"""Publishes the agent's health on ``/diagnostics`` once a second (REP 107).
 
-The agent's own node publishes it, so it stays in this graph. Nothing is made while nobody listens.
+The agent's own node publishes it, so it does not cross to other modules. Without a subscriber nothing is built.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from rmpa.observe import limits
-from rmpa.observe.health import Health
+from rmpa.observe.health import Health, diagnostic_status
 from rmpa.ros.node.publication import Publication
 from rmpa.ros.types.diagnostic_array import ARRAY_DEFINITION, ARRAY_MD5, ARRAY_TYPE, frame_array
 from rmpa.ros.wire.tcpros import TopicDescription
@@ -30,19 +30,19 @@ TOPIC: Final = "/diagnostics"
 
 
 class Diagnostics:
-    """Publishes what the view shows; has the clocks followed, whether somebody listens or not.
+    """Publishes judged snapshots; follows the peers' clocks as often, with or without a subscriber.
 
     Args:
         core: The local core.
-        bridge: Its node publishes; started before.
-        view: What there is to tell.
-        clocks: Those of the peers.
+        bridge: Has the node that publishes; started before.
+        snapshots: Builds what is judged.
+        clocks: The clocks of the peers.
     """
 
-    def __init__(self, core: Core, bridge: Bridge, view: SnapshotBuilder, clocks: PeerClocks) -> None:
+    def __init__(self, core: Core, bridge: Bridge, snapshots: SnapshotBuilder, clocks: PeerClocks) -> None:
         self._core = core
         self._bridge = bridge
-        self._view = view
+        self._snapshots = snapshots
         self._clocks = clocks
         self._clock = SystemClock()
         self._health = Health()
@@ -56,7 +56,7 @@ class Diagnostics:
         self._timer: asyncio.TimerHandle | None = None
 
     def start(self) -> None:
-        """Advertise, and look once a second."""
+        """Advertise, and publish once a second."""
         node = self._bridge.node
         node.add_publication(self._publication)
         code, text, _ = self._core.call("registerPublisher", node.name, TOPIC, ARRAY_TYPE, node.uri)
@@ -66,7 +66,7 @@ class Diagnostics:
         self._again()
 
     def close(self) -> None:
-        """Advertise no more."""
+        """Unadvertise."""
         if self._timer is not None:
             self._timer.cancel()
         node = self._bridge.node
@@ -84,8 +84,8 @@ class Diagnostics:
 
     def _publish(self) -> None:
         self._sequence += 1
-        parts = []
-        for status in self._health.judge(self._view.snapshot(), self._clock.now()):
-            parts.append(status.serialize())
+        snapshot, parts = self._snapshots.build(), []
+        for check in self._health.judge(snapshot, self._clock.now()):
+            parts.append(diagnostic_status(check, snapshot.agent.name).serialize())
             yield_to_data()
         self._publication.publish_framed(frame_array(self._sequence, self._clock.wall_ns(), parts))

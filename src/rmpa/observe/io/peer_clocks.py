@@ -1,4 +1,4 @@
-"""What the clocks of all peers were over the last minute, those that are away for a moment included."""
+"""The clocks of all peers over the last minute; those of peers that are away for a moment are kept."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ if TYPE_CHECKING:
 
 
 class PeerClocks:
-    """Follows the links; to be asked to once a second, that no time is without an estimate.
+    """Records each link's estimate of its peer's clock; ``follow`` is called once a second.
 
     Args:
-        bridge: Knows the links.
+        bridge: Has the links.
     """
 
     def __init__(self, bridge: Bridge) -> None:
@@ -22,14 +22,14 @@ class PeerClocks:
         self._clocks: dict[int, PeerClock] = {}
 
     def __getitem__(self, peer: int) -> PeerClock:
-        """The clock of a peer, by the bridge's number of its link."""
+        """The clock of a peer, by its session's number."""
         return self._clocks[peer]
 
     def follow(self, now: float) -> None:
-        """Take down what each link knows now (monotonic seconds); forget peers that are gone."""
+        """Record the present estimates; forget peers that are gone. ``now`` is monotonic seconds."""
         before, self._clocks = self._clocks, {}
-        for attached in self._bridge.everyone():
-            clock = self._clocks[attached.peer] = before.get(attached.peer) or PeerClock()
-            offset, error = attached.link.clock_offset, attached.link.clock_error
-            if offset is not None and error is not None and attached.away is None:
+        for session in self._bridge.everyone():
+            clock = self._clocks[session.peer] = before.get(session.peer) or PeerClock()
+            offset, error = session.link.clock_offset, session.link.clock_error
+            if offset is not None and error is not None and session.away is None:
                 clock.told(offset, error, now)

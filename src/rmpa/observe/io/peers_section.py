@@ -2,77 +2,87 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final, Protocol
 
 import msgspec
 
-from rmpa.observe.io.bounds_section import bound_here, bound_there
 from rmpa.observe.shared_address import mark_shared_addresses
-from rmpa.observe.snapshot import LinkInfo, PeerInfo
+from rmpa.observe.snapshot import BoundInfo, LinkInfo, PeerInfo
 from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.system_clock import SystemClock
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from rmpa.bridge.bounds import Beyond
     from rmpa.bridge.io.bounds import Bounds
     from rmpa.bridge.io.bridge import Bridge, PeerSession
-    from rmpa.bridge.io.network_endpoint import NetworkEndpoint
+    from rmpa.core.identity import Identity
     from rmpa.discovery.events import PeerView
-    from rmpa.mesh.io.link import MeshLink
+    from rmpa.discovery.io.discovery import Discovery
+    from rmpa.mesh.io.link import PeerLink
+    from rmpa.mesh.io.mesh import Mesh
     from rmpa.mesh.io.path_monitor import PathMonitor
     from rmpa.mesh.peering import PeerStatus
-    from rmpa.observe.snapshot import BoundInfo
+
+_DENY: Final = {"services": "services.deny"}
+"""The setting that denies things of a kind, where it is not ``bridge.deny``."""
+
+
+class EndpointView(Protocol):
+    """What the snapshot needs of the agent's place in the network (``agent.network.NetworkEndpoint``)."""
+
+    identity: Identity
+    mesh: Mesh
+    discovery: Discovery
 
 
 class PeersSection:
     """Reads what is known of peers; changes nothing.
 
     Args:
-        bridge: The agent's.
+        bridge: The agent's bridge.
+        bounds: Its part for limits.
     """
 
-    def __init__(self, bridge: Bridge) -> None:
+    def __init__(self, bridge: Bridge, bounds: Bounds) -> None:
         self._bridge = bridge
-        self.bounds: Bounds | None = None
-        """What is beyond the limits; told once it is known."""
+        self._bounds = bounds
         self._clock = SystemClock()
 
-    def infos(self, station: NetworkEndpoint) -> tuple[PeerInfo, ...]:
+    def infos(self, endpoint: EndpointView) -> tuple[PeerInfo, ...]:
         """Every peer that is known, by name."""
         now = self._clock.now()
-        links = {attached.link.guid: attached for attached in self._bridge.attached()}
+        links = {session.link.guid: session for session in self._bridge.attached()}
         yield_to_data()  # a millisecond each with a full roster
-        roster = {view.identity.guid: view for view in station.discovery.peers()}
+        roster = {view.identity.guid: view for view in endpoint.discovery.peers()}
         yield_to_data()
-        statuses = {status.identity.guid: status for status in station.mesh.peers()}
+        statuses = {status.identity.guid: status for status in endpoint.mesh.peers()}
         infos = []
         for guid in {*roster, *statuses, *links}:
             yield_to_data()
-            attached = links.get(guid)
-            info = self._peer(roster.get(guid), statuses.get(guid), attached, now)
-            if attached is not None:
-                info = msgspec.structs.replace(info, link=self._link(attached.link, station.mesh.paths, now))
-                theirs = len(self._bridge.imports.offered_by(attached.peer))
-                ours = self._bridge.exports.topics_for(attached.peer)
+            session = links.get(guid)
+            info = self._peer(roster.get(guid), statuses.get(guid), session, now)
+            if session is not None:
+                info = msgspec.structs.replace(info, link=self._link(session.link, endpoint.mesh.paths, now))
+                theirs = len(self._bridge.imports.offered_by(session.peer))
+                ours = self._bridge.exports.topics_for(session.peer)
                 yield_to_data()
-                beyond = self._beyond(attached)
+                beyond = self._beyond(session)
                 info = msgspec.structs.replace(info, topics_in=theirs, topics_out=ours, beyond=beyond)
             infos.append(info)
         relayed = self._relayed({info.instance: info for info in infos})
         infos = [info for info in infos if info.instance not in {one.instance for one in relayed}]
-        own = {str(address) for address in (station.identity.guid.address, *station.identity.addresses)}
+        own = {str(address) for address in (endpoint.identity.guid.address, *endpoint.identity.addresses)}
         return mark_shared_addresses(sorted((*infos, *relayed), key=lambda info: (info.name, info.guid)), own)
 
-    def _beyond(self, attached: PeerSession) -> tuple[BoundInfo, ...]:
-        if self.bounds is None:
-            return ()
-        name, peer = attached.link.name, attached.peer
-        here = [bound_here(name, one) for one in self.bounds.here(peer)]
-        return (*here, *(bound_there(name, one) for one in self.bounds.there(peer)))
+    def _beyond(self, session: PeerSession) -> tuple[BoundInfo, ...]:
+        name, peer = session.link.name, session.peer
+        here = [_bound_here(name, one) for one in self._bounds.here(peer)]
+        return (*here, *(_bound_there(name, one) for one in self._bounds.there(peer)))
 
     def _relayed(self, known: Mapping[str, PeerInfo]) -> list[PeerInfo]:
-        """Modules without a link whose topics a relay passes on; their beacons may be heard all the same."""
+        """Modules without a link whose topics a relay passes on. The roster may know them all the same."""
         infos = []
         for origin, via in self._bridge.imports.ways:
             blank = PeerInfo(name=origin.name, guid=origin.guid, instance=origin.instance, state="", since_ago=0.0)
@@ -82,13 +92,13 @@ class PeersSection:
         return infos
 
     def _peer(
-        self, view: PeerView | None, status: PeerStatus | None, attached: PeerSession | None, now: float
+        self, view: PeerView | None, status: PeerStatus | None, session: PeerSession | None, now: float
     ) -> PeerInfo:
-        identity = (view or status or attached.link).identity  # type: ignore[union-attr] # one of the three is there
+        identity = (view or status or session.link).identity  # type: ignore[union-attr] # one of the three is there
         conflicts = view.conflicts if view is not None else ()
         unlinked = status.since if status is not None and status.since is not None else view.since if view else now
-        if attached is not None:
-            state, since = "linked", attached.link.since or now
+        if session is not None:
+            state, since = "linked", session.link.since or now
         elif view is not None and not view.present:
             state, since = "conflict", view.since
         elif status is not None and status.state == "refused":
@@ -112,7 +122,7 @@ class PeersSection:
         )
 
     @staticmethod
-    def _link(link: MeshLink, paths: PathMonitor, now: float) -> LinkInfo:
+    def _link(link: PeerLink, paths: PathMonitor, now: float) -> LinkInfo:
         host, port = link.remote_endpoint
         problem = paths.problem(link)
         return LinkInfo(
@@ -131,3 +141,41 @@ class PeersSection:
             path_problem=problem.text if problem is not None else "",
             path_remedy=problem.remedy if problem is not None else "",
         )
+
+
+def _bound_here(peer: str, beyond: Beyond) -> BoundInfo:
+    """What of a peer is hidden here."""
+    text = (
+        f"{beyond.what} of {peer} stay hidden here: it has more than {_setting(beyond)} of this module; "
+        f"raise it in rmpa.toml and `rmpa reload`, or deny some by {_deny(beyond)}"
+    )
+    return _bound(beyond, text, here=True)
+
+
+def _bound_there(peer: str, beyond: Beyond) -> BoundInfo:
+    """What of this module is hidden at a peer."""
+    text = (
+        f"{beyond.what} of this module stay hidden at {peer}: there are more than {_setting(beyond)} over there; "
+        f"raise it in its rmpa.toml and `rmpa reload` there, or deny some here by {_deny(beyond)}"
+    )
+    return _bound(beyond, text, here=False)
+
+
+def own_text(beyond: Beyond) -> str:
+    """What of this module no peer is offered, ready to read."""
+    return (
+        f"{beyond.what} of this module are offered to no peer: more than {_setting(beyond)}; raise it "
+        f"in rmpa.toml and `rmpa reload`, or deny some by {_deny(beyond)}"
+    )
+
+
+def _setting(beyond: Beyond) -> str:
+    return f"limits.{beyond.kind} = {beyond.limit}"
+
+
+def _deny(beyond: Beyond) -> str:
+    return _DENY.get(beyond.kind, "bridge.deny")
+
+
+def _bound(beyond: Beyond, text: str, *, here: bool) -> BoundInfo:
+    return BoundInfo(kind=beyond.kind, limit=beyond.limit, hidden=beyond.hidden, here=here, text=text)

@@ -1,4 +1,4 @@
-"""Where the control sockets of this machine's agents live, and the lock that keeps their names apart."""
+"""The directory of the control sockets, and the lock that keeps agents' names apart."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _REMEDY: Final = "set RMPA_RUNTIME_DIR to a directory of your own"
 
 
 def runtime_dir(environ: Mapping[str, str], setting: str = "") -> Path:
-    """The directory that a new agent of this user uses; it need not exist yet.
+    """The directory for a new agent of this user; it need not exist yet.
 
     Args:
-        environ: RMPA_RUNTIME_DIR and XDG_RUNTIME_DIR count.
+        environ: Has RMPA_RUNTIME_DIR and XDG_RUNTIME_DIR, or not.
         setting: ``Settings.runtime_dir``; empty for the usual place.
     """
     if setting or environ.get("RMPA_RUNTIME_DIR"):
@@ -35,9 +35,9 @@ def runtime_dir(environ: Mapping[str, str], setting: str = "") -> Path:
 
 
 def runtime_dirs(environ: Mapping[str, str]) -> list[Path]:
-    """The directories that a client looks in, those that are there and that it may read.
+    """The directories in which a client looks for agents: those that exist and that it may read.
 
-    With RMPA_RUNTIME_DIR that one alone; else every usual place, since ``sudo`` and ``systemd`` drop variables.
+    With RMPA_RUNTIME_DIR that one alone; else every usual one, since ``sudo`` and ``systemd`` drop variables.
     """
     places = [runtime_dir(environ)]
     if not environ.get("RMPA_RUNTIME_DIR"):
@@ -46,9 +46,9 @@ def runtime_dirs(environ: Mapping[str, str]) -> list[Path]:
 
 
 def _usable(place: Path) -> bool:
-    """Whether we may read it and nobody else could have put a socket there to fool us.
+    """Whether this user may read it, and no untrusted user can have put a socket there.
 
-    ``/run/rmpa`` may belong to anybody: only root makes it, or systemd for a unit's own user.
+    The owner of ``/run/rmpa`` does not matter: only root makes it, or systemd for a unit's user.
     """
     try:
         info = place.lstat()
@@ -62,7 +62,7 @@ def make_runtime_dir(place: Path) -> None:
     """Make the directory, for this user alone.
 
     Raises:
-        StartError: It cannot be made, or somebody else owns it.
+        StartError: It cannot be made, or another user owns it.
     """
     try:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -78,14 +78,14 @@ def make_runtime_dir(place: Path) -> None:
 
 
 class NameLock:
-    """Holds ``<name>.lock`` for as long as the agent lives; the kernel lets go of it however the agent ends.
+    """Holds ``<name>.lock`` while the agent runs; the kernel releases the lock however the agent ends.
 
     Args:
         place: The runtime directory; made if needed.
         name: The agent's name.
 
     Raises:
-        StartError: Another agent holds it (its process id is told), or the directory cannot be used.
+        StartError: Another agent holds it (the text has its process id), or the directory cannot be used.
     """
 
     def __init__(self, place: Path, name: str) -> None:
@@ -106,9 +106,9 @@ class NameLock:
                 raise StartError("rmpa up", problem, "stop it, or give this one a --name of its own") from None
             if self._still_there(fd):
                 break
-            os.close(fd)  # its last holder removed it between our open and our lock
+            os.close(fd)  # its last holder has removed the file after we opened it
         self._fd = fd
-        with contextlib.suppress(OSError):  # a full disk; it is the lock that counts, not who is said to hold it
+        with contextlib.suppress(OSError):  # a full disk: the lock holds without the process id in the file
             os.ftruncate(fd, 0)
             os.write(fd, f"{os.getpid()}\n".encode())
 
@@ -119,7 +119,7 @@ class NameLock:
             return False
 
     def release(self) -> None:
-        """Remove the file and let go; twice does no harm."""
+        """Remove the file and release the lock; twice does no harm."""
         if self._fd >= 0:
             with contextlib.suppress(OSError):
                 self.path.unlink()

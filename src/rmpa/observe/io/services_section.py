@@ -1,10 +1,10 @@
-"""The services' part of the snapshot: those of this module and of its peers, and how their calls went."""
+"""The services in the snapshot: those of this module and of its peers, with the figures of their calls."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from rmpa.observe.snapshot import LatencySpread, ServiceInfo
+from rmpa.observe.snapshot import SampleSpread, ServiceInfo
 from rmpa.runtime.event_loop import yield_to_data
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class ServicesSection:
-    """Reads what is known of services; changes nothing.
+    """Reads what the bridge knows of services; changes nothing.
 
     Args:
         services: The bridge's part.
@@ -27,17 +27,16 @@ class ServicesSection:
         self._services = services
 
     def infos(self) -> tuple[ServiceInfo, ...]:
-        """Every service of the local graph, the agent's own left out, and every one that peers offer."""
+        """All services of the local graph, without the agent's own, and of the peers."""
         found = [*self._local(), *self._remote()]
         return tuple(sorted(found, key=lambda info: (info.name, info.direction == "in", info.peer)))
 
     def _local(self) -> Iterator[ServiceInfo]:
-        services = self._services
-        for service, server in list(services.exports.seen.items()):
+        for service, server in list(self._services.exports.seen.items()):
             yield_to_data()
-            yield self._export(service, server, services.served.get(service))
+            yield self._export(service, server)
 
-    def _export(self, service: str, server: LocalService, stats: CallStats | None) -> ServiceInfo:
+    def _export(self, service: str, server: LocalService) -> ServiceInfo:
         exports = self._services.exports
         about = exports.about(service)
         decision = self._services.rules.judge(service, server.node)
@@ -50,13 +49,9 @@ class ServicesSection:
             type=about.type if about else "",
             md5=about.md5 if about else "",
             callers=callers,
-            calls=stats.calls if stats else 0,
-            failed=stats.failed if stats else 0,
-            active=stats.active if stats else 0,
-            latency=_latency(stats),
             crosses=decision.allowed,
             policy=decision.rule,
-            problem=stats.problem if stats else "",
+            **_figures(self._services.served.get(service)),
         )
 
     def _remote(self) -> Iterator[ServiceInfo]:
@@ -66,8 +61,9 @@ class ServicesSection:
 
     def _import(self, peer: int, remote: RemoteService) -> ServiceInfo:
         shown = self._services.shown(peer, remote.name) if remote.shown else None
-        stats = shown.stats if shown else None
         decision = self._services.rules.judge(remote.name, remote.node)
+        figures = _figures(shown.stats if shown else None)
+        figures["problem"] = (shown.mismatch if shown else "") or figures.get("problem") or remote.problem
         return ServiceInfo(
             name=remote.name,
             node=remote.node,
@@ -77,27 +73,21 @@ class ServicesSection:
             wire=remote.wire if remote.wire != remote.name else "",
             type=remote.about.type if remote.about else "",
             md5=remote.about.md5 if remote.about else "",
-            calls=stats.calls if stats else 0,
-            failed=stats.failed if stats else 0,
-            active=stats.active if stats else 0,
-            latency=_latency(stats),
             crosses=decision.allowed,
             policy=decision.rule,
             hidden=remote.hidden,
-            problem=(shown.mismatch if shown else "") or (stats.problem if stats else "") or remote.problem,
+            **figures,
         )
 
 
-def _latency(stats: CallStats | None) -> LatencySpread | None:
-    if stats is None or not stats.latencies.total:
-        return None
-    summary = stats.latencies.summary()
-    return LatencySpread(
-        count=summary.count,
-        mean=summary.mean,
-        sd=summary.sd,
-        min=summary.minimum,
-        max=summary.maximum,
-        p50=summary.p50,
-        p99=summary.p99,
-    )
+def _figures(stats: CallStats | None) -> dict[str, Any]:
+    """The fields of a service that its calls give."""
+    if stats is None:
+        return {}
+    return {
+        "calls": stats.calls,
+        "failed": stats.failed,
+        "active": stats.active,
+        "latency": SampleSpread.of(stats.latencies.summary()) if stats.latencies.total else None,
+        "problem": stats.problem,
+    }

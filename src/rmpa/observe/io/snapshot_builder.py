@@ -1,4 +1,4 @@
-"""Builds the snapshot that the control socket and ``/diagnostics`` show from what the rooms tell."""
+"""Builds the snapshot that the control socket and ``/diagnostics`` show."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ import contextlib
 import os
 import time
 from collections import Counter
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import psutil
 
 import rmpa
 from rmpa.observe import limits
-from rmpa.observe.io.bounds_section import own_text
-from rmpa.observe.io.peers_section import PeersSection
+from rmpa.observe.io.peers_section import PeersSection, own_text
+from rmpa.observe.io.services_section import ServicesSection
 from rmpa.observe.io.topics_section import TopicsSection, unreachable_infos
 from rmpa.observe.snapshot import AgentInfo, FilesInfo, Snapshot
 from rmpa.runtime import limits as runtime_limits
@@ -22,134 +23,147 @@ from rmpa.runtime.event_loop import yield_to_data
 from rmpa.runtime.realtime import refused
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
+    from collections.abc import Callable, Collection, Iterable, Iterator
 
     from rmpa.bridge.io.bounds import Bounds
     from rmpa.bridge.io.bridge import Bridge
-    from rmpa.bridge.io.network_endpoint import NetworkEndpoint
+    from rmpa.bridge.services.io.part import Services
     from rmpa.config.settings import Settings
     from rmpa.core.counters import Counters
     from rmpa.observe.io.peer_clocks import PeerClocks
-    from rmpa.observe.io.services_section import ServicesSection
+    from rmpa.observe.io.peers_section import EndpointView
     from rmpa.ros.core.api import Core
     from rmpa.runtime.realtime import SchedulingRequest
 
 
+@dataclass(frozen=True, slots=True)
+class SnapshotSources:
+    """What the snapshot is built from.
+
+    Args:
+        core: The agent's ROS core.
+        bridge: Its bridge.
+        clocks: The clocks of its peers.
+        services: The bridge's part for services.
+        bounds: The bridge's part for limits.
+        endpoint: Its place in the network now; ``None`` while it has none.
+        counters: The counters of parts that are not named here.
+        notes: What else the user should know, each ready to read.
+        started: When the agent started, seconds since the epoch.
+        requests: What came of each request of ``--realtime``.
+    """
+
+    core: Core
+    bridge: Bridge
+    clocks: PeerClocks
+    services: Services
+    bounds: Bounds
+    endpoint: Callable[[], EndpointView | None]
+    counters: tuple[Counters, ...]
+    notes: Callable[[], Iterable[str]]
+    started: float
+    requests: tuple[SchedulingRequest, ...] = ()
+
+
 class SnapshotBuilder:
-    """Reads the rooms; changes nothing.
+    """Builds snapshots of an agent; changes nothing.
 
     Args:
         settings: The agent's settings.
-        core: Its ROS core.
-        bridge: Its bridge.
-        clocks: Those of its peers.
-        counters: Those of its other parts.
-        started: Seconds since the epoch.
-        wishes: What came of ``--realtime``.
+        sources: The parts of the agent.
     """
 
-    def __init__(
-        self,
-        settings: Settings,
-        core: Core,
-        bridge: Bridge,
-        clocks: PeerClocks,
-        *counters: Counters,
-        started: float,
-        wishes: tuple[SchedulingRequest, ...] = (),
-    ) -> None:
+    def __init__(self, settings: Settings, sources: SnapshotSources) -> None:
         self._settings = settings
-        self._core = core
-        self._bridge = bridge
-        self._counters = counters
-        self._started = started
-        self._wishes = wishes
+        self._sources = sources
         self._process = psutil.Process()
-        self._process.cpu_percent()  # from here on it counts
+        self._process.cpu_percent()  # the first call only begins to count
         self._cpu: float | None = None
         self._cpu_known = time.monotonic()
-        self._peers = PeersSection(bridge)
-        self._bounds: Bounds | None = None
-        self._topics = TopicsSection(settings, core, bridge, clocks)
-        self.station: NetworkEndpoint | None = None
-        self.services: ServicesSection | None = None
-        self.waiting: Callable[[], tuple[str, ...]] = tuple
-        """What the settings say and only a restart brings."""
-        self.parameters: Callable[[], tuple[str, ...]] = tuple
-        """What there is to know of followed parameters."""
+        self._peers = PeersSection(sources.bridge, sources.bounds)
+        self._topics = TopicsSection(settings, sources.core, sources.bridge, sources.clocks)
+        self._services = ServicesSection(sources.services)
 
-    def watch(self, bounds: Bounds) -> None:
-        """Show what is beyond the limits, from now on."""
-        self._bounds = self._peers.bounds = bounds
+    @property
+    def endpoint(self) -> EndpointView | None:
+        """The agent's place in the network now."""
+        return self._sources.endpoint()
 
     def reload(self, settings: Settings) -> None:
         """Other settings hold from now on."""
         self._settings = settings
         self._topics.reload(settings)
 
-    def snapshot(self, topics: Collection[str] | None = None) -> Snapshot:
-        """Everything at this moment; data goes on in between.
+    def build(self, topics: Collection[str] | None = None) -> Snapshot:
+        """A snapshot of this moment. It yields to data between its parts.
 
         Args:
             topics: The only topics that are wanted, without services, or ``None`` for all.
         """
-        rooms = [self._bridge.counters, self._core.counters, DESCRIPTORS.counters, *self._counters]
-        if self.station is not None:
-            rooms += [self.station.mesh.counters, self.station.discovery.counters]
+        endpoint = self.endpoint
         counters: Counter[str] = Counter()
-        for room in rooms:  # the core and the proxies have the same servers: their counts add up
-            counters.update(room.as_dict())
+        for each in self._counters(endpoint):  # counters of one name add up: core and proxies have the same servers
+            counters.update(each.as_dict())
         yield_to_data()
         return Snapshot(
-            agent=self._agent(),
+            agent=self._agent(endpoint),
             taken=time.time(),
-            peers=self._peers.infos(self.station) if self.station is not None else (),
+            peers=self._peers.infos(endpoint) if endpoint is not None else (),
             topics=self._topics.infos(topics),
-            services=self.services.infos() if self.services is not None and topics is None else (),
+            services=self._services.infos() if topics is None else (),
             counters=dict(sorted(counters.items())),
-            notes=self._notes(),
-            unreachable=unreachable_infos(self._core, time.monotonic()),
+            notes=self._notes(endpoint),
+            unreachable=unreachable_infos(self._sources.core, time.monotonic()),
         )
 
-    def _notes(self) -> tuple[str, ...]:
-        notes = tuple(self.station.discovery.notes()) if self.station is not None else ()
-        notes += self._core.notes()
-        if DESCRIPTORS.shortage is not None:
-            notes += (DESCRIPTORS.shortage.problem,)
-        notes += tuple(f"{key} waits for a restart" for key in self.waiting())
-        notes += self.parameters()
-        notes += tuple(map(own_text, self._bounds.own())) if self._bounds is not None else ()
-        missing = refused(self._wishes)
-        return (*notes, missing) if missing else notes
+    def _counters(self, endpoint: EndpointView | None) -> Iterator[Counters]:
+        yield from (
+            self._sources.bridge.counters,
+            self._sources.core.counters,
+            DESCRIPTORS.counters,
+            *self._sources.counters,
+        )
+        if endpoint is not None:
+            yield from (endpoint.mesh.counters, endpoint.discovery.counters)
 
-    def _agent(self) -> AgentInfo:
-        identity = self.station.identity if self.station is not None else None
-        proxies = sum(attached.inbound.count for attached in self._bridge.everyone())
+    def _notes(self, endpoint: EndpointView | None) -> tuple[str, ...]:
+        notes = [*(endpoint.discovery.notes() if endpoint is not None else ()), *self._sources.core.notes()]
+        if DESCRIPTORS.shortage is not None:
+            notes.append(DESCRIPTORS.shortage.problem)
+        notes += self._sources.notes()
+        notes += map(own_text, self._sources.bounds.own())
+        missing = refused(self._sources.requests)
+        return (*notes, missing) if missing else tuple(notes)
+
+    def _agent(self, endpoint: EndpointView | None) -> AgentInfo:
+        identity = endpoint.identity if endpoint is not None else None
+        bridge, core = self._sources.bridge, self._sources.core
+        proxies = sum(session.inbound.count for session in bridge.everyone())
         return AgentInfo(
             name=self._settings.name,
             guid=str(identity.guid) if identity else "",
             instance=identity.instance.hex() if identity else "",
             domain=self._settings.domain,
-            core_uri=self._core.uri,
+            core_uri=core.uri,
             version=rmpa.__version__,
             pid=os.getpid(),
-            started=self._started,
-            uptime=time.time() - self._started,
+            started=self._sources.started,
+            uptime=time.time() - self._sources.started,
             cpu=self._cpu_share(),
             rss=self._memory(),
             addresses=tuple(str(a) for a in (identity.guid.address, *identity.addresses)) if identity else (),
-            interfaces=tuple(i.name for i in self.station.discovery.interfaces) if self.station else (),
+            interfaces=tuple(i.name for i in endpoint.discovery.interfaces) if endpoint is not None else (),
             config_file=str(self._settings.config_file or ""),
-            realtime=tuple(map(str, self._wishes)),
+            realtime=tuple(map(str, self._sources.requests)),
             files=_files(),
             proxies=proxies,
-            proxy_sockets=self._bridge.proxy_nodes.sockets(proxies),
-            proxy_listening=self._bridge.proxy_nodes.listening,
-            core_memory=self._core.restored(),
+            proxy_sockets=bridge.proxy_nodes.sockets(proxies),
+            proxy_listening=bridge.proxy_nodes.listening,
+            core_memory=core.restored(),
         )
 
     def _cpu_share(self) -> float | None:
-        """Looked at now and then: between two snapshots that follow each other there is nothing to see."""
+        """Percent of one core, measured over ``limits.CPU_INTERVAL`` or longer."""
         now = time.monotonic()
         if now - self._cpu_known >= limits.CPU_INTERVAL:
             with contextlib.suppress(OSError):  # no file descriptor is left to read /proc

@@ -1,10 +1,10 @@
-"""The topics' part of the snapshot: the local graph, what crosses the mesh, and how well."""
+"""The topics in the snapshot: the local graph, the routes across the mesh, and their figures."""
 
 from __future__ import annotations
 
 import math
 from itertools import chain
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -16,7 +16,7 @@ from rmpa.bridge.topics.imports import RouteState
 from rmpa.config.param_rules import CLOCK
 from rmpa.core import limits
 from rmpa.core.contract import KEYS, Contract, Contracts
-from rmpa.observe.snapshot import EventInfo, LatencyInfo, LatencySpread, RouteInfo, TopicInfo, UnreachableInfo
+from rmpa.observe.snapshot import EventInfo, LatencyInfo, RouteInfo, SampleSpread, TopicInfo, UnreachableInfo
 from rmpa.ros.wire.tcpros import LENGTH
 from rmpa.runtime.event_loop import breathing_sorted, yield_to_data, yielding_to_data
 from rmpa.runtime.system_clock import SystemClock
@@ -24,13 +24,14 @@ from rmpa.runtime.system_clock import SystemClock
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
+    from rmpa.bridge.data.losses import ReceptionHistory
     from rmpa.bridge.data.peer_clock import PeerClock
+    from rmpa.bridge.data.qos_events import QosWatch
     from rmpa.bridge.data.quality import QualitySummary
     from rmpa.bridge.io.bridge import Bridge, PeerSession
     from rmpa.bridge.topics.exports import LocalSource
     from rmpa.bridge.topics.imports import RemoteTopic
     from rmpa.config.settings import Settings
-    from rmpa.core.stats import SampleSummary
     from rmpa.observe.io.peer_clocks import PeerClocks
     from rmpa.ros.core.api import Core
 
@@ -38,7 +39,7 @@ _DEFAULT = Contract()
 
 
 def unreachable_infos(core: Core, now: float) -> tuple[UnreachableInfo, ...]:
-    """The nodes of the local graph that nothing can connect to, by name.
+    """The nodes of the local graph to which no connection can be made, by name.
 
     Args:
         core: The agent's.
@@ -53,9 +54,9 @@ def unreachable_infos(core: Core, now: float) -> tuple[UnreachableInfo, ...]:
 
 
 class TopicsSection:
-    """Reads what is known of topics; changes nothing.
+    """Reads what core and bridge know of topics; changes nothing.
 
-    Data may go on between two topics, and change the plan: what is iterated over is a copy.
+    It yields to data between two topics. What it iterates over is a copy, because data may change the routes.
 
     Args:
         settings: The agent's.
@@ -78,7 +79,7 @@ class TopicsSection:
         self._follow = settings.time.follow
 
     def infos(self, wanted: Collection[str] | None = None) -> tuple[TopicInfo, ...]:
-        """Every topic of the graph and every one that peers offer, by name; or those that are wanted."""
+        """All topics of the local graph and of the peers, by name; or those that are wanted."""
         state = self._core.state()
         routes: dict[str, list[RouteInfo]] = {}
         mismatches: dict[str, list[str]] = {}
@@ -90,63 +91,51 @@ class TopicsSection:
         names: Iterable[str] = chain(*tables) if wanted is None else wanted
         known = {name for name in yielding_to_data(names) if any(name in table for table in tables)}
         unreachable = {info.node: str(info) for info in unreachable_infos(self._core, self._clock.now())}
-        return tuple(
-            self._topic(
-                name,
-                state.types.get(name, ""),
-                tuple(node for node in state.publishers.get(name, {}) if not is_own(node)),
-                tuple(node for node in state.subscribers.get(name, {}) if not is_own(node)),
-                tuple(routes.get(name, ())),
-                tuple(mismatches.get(name, ())),
-                tuple(text for node in state.publishers.get(name, {}) if (text := unreachable.get(node))),
+        found = []
+        for name in breathing_sorted(known):
+            yield_to_data()
+            nodes, type_name = tuple(state.publishers.get(name, ())), state.types.get(name, "")
+            own, crossing = tuple(node for node in nodes if not is_own(node)), tuple(routes.get(name, ()))
+            decision = self._decision(name, type_name, own[0] if own else "/")
+            topic = TopicInfo(
+                name=name,
+                type=type_name or next((route.type for route in crossing), ""),
+                md5=next((route.md5 for route in crossing if route.md5), ""),
+                publishers=own,
+                subscribers=tuple(node for node in state.subscribers.get(name, ()) if not is_own(node)),
+                routes=crossing,
+                crosses=decision.allowed,
+                policy=decision.rule,
+                mismatches=tuple(mismatches.get(name, ())),
+                unreachable=tuple(unreachable[node] for node in nodes if node in unreachable),
             )
-            for name in breathing_sorted(known)
-        )
+            found.append(topic)
+        return tuple(found)
 
-    def _topic(
-        self,
-        name: str,
-        type_name: str,
-        publishers: tuple[str, ...],
-        subscribers: tuple[str, ...],
-        routes: tuple[RouteInfo, ...],
-        mismatches: tuple[str, ...],
-        unreachable: tuple[str, ...],
-    ) -> TopicInfo:
-        yield_to_data()
-        decision = self._policy.judge(name, type_name, publishers[0] if publishers else "/")
+    def _decision(self, name: str, type_name: str, node: str) -> PolicyDecision:
+        """Whether a topic of this module may cross."""
+        decision = self._policy.judge(name, type_name, node)
         if name == CLOCK and self._follow and not decision.allowed:
             text = f'time.follow = "{self._follow}": that module\'s comes here; one of this module stays home'
-            decision = PolicyDecision(True, text)
-        return TopicInfo(
-            name=name,
-            type=type_name or next((route.type for route in routes), ""),
-            md5=next((route.md5 for route in routes if route.md5), ""),
-            publishers=publishers,
-            subscribers=subscribers,
-            routes=routes,
-            crosses=decision.allowed,
-            policy=decision.rule,
-            mismatches=mismatches,
-            unreachable=unreachable,
-        )
+            return PolicyDecision(True, text)
+        return decision
 
     def _inbound(self, wanted: Collection[str] | None) -> Iterator[tuple[Source, RouteInfo, list[str]]]:
-        """Each source of a peer, its route, and what did not fit it."""
-        attached = {at.peer: at for at in self._bridge.everyone()}
+        """Each source of a peer with its route, and its mismatches."""
+        sessions = {at.peer: at for at in self._bridge.everyone()}
         self._clocks.follow(self._clock.now())
-        clocks = {peer: self._clocks[peer] for peer in attached}
+        clocks = {peer: self._clocks[peer] for peer in sessions}
         for peer, source, entry in yielding_to_data(list(self._bridge.imports)):
             if wanted is not None and entry.topic not in wanted:
                 continue
             yield_to_data()
-            at = attached[peer]
+            at = sessions[peer]
             texts = [f"{at.link.name}: {entry.hidden}"] if entry.conflict else []
             texts += self._bridge.mismatches(source)
             yield Source(entry.topic, source.node), self._import(at, source, entry, clocks[peer]), texts
 
     def _left_out(self, wanted: Collection[str] | None) -> Iterator[tuple[Source, RouteInfo, list[str]]]:
-        """What peers offer beyond ``limits.topics``."""
+        """The topics of peers beyond ``limits.topics``, which are hidden."""
         names = {at.peer: at.link.name for at in self._bridge.everyone()}
         for peer, topic, offer in self._bridge.imports.left_out():
             if wanted is not None and topic not in wanted:
@@ -173,52 +162,43 @@ class TopicsSection:
         flow = at.inbound.flow(source, entry.route)
         publication = at.inbound.publication(source)
         past = at.inbound.past(source) if flow is None else None
-        happened = flow.watch if flow is not None else past
-        latched = entry.description.latching if entry.description else False
-        now = self._clock.now()
-        quality = flow.quality.summary(clock, now, latching=latched) if flow else None
+        about, now = entry.description, self._clock.now()
+        latched = about.latching if about is not None else False
         problem = at.inbound.problems.get(source.node, "")
         if not problem and entry.state is not RouteState.OPEN:
             problem = entry.problem
-        return RouteInfo(
+        info = RouteInfo(
             peer=at.link.name,
             node=source.node,
             direction="in",
             wire=source.topic if source.topic != entry.topic else "",
             state="hidden" if not entry.shown else entry.state.name.lower(),
             type=entry.type,
-            md5=entry.description.md5 if entry.description else "",
-            messages=quality.messages if quality else 0,
-            bytes=quality.bytes - LENGTH.size * quality.messages if quality else 0,
-            dropped=publication.dropped if publication else 0,
-            lost=flow.lost if flow else past.lost if past else 0,
-            oversized=flow.oversized if flow else 0,
-            oversized_bytes=flow.oversized_bytes if flow else 0,
-            late=flow.late + flow.stale if flow else 0,
-            expired=flow.expired if flow else 0,
-            lane=flow.lane if flow else "",
-            events={kind.value: count for kind, count in happened.counts.items()} if happened else {},
-            recent=tuple(
-                EventInfo(kind=event.kind.value, count=event.count, text=event.text, ago=now - event.now)
-                for event in happened.recent
-            )
-            if happened
-            else (),
-            age=quality.age if quality else None,
-            rate=_known(quality.rate) if quality else None,
-            bandwidth=_known(quality.bandwidth - LENGTH.size * quality.rate) if quality else None,
-            period=_spread(quality.period) if quality else None,
-            jitter=_known(quality.jitter) if quality else None,
-            latency=_latency(quality) if quality else None,
+            md5=about.md5 if about is not None else "",
+            dropped=publication.dropped if publication is not None else 0,
+            lost=past.lost if past is not None else 0,
             latched=latched,
             contract=_contract(entry.contract or self._contracts.of(source.topic, entry.type)),
             problem=entry.hidden or problem,
             limit="nodes" if entry.crowded else "",
+            **_events(flow.watch if flow is not None else past, now),
+        )
+        if flow is None:
+            return info
+        return msgspec.structs.replace(
+            info,
+            lost=flow.lost,
+            oversized=flow.oversized,
+            oversized_bytes=flow.oversized_bytes,
+            late=flow.late + flow.stale,
+            expired=flow.expired,
+            lane=flow.lane,
+            **_figures(flow.quality.summary(clock, now, latching=latched)),
         )
 
     def _outbound(self, wanted: Collection[str] | None) -> Iterator[tuple[Source, RouteInfo | None, list[str]]]:
-        """Each source of ours with what did not fit it, and its route to each peer that wants it."""
-        names = {attached.peer: attached.link.name for attached in self._bridge.attached()}
+        """Each source of this module with its mismatches, and then with its route to each peer that wants it."""
+        names = {session.peer: session.link.name for session in self._bridge.attached()}
         for source, local in yielding_to_data(list(self._bridge.exports.offered.items())):
             if wanted is not None and source.topic not in wanted:
                 continue
@@ -232,7 +212,7 @@ class TopicsSection:
                     yield source, self._away(self._export(source, local, peer, "", away), peer), []
 
     def _away(self, route: RouteInfo, peer: int) -> RouteInfo:
-        """A reliable route whose peer has no link, or has not asked for it again."""
+        """A reliable route whose peer has no link, or has not opened it again."""
         name, seconds = self._bridge.losses.away(peer)
         keeps = float(route.contract.get("outage") or limits.RESUME_WINDOW)
         if seconds < keeps:
@@ -247,26 +227,31 @@ class TopicsSection:
     ) -> RouteInfo:
         about = self._bridge.exports.description(source)
         flow = self._bridge.outbound.flows.get(source)
-        leg = flow.by_peer.get(peer) if flow else None
+        sender = flow.by_peer.get(peer) if flow is not None else None
         offer = self._bridge.exports.offer(peer, source)
-        return RouteInfo(
+        info = RouteInfo(
             peer=name,
             node=source.node,
             direction="out",
             state="open",
             type=local.type,
-            md5=about.md5 if about else "",
-            messages=flow.messages if flow else 0,
-            bytes=flow.bytes - LENGTH.size * flow.messages if flow else 0,
-            dropped=flow.dropped if flow else 0,
+            md5=about.md5 if about is not None else "",
             lost=self._bridge.outbound.lost(source, peer),
-            kept=leg.sender.pending if isinstance(leg, ReliableRouteSender) else 0,
-            oversized=flow.oversized if flow else 0,
-            oversized_bytes=flow.oversized_bytes if flow else 0,
-            latched=about.latching if about else False,
+            kept=sender.sender.pending if isinstance(sender, ReliableRouteSender) else 0,
+            latched=about.latching if about is not None else False,
             wire=offer.topic if offer is not None and offer.topic != source.topic else "",
-            lane=leg.lane if leg else "",
+            lane=sender.lane if sender is not None else "",
             contract=_contract(contract or self._contracts.of(source.topic, local.type)),
+        )
+        if flow is None:
+            return info
+        return msgspec.structs.replace(
+            info,
+            messages=flow.messages,
+            bytes=flow.bytes - LENGTH.size * flow.messages,
+            dropped=flow.dropped,
+            oversized=flow.oversized,
+            oversized_bytes=flow.oversized_bytes,
         )
 
 
@@ -274,37 +259,34 @@ def _known(figure: float) -> float | None:
     return None if math.isnan(figure) else figure
 
 
-def _spread(summary: SampleSummary) -> LatencySpread | None:
-    if not summary.count:
-        return None
-    return LatencySpread(
-        count=summary.count,
-        mean=summary.mean,
-        sd=summary.sd,
-        min=summary.minimum,
-        max=summary.maximum,
-        p50=summary.p50,
-        p99=summary.p99,
-    )
+def _figures(quality: QualitySummary) -> dict[str, Any]:
+    """The fields of a route that its quality gives."""
+    latency = None
+    if quality.latency is not None and quality.latency_last is not None and quality.latency_error is not None:
+        latency = LatencyInfo.of(quality.latency, last=quality.latency_last, error=quality.latency_error)
+    return {
+        "messages": quality.messages,
+        "bytes": quality.bytes - LENGTH.size * quality.messages,
+        "age": quality.age,
+        "rate": _known(quality.rate),
+        "bandwidth": _known(quality.bandwidth - LENGTH.size * quality.rate),
+        "period": SampleSpread.of(quality.period) if quality.period.count else None,
+        "jitter": _known(quality.jitter),
+        "latency": latency,
+    }
 
 
-def _latency(quality: QualitySummary) -> LatencyInfo | None:
-    s, last, error = quality.latency, quality.latency_last, quality.latency_error
-    if s is None or last is None or error is None:
-        return None
-    return LatencyInfo(
-        count=s.count,
-        mean=s.mean,
-        sd=s.sd,
-        min=s.minimum,
-        max=s.maximum,
-        p50=s.p50,
-        p99=s.p99,
-        last=last,
-        error=error,
+def _events(watch: QosWatch | ReceptionHistory | None, now: float) -> dict[str, Any]:
+    """The fields of a route that its contract's events give."""
+    if watch is None:
+        return {}
+    recent = tuple(
+        EventInfo(kind=event.kind.value, count=event.count, text=event.text, ago=now - event.now)
+        for event in watch.recent
     )
+    return {"events": {kind.value: count for kind, count in watch.counts.items()}, "recent": recent}
 
 
 def _contract(contract: Contract) -> dict[str, str | float | None]:
-    """What is not the default."""
+    """The fields that differ from the default."""
     return {key: getattr(contract, key) for key in KEYS if getattr(contract, key) != getattr(_DEFAULT, key)}

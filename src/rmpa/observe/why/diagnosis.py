@@ -1,56 +1,29 @@
-"""What ``rmpa why`` is made of: stages with their evidence, and what either side knows of a topic."""
+"""What ``rmpa why`` is made of: the stages of a path, and what the agents at its two ends know."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from enum import StrEnum
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
 
 import msgspec
 
+from rmpa.observe.check import FAIL, Check
+
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from rmpa.observe.snapshot import Snapshot
 
 
-class StageResult(StrEnum):
-    """What became of a stage."""
-
-    OK = "ok"
-    WARN = "warn"
-    """It works, though something about it is worth knowing."""
-    FAIL = "fail"
-    """Here it ends."""
-    UNKNOWN = "unknown"
-    """Nobody could tell; the walk goes on."""
-
-
-class PathStage(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One stage on the way.
-
-    Attributes:
-        name: What it is about, a word or two.
-        verdict: What became of it.
-        text: The evidence, ready to read.
-        remedy: What to do, where something is to be done.
-    """
-
-    name: str
-    verdict: StageResult
-    text: str
-    remedy: str = ""
-
-
 class Diagnosis(msgspec.Struct, frozen=True, kw_only=True):
-    """One way from a publisher (or server) in one module to those who use it in another.
+    """The path of a topic (service) from its publisher (server) in one module to its users in another.
 
     Attributes:
         kind: ``topic`` or ``service``.
-        name: The name in the graph of the module that diagnoses.
-        peer: The module that it comes from.
-        to: The module that it goes to.
-        node: The publisher (server), by its name over there; empty where there is none.
+        name: Its name in the graph of the module that diagnoses.
+        peer: The module of the publisher (server).
+        to: The module of the users.
+        node: The publisher (server), by its name in its own module; empty where there is none.
         flows: Whether it gets through.
         stages: From the peer to the reader, up to the first that fails.
     """
@@ -61,33 +34,51 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True):
     to: str
     node: str = ""
     flows: bool
-    stages: tuple[PathStage, ...]
+    stages: tuple[Check, ...]
+
+    @classmethod
+    def of(
+        cls, stages: tuple[Check, ...], *, name: str, peer: str, to: str, node: str = "", kind: str = "topic"
+    ) -> Self:
+        """The diagnosis that follows from the stages: it flows if none of them fails."""
+        flows = all(stage.level is not FAIL for stage in stages)
+        return cls(kind=kind, name=name, peer=peer, to=to, node=node, flows=flows, stages=stages)
 
     @property
-    def failed(self) -> PathStage | None:
+    def failed(self) -> Check | None:
         """The first stage that fails."""
-        return next((stage for stage in self.stages if stage.verdict is StageResult.FAIL), None)
+        return next((stage for stage in self.stages if stage.level is FAIL), None)
 
 
-class FarSource(msgspec.Struct, frozen=True, kw_only=True):
+def until_failure(stages: Iterable[Check]) -> tuple[Check, ...]:
+    """The stages up to the first that fails; those behind it are not even asked for."""
+    walked = []
+    for stage in stages:
+        walked.append(stage)
+        if stage.level is FAIL:
+            break
+    return tuple(walked)
+
+
+class PublisherReport(msgspec.Struct, frozen=True, kw_only=True):
     """One publisher, as its own agent sees it.
 
     Attributes:
         node: Its name.
         topic: The topic's name in its own graph.
-        type: Its message type; ``*`` where nobody has told it.
-        crosses: Whether policy over there lets it cross to the one that asks.
+        type: Its message type; ``*`` where it is not known.
+        crosses: Whether the policy of its module lets it cross to the agent that asks.
         rule: The rule that says so.
-        offered: Whether peers are told of it.
-        route: What goes to the one that asks: empty (nothing), ``opening`` (its publisher has not answered) or
-            ``open``.
-        messages: That the agent has had of it since it connected.
-        dropped: Of these, those given up because a link was too slow.
-        lost: Messages of a reliable route to the one that asks that were given up, because it was away for too long.
+        offered: Whether peers are offered it.
+        route: The state of the route to the agent that asks: empty (none), ``opening`` (the publisher has not
+            answered) or ``open``.
+        messages: That came from the publisher since its agent connected to it.
+        dropped: Of these, those that were dropped because a link was too slow.
+        lost: Messages of a reliable route to the agent that asks that were given up after too long an outage.
         oversized: Messages that are too long, and were left out.
         oversized_bytes: The last one's.
-        beyond: That module's ``limits.topics``, if it is not offered because there are more; else 0.
-        unreachable: Why its agent cannot connect to its node, ready to read; empty where it can.
+        beyond: ``limits.topics`` of its module, if it is not offered because there are more; else 0.
+        unreachable: Why its agent cannot connect to it, ready to read; empty where it can.
     """
 
     node: str
@@ -106,37 +97,37 @@ class FarSource(msgspec.Struct, frozen=True, kw_only=True):
     unreachable: str = ""
 
 
-class FarTopic(msgspec.Struct, frozen=True, kw_only=True):
-    """What the publishing side's agent answers.
+class TopicAtPublisher(msgspec.Struct, frozen=True, kw_only=True):
+    """What the publisher's agent knows of a topic; its answer to ``why.topic``.
 
     Attributes:
-        sources: Its module's own publishers of the topic.
-        subscribers: Its module's own subscribers.
-        near: A topic over there of nearly this name, or empty.
-        awaited: Nodes that published it before its agent was restarted, with their addresses, and do not answer now.
-        path_problem: What is wrong with the path from there to the one that asks, ready to read; empty if nothing is
+        sources: The publishers of the topic in its own module.
+        subscribers: The subscribers in its own module.
+        similar: A topic of that module with nearly this name, or empty; ``near`` on the wire.
+        awaited: Nodes that published it before the agent was restarted and do not answer now, with their addresses.
+        path_problem: What is wrong with the network path to the agent that asks, ready to read; empty if nothing is
             known.
         path_remedy: What to do about that.
     """
 
-    sources: tuple[FarSource, ...] = ()
+    sources: tuple[PublisherReport, ...] = ()
     subscribers: tuple[str, ...] = ()
-    near: str = ""
+    similar: str = msgspec.field(default="", name="near")
     awaited: tuple[str, ...] = ()
     path_problem: str = ""
     path_remedy: str = ""
 
 
-class Reader(msgspec.Struct, frozen=True, kw_only=True):
-    """A local subscriber that is connected to a proxy.
+class SubscriberConnection(msgspec.Struct, frozen=True, kw_only=True):
+    """A local subscriber's connection to a proxy.
 
     Attributes:
-        number: The proxy's own number for its connection.
-        node: Its name.
-        held: Whether it waits for the header: the route is not open yet.
-        messages: Handed to its connection, dropped ones included.
-        waiting: Bytes that wait for it to read.
-        dropped: Messages given up because it read too slowly.
+        number: The proxy's number for the connection.
+        node: The subscriber's name.
+        held: Whether it waits for the header, because the route is not open yet.
+        messages: Handed to the connection, dropped ones included.
+        waiting: Bytes in its queue.
+        dropped: Messages dropped because the subscriber read too slowly.
     """
 
     number: int
@@ -148,42 +139,55 @@ class Reader(msgspec.Struct, frozen=True, kw_only=True):
 
 
 @dataclass(frozen=True, slots=True)
-class NearTopic:
-    """What this side knows of one topic of one peer.
+class ProxyState:
+    """What the subscribers' agent knows of the proxy for one publisher.
+
+    Args:
+        name: The proxy's name.
+        registered: Whether it is a publisher of the topic in the local graph.
+        conflict: Whether the publisher's type differs from that of the local publishers.
+        connections: Those of local subscribers.
+        mismatches: The subscribers that were refused here or at the peer, ready to read.
+    """
+
+    name: str = ""
+    registered: bool = False
+    conflict: bool = False
+    connections: tuple[SubscriberConnection, ...] = ()
+    mismatches: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class TopicAtSubscriber:
+    """What the subscribers' agent knows of a topic of one peer.
 
     Args:
         snapshot: The agent's, of this topic at least.
         topic: The topic's name here.
-        carrier: The peer whose link brings it; another one where a relay passes it on.
-        only: The carrier's nodes that are the peer's; ``None`` for all.
-        proxies: What stands here for each node.
-        registered: Nodes of the peer whose proxies are in the local graph as publishers of it.
-        conflict: Nodes of the peer whose type is another one than that of the local publishers.
-        readers: Who is connected to the proxy of each node of the peer.
-        mismatches: Who was refused there or here, ready to read, by node of the peer.
+        carrier: The peer whose link carries it; another one where a relay passes it on.
+        proxies: Those of the peer's publishers, by the publisher's name; ``None`` without a link.
     """
 
     snapshot: Snapshot
     topic: str
     carrier: str = ""
-    only: frozenset[str] | None = None
-    proxies: Mapping[str, str] = field(default_factory=dict)
-    registered: frozenset[str] = frozenset()
-    conflict: frozenset[str] = frozenset()
-    readers: Mapping[str, tuple[Reader, ...]] = field(default_factory=dict)
-    mismatches: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    proxies: Mapping[str, ProxyState] | None = None
+
+    def proxy(self, node: str) -> ProxyState:
+        """The proxy for a publisher."""
+        return (self.proxies or {}).get(node, ProxyState())
 
 
 @dataclass(frozen=True, slots=True)
-class BothSides:
-    """Both sides at one moment.
+class BothEnds:
+    """What is known at both ends of a topic's path at one moment.
 
     Args:
-        near: This side.
-        far: What the peer's agent answered; ``None`` if it did not.
+        here: At the subscribers' agent.
+        there: At the publisher's agent; ``None`` if it did not answer.
         refusal: Why it did not.
     """
 
-    near: NearTopic
-    far: FarTopic | None = None
+    here: TopicAtSubscriber
+    there: TopicAtPublisher | None = None
     refusal: str = ""

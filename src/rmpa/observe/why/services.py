@@ -1,4 +1,4 @@
-"""Why a service of a peer cannot be called here.
+"""Why a service of a peer cannot be called here: the stages between the client and the server, in order.
 
 The stages::
 
@@ -8,27 +8,29 @@ The stages::
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 import msgspec
 
 from rmpa.bridge import limits
-from rmpa.observe.why.diagnosis import Diagnosis, PathStage, StageResult
+from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
+from rmpa.observe.why.diagnosis import Diagnosis, until_failure
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
-class FarService(msgspec.Struct, frozen=True, kw_only=True):
-    """What the serving side's agent answers.
+class ServiceAtServer(msgspec.Struct, frozen=True, kw_only=True):
+    """What the server's agent knows of a service; its answer to ``why.service``.
 
     Attributes:
         node: The node of its module that provides the service; empty if none does.
         service: The service's name in its own graph.
-        crosses: Whether policy over there lets it cross to the one that asks.
+        crosses: Whether the policy of its module lets it cross to the agent that asks.
         rule: The rule that says so.
-        refusal: Why its server did not answer its own agent's probe, or empty.
-        near: A service over there of nearly this name, or empty.
+        refusal: Why the server did not answer its own agent's probe, or empty.
+        similar: A service of that module with nearly this name, or empty; ``near`` on the wire.
     """
 
     node: str = ""
@@ -36,25 +38,25 @@ class FarService(msgspec.Struct, frozen=True, kw_only=True):
     crosses: bool = True
     rule: str = ""
     refusal: str = ""
-    near: str = ""
+    similar: str = msgspec.field(default="", name="near")
 
 
 @dataclass(frozen=True, slots=True)
-class NearService:
-    """What this side knows of a service of one peer.
+class ServiceAtClient:
+    """What the clients' agent knows of a service of one peer.
 
     Args:
-        wire: Its name over there.
+        wire: Its name at the peer.
         offered: Whether the peer has offered it.
-        node: Its node over there.
+        node: Its node at the peer.
         hidden: Why it is not shown here, or empty.
-        registered: Whether a client that asks the local core is sent to it.
-        answer: What a probe brought: its type and md5 sum; empty if it was refused.
+        registered: Whether the local core sends clients to it.
+        answer: The type and md5 sum that a probe brought; empty if it was refused.
         refusal: Why the probe was refused, or empty.
-        calls: From here, so far.
+        calls: The number of calls from here.
         failed: Of these.
-        problem: Of the last one that failed on our way.
-        mismatch: What a client was told whose definition is another one, or empty.
+        problem: Why the last one failed, if it did not reach the server.
+        mismatch: What a client with another definition was told, or empty.
     """
 
     wire: str = ""
@@ -70,81 +72,79 @@ class NearService:
     mismatch: str = ""
 
 
-_OK: Final = StageResult.OK
-_FAIL: Final = StageResult.FAIL
-_NOTHING: Final = NearService()
+_NOTHING: Final = ServiceAtClient()
 
 
-def walk_service(
-    begin: tuple[PathStage, ...],
+def diagnose_service(
+    begin: tuple[Check, ...],
     to: str,
     peer: str,
     service: str,
-    near: NearService = _NOTHING,
-    far: FarService | None = None,
+    here: ServiceAtClient = _NOTHING,
+    there: ServiceAtServer | None = None,
     refusal: str = "",
 ) -> Diagnosis:
-    """Walk all stages.
+    """Judge all stages.
 
     Args:
         begin: Those of the peer and its link.
         to: This module.
-        peer: The one that should provide it.
+        peer: The module that should provide it.
         service: Its name here.
-        near: What is known here.
-        far: What the peer's agent answered; ``None`` if it did not.
+        here: What is known here.
+        there: What the peer's agent answered; ``None`` if it did not.
         refusal: Why it did not.
     """
-    stages = list(begin)
-    if begin[-1].verdict is not _FAIL:
-        for stage in _stages(peer, service, near, far, refusal):
-            stages.append(stage)
-            if stage.verdict is _FAIL:
-                break
-    node = (far.node if far is not None else "") or near.node
-    flows = stages[-1].verdict is not _FAIL
-    return Diagnosis(kind="service", name=service, peer=peer, to=to, node=node, flows=flows, stages=tuple(stages))
+    stages = until_failure(chain(begin, _stages(peer, service, here, there, refusal)))
+    node = (there.node if there is not None else "") or here.node
+    return Diagnosis.of(stages, kind="service", name=service, peer=peer, to=to, node=node)
 
 
-def _stages(peer: str, service: str, near: NearService, far: FarService | None, refusal: str) -> Iterator[PathStage]:
-    yield from _there(peer, near.wire or service, near, far, refusal)
-    if not near.offered:
+def _stages(
+    peer: str, service: str, here: ServiceAtClient, there: ServiceAtServer | None, refusal: str
+) -> Iterator[Check]:
+    yield from _at_server(peer, here.wire or service, here, there, refusal)
+    if not here.offered:
         remedy = (
             f"if it stays so for more than {limits.RECONCILE_INTERVAL:g} s, it is a bug of ours: both logs, please"
         )
-        yield PathStage("offer", _FAIL, f"the offer of {peer} has not come here", remedy)
-    yield PathStage("offer", _OK, f"{peer} offers it")
-    if near.hidden:
-        yield PathStage("shown", _FAIL, f"it is not shown here: {near.hidden}", _unhide(near.hidden))
-    was = f" (its {near.wire})" if near.wire not in ("", service) else ""
-    yield PathStage("shown", _OK, f"it is {service} here{was}")
-    if not near.registered:
+        yield Check("offer", FAIL, f"the offer of {peer} has not come here", remedy)
+    yield Check("offer", OK, f"{peer} offers it")
+    if here.hidden:
+        yield Check("shown", FAIL, f"it is not shown here: {here.hidden}", _unhide(here.hidden))
+    was = f" (its {here.wire})" if here.wire not in ("", service) else ""
+    yield Check("shown", OK, f"it is {service} here{was}")
+    if not here.registered:
         remedy = f"it is put there again within {limits.RECONCILE_INTERVAL:g} s; if not, the agent's log says why"
-        yield PathStage("graph", _FAIL, "the local core does not have it", remedy)
-    yield PathStage("graph", _OK, "the local core sends clients to it")
-    yield _answer(peer, near)
-    yield _calls(near)
+        yield Check("graph", FAIL, "the local core does not have it", remedy)
+    yield Check("graph", OK, "the local core sends clients to it")
+    yield _answer(peer, here)
+    yield _calls(here)
 
 
-def _there(peer: str, wire: str, near: NearService, far: FarService | None, refusal: str) -> Iterator[PathStage]:
-    if far is None:
-        verdict = StageResult.UNKNOWN if near.offered else _FAIL
-        yield PathStage(
-            "server", verdict, f"{peer} does not tell ({refusal})", f"ask on {peer}: rosservice info {wire}"
-        )
+def _at_server(
+    peer: str, wire: str, here: ServiceAtClient, there: ServiceAtServer | None, refusal: str
+) -> Iterator[Check]:
+    if there is None:
+        level = UNKNOWN if here.offered else FAIL
+        yield Check("server", level, f"{peer} does not tell ({refusal})", f"ask on {peer}: rosservice info {wire}")
         return
-    if not far.node:
-        remedy = f"did you mean {far.near}?" if far.near else f"start its server there (on {peer}: rosservice list)"
-        yield PathStage("server", _FAIL, f"no node of {peer} provides {wire}", remedy)
-    was = f" as {far.service}" if far.service not in ("", wire) else ""
-    if far.refusal:
-        text = f"{far.node} on {peer} is registered for it, and does not answer: {far.refusal}"
-        yield PathStage("server", _FAIL, text, f"is it stopped, or dead? on {peer}: rosnode ping {far.node}")
-    yield PathStage("server", _OK, f"{far.node} on {peer} provides it{was}")
-    if not far.crosses:
+    if not there.node:
+        remedy = (
+            f"did you mean {there.similar}?"
+            if there.similar
+            else f"start its server there (on {peer}: rosservice list)"
+        )
+        yield Check("server", FAIL, f"no node of {peer} provides {wire}", remedy)
+    was = f" as {there.service}" if there.service not in ("", wire) else ""
+    if there.refusal:
+        text = f"{there.node} on {peer} is registered for it, and does not answer: {there.refusal}"
+        yield Check("server", FAIL, text, f"is it stopped, or dead? on {peer}: rosnode ping {there.node}")
+    yield Check("server", OK, f"{there.node} on {peer} provides it{was}")
+    if not there.crosses:
         remedy = f"change [services] or [[peer]] in the rmpa.toml of {peer}, and `rmpa reload` there"
-        yield PathStage("policy there", _FAIL, f"{peer} keeps it at home: {far.rule}", remedy)
-    yield PathStage("policy there", _OK, f"{peer} lets it cross: {far.rule}")
+        yield Check("policy there", FAIL, f"{peer} keeps it at home: {there.rule}", remedy)
+    yield Check("policy there", OK, f"{peer} lets it cross: {there.rule}")
 
 
 def _unhide(hidden: str) -> str:
@@ -153,18 +153,18 @@ def _unhide(hidden: str) -> str:
     return "a graph has one provider for each service; give one of them another name (prefix or remap_in of [[peer]])"
 
 
-def _answer(peer: str, near: NearService) -> PathStage:
-    if near.answer:
-        return PathStage("answer", _OK, f"its server answers: {near.answer}")
-    return PathStage(
-        "answer", _FAIL, near.refusal or "no answer", f"is the server on {peer} alive? its node's log may tell"
+def _answer(peer: str, here: ServiceAtClient) -> Check:
+    if here.answer:
+        return Check("answer", OK, f"its server answers: {here.answer}")
+    return Check(
+        "answer", FAIL, here.refusal or "no answer", f"is the server on {peer} alive? its node's log may tell"
     )
 
 
-def _calls(near: NearService) -> PathStage:
-    text = f"{near.calls} from here, {near.failed} of them failed"
-    if near.mismatch:
-        return PathStage("calls", StageResult.WARN, near.mismatch, "build both sides with one version of the service")
-    if near.problem:
-        return PathStage("calls", StageResult.WARN, f"{text}; the last time: {near.problem}", "docs/services.md")
-    return PathStage("calls", _OK, text)
+def _calls(here: ServiceAtClient) -> Check:
+    text = f"{here.calls} from here, {here.failed} of them failed"
+    if here.mismatch:
+        return Check("calls", WARN, here.mismatch, "build both sides with one version of the service")
+    if here.problem:
+        return Check("calls", WARN, f"{text}; the last time: {here.problem}", "docs/services.md")
+    return Check("calls", OK, text)

@@ -1,7 +1,6 @@
-"""Why a topic of a peer does not arrive here: the stages between its publisher and its reader, walked in order.
+"""Why a topic of a peer does not arrive here: the stages between its publisher and its subscribers, in order.
 
-Pure: what is known on both sides goes in, stages with their evidence come out, and the first that fails says what to
-do. The stages::
+Pure: what both ends know goes in, stages come out, and the first that fails says what to do. The stages::
 
     peer ─ link ─ publisher ─ policy there ─ offer ─ limit ─ policy here ─ type ─ graph ─ subscriber ─ md5 ─ route
          ─ sent ─ arrived ─ contract ─ reader
@@ -9,64 +8,65 @@ do. The stages::
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits as bridge_limits
 from rmpa.config import limits as config_limits
 from rmpa.config.values import did_you_mean
 from rmpa.mesh import limits as mesh_limits
-from rmpa.observe.why.diagnosis import Diagnosis, PathStage, StageResult
+from rmpa.observe.check import FAIL, OK, UNKNOWN, WARN, Check
+from rmpa.observe.why.diagnosis import Diagnosis, until_failure
 from rmpa.ros import limits as ros_limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rmpa.observe.snapshot import PeerInfo, RouteInfo, Snapshot
-    from rmpa.observe.why.diagnosis import BothSides, FarSource, NearTopic
+    from rmpa.observe.why.diagnosis import BothEnds, PublisherReport, TopicAtSubscriber
 
 
-_OK, _WARN, _FAIL, _UNKNOWN = StageResult.OK, StageResult.WARN, StageResult.FAIL, StageResult.UNKNOWN
 _SEVERAL: Final = 2
-"""Messages of which one may be on its way."""
+"""Messages sent without one arriving that count as a fault: a single one may still be on its way."""
 _FLOWING: Final = frozenset({"open", "lingering"})
 
 
 def find_peer(snapshot: Snapshot, name: str) -> PeerInfo | None:
-    """The peer of a name or a GUID; of several that share the name, a linked one."""
+    """The peer with a name or GUID; of several peers of one name, a linked one."""
     fitting = [p for p in snapshot.peers if name in (p.name, p.guid, p.guid.partition("#")[0])]
     return min(fitting, key=lambda p: p.state != "linked", default=None)
 
 
-def walk_peer(snapshot: Snapshot, name: str) -> tuple[PathStage, ...]:
+def peer_stages(snapshot: Snapshot, name: str) -> tuple[Check, ...]:
     """The first two stages: whether the peer is known, and whether it is linked."""
     agent = snapshot.agent
     peer = find_peer(snapshot, name)
     if peer is None:
         where = ", ".join(agent.interfaces) or "no interface"
         known = [p.name for p in snapshot.peers]
-        near = did_you_mean(name, known)
+        similar = did_you_mean(name, known)
         text = f"{agent.name} knows no peer {name!r} (domain {agent.domain}, looking on {where}); "
         text += f"known are {', '.join(known)}" if known else "it knows no peer at all"
-        remedy = f"did you mean {near}? If not, " if near else ""
+        remedy = f"did you mean {similar}? If not, " if similar else ""
         remedy += (
             f"see that `rmpa up` runs there with --domain {agent.domain}; `rmpa doctor` on both checks multicast, "
             "and --seed HOST:PORT reaches it where there is none"
         )
-        return (PathStage("peer", _FAIL, text, remedy),)
+        return (Check("peer", FAIL, text, remedy),)
     if peer.conflicts:
         texts, remedies = zip(*(conflict.partition("; ")[::2] for conflict in peer.conflicts), strict=True)
         remedy = "; ".join(filter(None, remedies)) or "give each module a --name and an address of its own"
-        return (PathStage("peer", _FAIL, "; ".join(texts), remedy),)
+        return (Check("peer", FAIL, "; ".join(texts), remedy),)
     if peer.state == "relayed":
-        heard = PathStage("peer", _OK, f"{peer.name} is known ({peer.guid})")
-        return (heard, PathStage("link", _OK, f"no link of its own; {peer.via} passes on what it publishes"))
-    found = PathStage("peer", _OK, f"{peer.name} is known, by {peer.source or 'its link'} ({peer.guid})")
+        heard = Check("peer", OK, f"{peer.name} is known ({peer.guid})")
+        return (heard, Check("link", OK, f"no link of its own; {peer.via} passes on what it publishes"))
+    found = Check("peer", OK, f"{peer.name} is known, by {peer.source or 'its link'} ({peer.guid})")
     if peer.state != "linked" or peer.link is None:
         return (found, _unlinked(peer))
     return (found, _linked(peer))
 
 
-def _unlinked(peer: PeerInfo) -> PathStage:
+def _unlinked(peer: PeerInfo) -> Check:
     text = f"{peer.name} is {peer.state}"
     if peer.last_error:
         text += f": {peer.last_error}"
@@ -79,319 +79,317 @@ def _unlinked(peer: PeerInfo) -> PathStage:
     )
     if peer.state == "refused":
         remedy = "do what the text says; both sides are asked again by themselves"
-    return PathStage("link", _FAIL, text, remedy)
+    return Check("link", FAIL, text, remedy)
 
 
-def _linked(peer: PeerInfo) -> PathStage:
+def _linked(peer: PeerInfo) -> Check:
     link = peer.link
-    assert link is not None  # noqa: S101 - asked before
+    assert link is not None  # noqa: S101 - the caller has looked
     text = f"linked by {link.remote} for {link.up_ago:.0f} s"
     if link.rtt is not None:
         text += f", round trip {link.rtt * 1e3:.1f} ms"
     if link.heard_ago is not None and link.heard_ago > mesh_limits.LINK_LEASE / 2:
         text += f"; silent for {link.heard_ago:.1f} s"
-        return PathStage("link", _WARN, text, "if it stays so, the cable or the radio is the place to look at")
+        return Check("link", WARN, text, "if it stays so, the cable or the radio is the place to look at")
     if link.path_problem:
-        return PathStage("link", _WARN, f"{text}; {link.path_problem}", link.path_remedy)
-    return PathStage("link", _OK, text)
+        return Check("link", WARN, f"{text}; {link.path_problem}", link.path_remedy)
+    return Check("link", OK, text)
 
 
-def walk_topic(sight: BothSides, peer: str, later: BothSides | None = None, wire: str = "") -> tuple[Diagnosis, ...]:
-    """Walk all stages for each publisher that a peer has of a topic.
+def diagnose_topic(ends: BothEnds, peer: str, later: BothEnds | None = None, wire: str = "") -> tuple[Diagnosis, ...]:
+    """Judge all stages for each publisher that a peer has of a topic.
 
     Args:
-        sight: Both sides.
-        peer: Its name (or GUID), as the user wrote it.
-        later: Both sides some time after, so that what moves can be told from what stands.
-        wire: The topic's name over there; ours if empty.
+        ends: What both ends know.
+        peer: The peer's name (or GUID), as the user wrote it.
+        later: The same some time after, which shows whether messages move.
+        wire: The topic's name at the peer; the one here if empty.
 
     Returns:
-        One diagnosis for each publisher; one alone where the walk ends before there is any.
+        One diagnosis for each publisher; a single one where a stage before the publishers fails.
     """
-    near = sight.near
-    snapshot = near.snapshot
+    snapshot, topic = ends.here.snapshot, ends.here.topic
     to = snapshot.agent.name
     known = find_peer(snapshot, peer)
     name = known.name if known is not None else peer
-    wire = wire or near.topic
-    begin = walk_peer(snapshot, peer)
-    if known is not None and begin[-1].verdict is not _FAIL:
-        begin += (_published(sight, name, wire),)
-    if known is None or begin[-1].verdict is _FAIL:
-        return (_diagnosis(near, name, to, "", begin),)
-    nodes = _nodes(sight, name)
-    found = []
-    for node in nodes:
-        stages = list(begin)
-        for stage in _source_stages(sight, later, name, node, wire):
-            stages.append(stage)
-            if stage.verdict is _FAIL:
-                break
-        found.append(_diagnosis(near, name, to, node, tuple(stages)))
-    return tuple(found)
+    wire = wire or topic
+    begin = peer_stages(snapshot, peer)
+    if begin[-1].level is not FAIL:
+        begin += (_published(ends, name, wire),)
+    if begin[-1].level is FAIL:
+        return (Diagnosis.of(begin, name=topic, peer=name, to=to),)
+    return tuple(
+        Diagnosis.of(
+            until_failure(chain(begin, _source_stages(ends, later, name, node, wire))),
+            name=topic,
+            peer=name,
+            to=to,
+            node=node,
+        )
+        for node in _nodes(ends, name)
+    )
 
 
-def _diagnosis(near: NearTopic, peer: str, to: str, node: str, stages: tuple[PathStage, ...]) -> Diagnosis:
-    flows = all(stage.verdict is not _FAIL for stage in stages)
-    return Diagnosis(name=near.topic, peer=peer, to=to, node=node, flows=flows, stages=stages)
+def _nodes(ends: BothEnds, peer: str) -> list[str]:
+    reported = [source.node for source in ends.there.sources] if ends.there is not None else []
+    known = [route.node for route in _routes(ends.here, peer)]
+    return list(dict.fromkeys([*reported[: bridge_limits.WHY_SOURCES_MAX], *known]))[: bridge_limits.WHY_SOURCES_MAX]
 
 
-def _nodes(sight: BothSides, peer: str) -> list[str]:
-    far = [source.node for source in sight.far.sources] if sight.far is not None else []
-    known = [route.node for route in _routes(sight.near, peer)]
-    return list(dict.fromkeys([*far[: bridge_limits.WHY_SOURCES_MAX], *known]))[: bridge_limits.WHY_SOURCES_MAX]
+def _routes(here: TopicAtSubscriber, peer: str) -> list[RouteInfo]:
+    topics = [topic for topic in here.snapshot.topics if topic.name == here.topic]
+    routes = [r for t in topics for r in t.routes if r.direction == "in" and r.peer == (here.carrier or peer)]
+    return [route for route in routes if here.proxies is None or route.node in here.proxies]
 
 
-def _routes(near: NearTopic, peer: str) -> list[RouteInfo]:
-    topics = [topic for topic in near.snapshot.topics if topic.name == near.topic]
-    routes = [r for t in topics for r in t.routes if r.direction == "in" and r.peer == (near.carrier or peer)]
-    return [route for route in routes if near.only is None or route.node in near.only]
-
-
-def _far(sight: BothSides | None, node: str) -> FarSource | None:
-    sources = sight.far.sources if sight is not None and sight.far is not None else ()
+def _report(ends: BothEnds | None, node: str) -> PublisherReport | None:
+    sources = ends.there.sources if ends is not None and ends.there is not None else ()
     return next((source for source in sources if source.node == node), None)
 
 
-def _route(sight: BothSides | None, peer: str, node: str) -> RouteInfo | None:
-    routes = _routes(sight.near, peer) if sight is not None else []
+def _route(ends: BothEnds | None, peer: str, node: str) -> RouteInfo | None:
+    routes = _routes(ends.here, peer) if ends is not None else []
     return next((route for route in routes if route.node == node), None)
 
 
-def _published(sight: BothSides, peer: str, wire: str) -> PathStage:
-    far = sight.far
-    if far is None:
-        offered = [route.node for route in _routes(sight.near, peer)]
+def _published(ends: BothEnds, peer: str, wire: str) -> Check:
+    there = ends.there
+    if there is None:
+        offered = [route.node for route in _routes(ends.here, peer)]
         if offered:
-            text = f"its agent does not tell ({sight.refusal}), but it offered {wire} of {', '.join(offered)}"
-            return PathStage("publisher", _UNKNOWN, text)
-        text = f"{peer} offers no {wire}, and its agent does not tell why ({sight.refusal})"
-        return PathStage("publisher", _FAIL, text, f"ask on {peer} itself: rostopic info {wire}")
-    if far.sources:
-        nodes = ", ".join(source.node for source in far.sources)
-        text = f"{nodes} on {peer} publish{'' if len(far.sources) > 1 else 'es'} {wire}"
-        others = {source.topic for source in far.sources} - {"", wire}
-        return PathStage("publisher", _OK, f"{text} ({', '.join(sorted(others))} over there)" if others else text)
-    if far.awaited:
-        text = (
-            f"{', '.join(far.awaited)} published {wire} before the agent of {peer} was restarted, and does not answer"
-        )
+            text = f"its agent does not tell ({ends.refusal}), but it offered {wire} of {', '.join(offered)}"
+            return Check("publisher", UNKNOWN, text)
+        text = f"{peer} offers no {wire}, and its agent does not tell why ({ends.refusal})"
+        return Check("publisher", FAIL, text, f"ask on {peer} itself: rostopic info {wire}")
+    if there.sources:
+        nodes = ", ".join(source.node for source in there.sources)
+        text = f"{nodes} on {peer} publish{'' if len(there.sources) > 1 else 'es'} {wire}"
+        others = {source.topic for source in there.sources} - {"", wire}
+        return Check("publisher", OK, f"{text} ({', '.join(sorted(others))} over there)" if others else text)
+    if there.awaited:
+        nodes = ", ".join(there.awaited)
+        text = f"{nodes} published {wire} before the agent of {peer} was restarted, and does not answer"
         remedy = "it is asked again by itself; is that program stopped or stuck? Else start it again"
-        return PathStage("publisher", _FAIL, text, remedy)
+        return Check("publisher", FAIL, text, remedy)
     text = f"no node of {peer} publishes {wire}"
-    if far.subscribers:
-        text += f"; {', '.join(far.subscribers)} there only subscribe to it"
+    if there.subscribers:
+        text += f"; {', '.join(there.subscribers)} there only subscribe to it"
     remedy = f"start its publisher there, or see `rmpa topic list {peer}:/`"
-    if far.near:
-        remedy = f"did you mean {far.near}?"
-    return PathStage("publisher", _FAIL, text, remedy)
+    if there.similar:
+        remedy = f"did you mean {there.similar}?"
+    return Check("publisher", FAIL, text, remedy)
 
 
-def _source_stages(sight: BothSides, later: BothSides | None, peer: str, node: str, wire: str) -> Iterator[PathStage]:
-    """The stages of one publisher, lazily: nobody looks behind the first that fails."""
-    far = _far(sight, node)
-    yield _policy_there(far, peer)
-    if far is not None and far.unreachable:
-        yield _unreachable(far, peer)
-    route = _route(sight, peer, node)
+def _source_stages(ends: BothEnds, later: BothEnds | None, peer: str, node: str, wire: str) -> Iterator[Check]:
+    """The stages of one publisher, lazily: those behind the first that fails are not made."""
+    report = _report(ends, node)
+    yield _policy_there(report, peer)
+    if report is not None and report.unreachable:
+        yield _unreachable(report, peer)
+    route = _route(ends, peer, node)
     if route is None:
-        yield _not_offered(sight, far, peer)
+        yield _not_offered(ends, report, peer)
         return
-    yield PathStage("offer", _OK, f"{sight.near.snapshot.agent.name} knows of it, as {route.type}")
+    yield Check("offer", OK, f"{ends.here.snapshot.agent.name} knows of it, as {route.type}")
     if route.limit:
-        yield _limit(sight.near, route)
+        yield _limit(ends.here, route)
         return
-    yield _policy_here(sight.near, route)
-    yield _type(sight.near, route)
-    yield _in_graph(sight.near, route)
-    yield from _subscriber(sight.near, route)
-    now, now_far = _route(later, peer, node) or route, _far(later, node) or far
-    yield _open_route(now, now_far, peer)
-    if sight.far is not None and sight.far.path_problem:
-        yield PathStage("path", _WARN, f"{peer} says: {sight.far.path_problem}", sight.far.path_remedy)
+    yield _policy_here(ends.here, route)
+    yield _type(ends.here, route)
+    yield _in_graph(ends.here, route)
+    yield from _subscriber(ends.here, route)
+    now, report_now = _route(later, peer, node) or route, _report(later, node) or report
+    yield _open_route(now, report_now, peer)
+    if ends.there is not None and ends.there.path_problem:
+        yield Check("path", WARN, f"{peer} says: {ends.there.path_problem}", ends.there.path_remedy)
     if now.state in _FLOWING:
-        yield _sent(now, now_far, peer, wire)
-        yield _arrived(route, now, far, now_far, peer, sight.near.snapshot.agent.name)
+        yield _sent(now, report_now, peer, wire)
+        yield _arrived(route, now, report, report_now, peer, ends.here.snapshot.agent.name)
         yield _contract(now)
-        yield _reading(sight, later, node)
+        yield _reading(ends, later, node)
 
 
-def _policy_there(far: FarSource | None, peer: str) -> PathStage:
-    if far is None:
-        return PathStage("policy there", _UNKNOWN, f"{peer} did not tell")
-    if far.crosses:
-        return PathStage("policy there", _OK, f"{peer} lets it cross: {far.rule}")
+def _policy_there(report: PublisherReport | None, peer: str) -> Check:
+    if report is None:
+        return Check("policy there", UNKNOWN, f"{peer} did not tell")
+    if report.crosses:
+        return Check("policy there", OK, f"{peer} lets it cross: {report.rule}")
     remedy = f"change [bridge] in the rmpa.toml of {peer}, and `rmpa reload` there"
-    if far.rule.startswith("built in"):
+    if report.rule.startswith("built in"):
         remedy = "no rule of yours can let it cross; republish it there under another name (topic_tools relay)"
-    return PathStage("policy there", _FAIL, f"{peer} keeps it at home: {far.rule}", remedy)
+    return Check("policy there", FAIL, f"{peer} keeps it at home: {report.rule}", remedy)
 
 
-def _unreachable(far: FarSource, peer: str) -> PathStage:
-    """The node is registered over there, and nothing there can connect to it."""
-    text = f"{far.node} is registered on {peer}, but cannot be reached at {far.unreachable}"
+def _unreachable(report: PublisherReport, peer: str) -> Check:
+    """The node is registered at the peer, and the peer's agent cannot connect to it."""
+    text = f"{report.node} is registered on {peer}, but cannot be reached at {report.unreachable}"
     remedy = (
         "if it is alive, start it with ROS_IP=127.0.0.1 (and no ROS_HOSTNAME) in its shell; if it is dead, "
         f"`rosnode cleanup` on {peer} removes it"
     )
-    return PathStage("reachable", _FAIL, text, remedy)
+    return Check("reachable", FAIL, text, remedy)
 
 
-def _not_offered(sight: BothSides, far: FarSource | None, peer: str) -> PathStage:
-    if far is not None and far.type in ("", "*"):
+def _not_offered(ends: BothEnds, report: PublisherReport | None, peer: str) -> Check:
+    if report is not None and report.type in ("", "*"):
         text = f"its node has not told {peer}'s core what type it is"
-        return PathStage("offer", _FAIL, text, "a publisher tells its type when it registers; is it an old script?")
-    if far is not None and far.beyond:
-        text = f"{peer} does not offer it: it has more topics than limits.topics = {far.beyond} of that module"
-        return PathStage(
-            "offer", _FAIL, text, "raise it over there and `rmpa reload`, or deny some by bridge.deny there"
-        )
-    if far is not None and not far.offered:
+        return Check("offer", FAIL, text, "a publisher tells its type when it registers; is it an old script?")
+    if report is not None and report.beyond:
+        text = f"{peer} does not offer it: it has more topics than limits.topics = {report.beyond} of that module"
+        return Check("offer", FAIL, text, "raise it over there and `rmpa reload`, or deny some by bridge.deny there")
+    if report is not None and not report.offered:
         text = f"{peer} does not offer it: its name or type is none that can cross, or is too long"
-        return PathStage("offer", _FAIL, text, f"names of at most {config_limits.CROSSING_NAME_MAX} characters cross")
-    peers = [p for p in sight.near.snapshot.peers if p.name == peer]
+        return Check("offer", FAIL, text, f"names of at most {config_limits.CROSSING_NAME_MAX} characters cross")
+    peers = [p for p in ends.here.snapshot.peers if p.name == peer]
     for bound in (bound for p in peers for bound in p.beyond if bound.here and bound.kind == "topics"):
-        text, _, remedy = bound.text.partition("; ")
-        return PathStage("limit", _FAIL, text, remedy)
+        return Check.from_message("limit", FAIL, bound.text)
     count = peers[0].topics_in if peers else 0
     text = f"the offer of it has not come here ({count} topics of {peer} have)"
     remedy = (
         f"if it stays so for more than {bridge_limits.RECONCILE_INTERVAL:g} s, it is a bug of ours: both logs, please"
     )
-    return PathStage("offer", _FAIL, text, remedy)
+    return Check("offer", FAIL, text, remedy)
 
 
-def _limit(near: NearTopic, route: RouteInfo) -> PathStage:
-    """The place that there is none of: the setting, and how much else it hides."""
-    peers = [p for p in near.snapshot.peers if p.name == route.peer]
+def _limit(here: TopicAtSubscriber, route: RouteInfo) -> Check:
+    """A limit of this module hides the topic: the setting, and how much else it hides."""
+    peers = [p for p in here.snapshot.peers if p.name == route.peer]
     hidden = [b.hidden for p in peers for b in p.beyond if b.here and b.kind == route.limit]
     text = route.problem + (f"; {hidden[0]} {route.limit} of it are hidden" if hidden else "")
     remedy = f"raise limits.{route.limit} in this module's rmpa.toml and `rmpa reload`, or deny what is not needed"
-    return PathStage("limit", _FAIL, text, remedy)
+    return Check("limit", FAIL, text, remedy)
 
 
-def _policy_here(near: NearTopic, route: RouteInfo) -> PathStage:
-    if route.state == "hidden" and route.node not in near.conflict:
+def _policy_here(here: TopicAtSubscriber, route: RouteInfo) -> Check:
+    if route.state == "hidden" and not here.proxy(route.node).conflict:
         remedy = "change [bridge] in this module's rmpa.toml, and `rmpa reload`"
-        return PathStage("policy here", _FAIL, f"this module does not take it: {route.problem}", remedy)
+        return Check("policy here", FAIL, f"this module does not take it: {route.problem}", remedy)
     was = f" (its {route.wire})" if route.wire else ""
-    return PathStage("policy here", _OK, f"this module takes it as {near.topic}{was}")
+    return Check("policy here", OK, f"this module takes it as {here.topic}{was}")
 
 
-def _type(near: NearTopic, route: RouteInfo) -> PathStage:
-    if route.node in near.conflict:
-        text, _, remedy = route.problem.partition("; ")
-        return PathStage("type", _FAIL, text, remedy)
-    return PathStage("type", _OK, f"no local publisher has another type than {route.type}")
+def _type(here: TopicAtSubscriber, route: RouteInfo) -> Check:
+    if here.proxy(route.node).conflict:
+        return Check.from_message("type", FAIL, route.problem)
+    return Check("type", OK, f"no local publisher has another type than {route.type}")
 
 
-def _in_graph(near: NearTopic, route: RouteInfo) -> PathStage:
-    proxy = near.proxies.get(route.node, f"/rmpa/{route.peer}{route.node}")
-    if route.node not in near.registered:
-        text = f"its proxy {proxy} is not in the local graph as a publisher of {near.topic}"
+def _in_graph(here: TopicAtSubscriber, route: RouteInfo) -> Check:
+    state = here.proxy(route.node)
+    proxy = state.name or f"/rmpa/{route.peer}{route.node}"
+    if not state.registered:
+        text = f"its proxy {proxy} is not in the local graph as a publisher of {here.topic}"
         if route.problem:
-            problem, _, remedy = route.problem.partition("; ")
-            return PathStage("graph", _FAIL, f"{text}: {problem}", remedy)
+            return Check.from_message("graph", FAIL, f"{text}: {route.problem}")
         remedy = (
             f"it is put there again within {bridge_limits.RECONCILE_INTERVAL:g} s; if not, the agent's log says why"
         )
-        return PathStage("graph", _FAIL, text, remedy)
-    return PathStage("graph", _OK, f"its proxy {proxy} stands in the local graph")
+        return Check("graph", FAIL, text, remedy)
+    return Check("graph", OK, f"its proxy {proxy} stands in the local graph")
 
 
-def _subscriber(near: NearTopic, route: RouteInfo) -> Iterator[PathStage]:
-    """Who listens here, and whether somebody was refused."""
-    readers = near.readers.get(route.node, ())
-    topics = [topic for topic in near.snapshot.topics if topic.name == near.topic]
+def _subscriber(here: TopicAtSubscriber, route: RouteInfo) -> Iterator[Check]:
+    """Whether a local subscriber is connected to the proxy, and whether one was refused."""
+    proxy = here.proxy(route.node)
+    connections, refused = proxy.connections, proxy.mismatches
+    topics = [topic for topic in here.snapshot.topics if topic.name == here.topic]
     listed = topics[0].subscribers if topics else ()
-    refused = near.mismatches.get(route.node, ())
-    if not readers:
+    if not connections:
         if refused:
-            yield PathStage("subscriber", _OK, f"{', '.join(listed) or 'a node'} wants it")
+            yield Check("subscriber", OK, f"{', '.join(listed) or 'a node'} wants it")
             remedy = "build both sides with one version of the message; `rosmsg md5 TYPE` on both shows which differs"
-            yield PathStage("md5", _FAIL, "; ".join(refused), remedy)
+            yield Check("md5", FAIL, "; ".join(refused), remedy)
         elif listed:
             text = f"{', '.join(listed)} subscribes, but has not connected to its proxy"
-            files = near.snapshot.agent.files
+            files = here.snapshot.agent.files
             if files is not None and files.problem:
                 problem, _, remedy = files.problem.partition("; ")
-                yield PathStage(
+                yield Check(
                     "subscriber",
-                    _FAIL,
+                    FAIL,
                     f"{text}; the agent has no file descriptor to accept it with: {problem}",
                     remedy,
                 )
                 return
             remedy = (
                 "look into that node's log; its ROS_IP and ROS_HOSTNAME must be of this machine, and its "
-                f"ROS_MASTER_URI {near.snapshot.agent.core_uri}: `rmpa doctor`"
+                f"ROS_MASTER_URI {here.snapshot.agent.core_uri}: `rmpa doctor`"
             )
-            yield PathStage("subscriber", _FAIL, text, remedy)
+            yield Check("subscriber", FAIL, text, remedy)
         else:
-            text = f"no node here subscribes to {near.topic}, so nothing is sent"
-            yield PathStage("subscriber", _FAIL, text, f"that is no fault; to try it: rmpa topic echo {near.topic}")
+            text = f"no node here subscribes to {here.topic}, so nothing is sent"
+            yield Check("subscriber", FAIL, text, f"that is no fault; to try it: rmpa topic echo {here.topic}")
         return
-    yield PathStage("subscriber", _OK, f"{', '.join(dict.fromkeys(r.node for r in readers))} connected to its proxy")
+    yield Check("subscriber", OK, f"{', '.join(dict.fromkeys(c.node for c in connections))} connected to its proxy")
     if refused:
-        yield PathStage("md5", _WARN, "; ".join(refused), "build both sides with one version of the message")
+        yield Check("md5", WARN, "; ".join(refused), "build both sides with one version of the message")
     elif route.md5:
-        yield PathStage("md5", _OK, f"{route.md5} on both sides")
+        yield Check("md5", OK, f"{route.md5} on both sides")
 
 
-def _open_route(route: RouteInfo, far: FarSource | None, peer: str) -> PathStage:
+def _open_route(route: RouteInfo, report: PublisherReport | None, peer: str) -> Check:
     if route.state in _FLOWING:
         lane = f", {route.lane} lane" if route.lane else ""
-        return PathStage("route", _OK, f"open{lane}{', latched' if route.latched else ''}")
+        return Check("route", OK, f"open{lane}{', latched' if route.latched else ''}")
     if route.state == "opening":
         text = f"{peer} has been asked for it and has not answered"
-        if far is not None and far.route == "opening":
-            return PathStage(
+        if report is not None and report.route == "opening":
+            return Check(
                 "route",
-                _FAIL,
+                FAIL,
                 f"{peer}'s agent waits for the publisher {route.node} to answer its connection",
                 f"is that node stopped or stuck? on {peer}: rosnode ping {route.node}",
             )
-        return PathStage("route", _FAIL, text, "ask again in a moment; if it stays so, see the log there")
+        return Check("route", FAIL, text, "ask again in a moment; if it stays so, see the log there")
     problem = route.problem or "nobody has asked for it yet"
     remedy = f"it is tried again by itself; on {peer}: rosnode info {route.node}"
-    return PathStage("route", _FAIL, f"{route.state}: {problem}", remedy)
+    return Check("route", FAIL, f"{route.state}: {problem}", remedy)
 
 
-def _sent(route: RouteInfo, far: FarSource | None, peer: str, wire: str) -> PathStage:
-    if far is None:
-        return PathStage("sent", _UNKNOWN, f"{peer} did not tell")
-    if far.oversized:
-        text = f"{far.oversized} messages of its publisher {route.node} are too long, the last has "
-        text += f"{far.oversized_bytes} bytes, and at most {ros_limits.TCPROS_MESSAGE_MAX} cross"
-        text += f"; {far.messages} others came" if far.messages else ""
-        return PathStage("sent", _WARN if far.messages else _FAIL, text, "send them in parts, or compressed")
-    if not far.messages and not route.messages:
+def _sent(route: RouteInfo, report: PublisherReport | None, peer: str, wire: str) -> Check:
+    if report is None:
+        return Check("sent", UNKNOWN, f"{peer} did not tell")
+    if report.oversized:
+        text = f"{report.oversized} messages of its publisher {route.node} are too long, the last has "
+        text += f"{report.oversized_bytes} bytes, and at most {ros_limits.TCPROS_MESSAGE_MAX} cross"
+        text += f"; {report.messages} others came" if report.messages else ""
+        return Check("sent", WARN if report.messages else FAIL, text, "send them in parts, or compressed")
+    if not report.messages and not route.messages:
         text = f"its publisher {route.node} is connected, and has published nothing since"
-        return PathStage("sent", _FAIL, text, f"look at that node; on {peer}: rostopic hz {wire}")
-    text = f"{far.messages} messages from its publisher so far"
-    if far.lost:
-        text += f"; {far.lost} of them given up, while {peer} had no link to this module or a slow one"
-        return PathStage("sent", _WARN, text, "a longer outage, or more depth, in [[contract]] keeps more")
-    if far.dropped:
-        return PathStage(
-            "sent", _WARN, f"{text}; {far.dropped} given up over there", "the link is slower than the topic"
+        return Check("sent", FAIL, text, f"look at that node; on {peer}: rostopic hz {wire}")
+    text = f"{report.messages} messages from its publisher so far"
+    if report.lost:
+        text += f"; {report.lost} of them given up, while {peer} had no link to this module or a slow one"
+        return Check("sent", WARN, text, "a longer outage, or more depth, in [[contract]] keeps more")
+    if report.dropped:
+        return Check(
+            "sent", WARN, f"{text}; {report.dropped} given up over there", "the link is slower than the topic"
         )
-    return PathStage("sent", _OK, text)
+    return Check("sent", OK, text)
 
 
 def _arrived(
-    before: RouteInfo, now: RouteInfo, far: FarSource | None, far_now: FarSource | None, peer: str, here: str
-) -> PathStage:
+    before: RouteInfo,
+    now: RouteInfo,
+    report: PublisherReport | None,
+    report_now: PublisherReport | None,
+    peer: str,
+    module: str,
+) -> Check:
     moved = now.messages - before.messages
-    sent = far_now.messages - far.messages if far is not None and far_now is not None else None
+    sent = report_now.messages - report.messages if report is not None and report_now is not None else None
     rarely = (
         float(now.contract.get("max_rate") or config_limits.CONTRACT_RATE_MAX) * bridge_limits.WHY_WINDOW < _SEVERAL
     )
     if not now.messages or (sent is not None and sent >= _SEVERAL and not moved and not rarely):
-        text = f"{peer} has {'sent ' + str(sent) if sent else 'sent some'} meanwhile, and none arrived at {here}"
-        dropped = f" ({far_now.dropped} were given up over there)" if far_now is not None and far_now.dropped else ""
+        text = f"{peer} has {'sent ' + str(sent) if sent else 'sent some'} meanwhile, and none arrived at {module}"
+        dropped = (
+            f" ({report_now.dropped} were given up over there)"
+            if report_now is not None and report_now.dropped
+            else ""
+        )
         remedy = "is the link too slow? `rmpa peer info`; a max_rate or priority helps (docs/contracts.md)"
-        return PathStage("arrived", _FAIL, text + dropped, remedy)
+        return Check("arrived", FAIL, text + dropped, remedy)
     age = now.age or 0.0
     usual = now.period.p99 if now.period is not None else None
     text = f"{now.messages} messages, the last {age:.2f} s ago"
@@ -403,40 +401,40 @@ def _arrived(
         and age > max(bridge_limits.WHY_SILENT, bridge_limits.WHY_SILENT_PERIODS * usual)
     ):
         text = f"nothing for {age:.1f} s; until then a message came every {usual * 1e3:.0f} ms at the latest"
-        return PathStage("arrived", _FAIL, text, f"its publisher {now.node} on {peer} has fallen silent: look at it")
+        return Check("arrived", FAIL, text, f"its publisher {now.node} on {peer} has fallen silent: look at it")
     if usual is None and not now.latched and age > bridge_limits.WHY_SILENT:
-        return PathStage("arrived", _WARN, text, "a topic of few messages? nothing tells how often they should come")
-    return PathStage("arrived", _OK, text)
+        return Check("arrived", WARN, text, "a topic of few messages? nothing tells how often they should come")
+    return Check("arrived", OK, text)
 
 
-def _contract(route: RouteInfo) -> PathStage:
+def _contract(route: RouteInfo) -> Check:
     missing = {key: getattr(route, key) for key in ("lost", "late", "expired") if getattr(route, key)}
     events = {kind: count for kind, count in route.events.items() if kind != "messages_lost"}
     if not missing and not events:
         said = ", ".join(f"{key} {value}" for key, value in route.contract.items())
-        return PathStage("contract", _OK, f"kept ({said})" if said else "nothing lost, late or expired")
+        return Check("contract", OK, f"kept ({said})" if said else "nothing lost, late or expired")
     parts = [f"{count} {key}" for key, count in missing.items()]
     parts += [f"{kind.replace('_', ' ')} {count} times" for kind, count in events.items()]
     remedy = "`rmpa topic info` tells when; docs/contracts.md what to do"
     if "lost" in missing and route.contract.get("reliability") == "reliable":
         remedy = "a longer outage, or more depth, in [[contract]] keeps more; `rmpa topic info` tells when"
-    return PathStage("contract", _WARN, ", ".join(parts), remedy)
+    return Check("contract", WARN, ", ".join(parts), remedy)
 
 
-def _reading(sight: BothSides, later: BothSides | None, node: str) -> PathStage:
-    before = {reader.number: reader for reader in sight.near.readers.get(node, ())}
-    after = (later or sight).near.readers.get(node, ())
+def _reading(ends: BothEnds, later: BothEnds | None, node: str) -> Check:
+    before = {reader.number: reader for reader in ends.here.proxy(node).connections}
+    after = (later or ends).here.proxy(node).connections
     if not after:
-        return PathStage("reader", _FAIL, "its subscribers have just left", "start them again")
+        return Check("reader", FAIL, "its subscribers have just left", "start them again")
     stuck = [reader for reader in after if reader.waiting and before.get(reader.number, reader).waiting]
     slow = [reader for reader in after if reader.dropped]
     names = ", ".join(f"{reader.node} ({reader.waiting} B wait, {reader.dropped} dropped)" for reader in stuck)
     remedy = "its callbacks are too slow, or it is stopped; nobody else waits for it"
     if stuck and len(stuck) == len(after):
-        return PathStage("reader", _FAIL, f"{names} does not read", remedy)
+        return Check("reader", FAIL, f"{names} does not read", remedy)
     if stuck:
-        return PathStage("reader", _WARN, f"{names} does not keep up; others do", remedy)
+        return Check("reader", WARN, f"{names} does not keep up; others do", remedy)
     if slow:
         text = ", ".join(f"{reader.node} has missed {reader.dropped}" for reader in slow)
-        return PathStage("reader", _WARN, text, remedy)
-    return PathStage("reader", _OK, f"{', '.join(dict.fromkeys(r.node for r in after))} takes them")
+        return Check("reader", WARN, text, remedy)
+    return Check("reader", OK, f"{', '.join(dict.fromkeys(r.node for r in after))} takes them")

@@ -1,1 +1,1 @@
-"""TODO room."""
+"""Decides which profile to apply: pure, without I/O and clocks."""

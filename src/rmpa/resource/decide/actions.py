@@ -1,4 +1,4 @@
-"""What the loop of a resource asks its driver for: apply a profile, raise an alarm, say that it is over."""
+"""Actions of the control loop for its driver: apply a profile, raise or clear an alarm."""
 
 from __future__ import annotations
 
@@ -12,39 +12,39 @@ if TYPE_CHECKING:
 
 
 class AlarmKind(Enum):
-    """What an alarm says; the level of REP 107 that it is shown with."""
+    """The kind of an alarm, and the level of REP 107 that it is shown with."""
 
     ADAPTATION = "adaptation"
     """A quality is not satisfied, and another profile takes over: WARN."""
     NON_ADAPTABLE = "non_adaptable"
-    """No profile meets what is asked; the most similar one runs: ERROR."""
+    """No profile meets the requirements; the most similar one runs: ERROR."""
 
 
 @dataclass(frozen=True, slots=True)
 class Shortfall:
-    """One attribute that is not as asked.
+    """One attribute that violates the requirements.
 
     Args:
         attribute: Its name.
-        wanted: The bound.
-        given: What was measured, or what the profile offers; ``None``: nothing.
+        requested: The bound.
+        offered: The measured value, or the one that the profile declares; ``None``: neither.
     """
 
     attribute: str
-    wanted: Bound
-    given: Value | None
+    requested: Bound
+    offered: Value | None
 
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """What every client is told.
+    """An alarm for all clients.
 
     Args:
         kind: Adaptation or non-adaptable.
-        shortfalls: What was asked and is not given.
+        shortfalls: The violated attributes.
         before: The profile that ran, or empty.
         after: The one that takes over, or the same.
-        at: When, monotonic seconds.
+        at: Monotonic seconds.
     """
 
     kind: AlarmKind
@@ -56,7 +56,7 @@ class Alarm:
 
 @dataclass(frozen=True, slots=True)
 class Apply:
-    """Apply this profile, and report ``applied`` or ``failed``; ``why`` is for people."""
+    """Apply this profile and report ``applied`` or ``failed``; ``why`` is for people."""
 
     profile: str
     why: str
@@ -64,14 +64,14 @@ class Apply:
 
 @dataclass(frozen=True, slots=True)
 class Raise:
-    """Tell every client, and the diagnostics."""
+    """Publish an alarm."""
 
     alarm: Alarm
 
 
 @dataclass(frozen=True, slots=True)
 class Clear:
-    """What an alarm said is over."""
+    """Publish that an alarm is over."""
 
     alarm: Alarm
 
@@ -82,7 +82,7 @@ class Reacted:
 
     Args:
         profile: The one that runs now.
-        reaction: Seconds since the request that called for it, or since the first window that did so began.
+        reaction: Reaction time in seconds, since its cause: a request, or the beginning of the first violated window.
     """
 
     profile: str

@@ -1,134 +1,57 @@
-"""The loop of a Smart Resource: what is asked, what is measured, and which profile to apply (paper, section 3.1).
+"""The control loop of a Smart Resource: from requirements and measurements to a profile (paper, section 3.1).
 
-MAPE-K, sans-I/O: *monitor* takes each window of measured quality, *analyse* compares it with what the clients ask,
-*plan* is ``decision.Decider``, *execute* is the driver's work, which reports back. The profile's state::
+MAPE-K, sans-I/O: *monitor* takes each window of measured quality, *analyse* compares it with the merged requirements
+(``violations``), *plan* is ``decision.Decider``, *execute* is the driver's work, which reports back. The states::
 
-    none ──decided──► applying ──applied──► active ──another is better──► applying
+    NONE ──decided──► APPLYING ──applied──► ACTIVE ──another profile is better──► APPLYING
                        │  ▲                    │
                        │  └─ next best ◄───────┘ violated
-                       └─ failed, hung: left out for a cool-down, and the next best is applied
+                       └─ failed, hung: excluded for a cool-down; the next best profile is applied
 
 A quality that is violated in ``k`` of the last ``n`` windows is a disturbance. If another profile can serve, that is
-an *adaptation event* (WARN): the violating one is left out for its cool-down and the other one applied. If none can,
-it is a *non-adaptable event* (ERROR): the best-effort profile runs. Without a disturbance a profile is changed only
-where that brings more than ``improvement``, and not before ``dwell`` is over: two nearly alike do not alternate.
+an *adaptation event* (WARN): the violated profile is excluded for its cool-down and the other one applied. If none
+can, it is a *non-adaptable event* (ERROR): the best-effort profile runs. Without a disturbance the profile changes
+only for an improvement of more than ``improvement``, and not before ``dwell`` is over, so that two nearly equal ones
+do not alternate.
 """
 
 from __future__ import annotations
 
 import math
-from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from enum import Enum, auto
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from rmpa.core.errors import LocalProtocolError, PeerRefused
 from rmpa.resource.decide.actions import Action, Alarm, AlarmKind, Apply, Clear, Raise, Reacted, Shortfall
-from rmpa.resource.declare.requirements import Merged, Requirement, merge
+from rmpa.resource.decide.cool_downs import CoolDown, CoolDowns
+from rmpa.resource.decide.violations import ViolationDetector
+from rmpa.resource.declare.adaptation_settings import AdaptationSettings
+from rmpa.resource.declare.requirements import MergedRequirements, Requirement, merge
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from rmpa.resource.decide.decision import Decider, ProfileDecision, ProfileScore
     from rmpa.resource.declare.attributes import Attribute, Value
-    from rmpa.resource.declare.requirements import Bound
-
-__all__ = [
-    "COOL_DOWN_GROWTH",
-    "EXPECTED",
-    "Action",
-    "Adaptation",
-    "AdaptationSettings",
-    "Alarm",
-    "AlarmKind",
-    "Apply",
-    "Clear",
-    "CoolDown",
-    "ProfileState",
-    "Raise",
-    "Reacted",
-    "Shortfall",
-]
-COOL_DOWN_GROWTH: Final = 2.0
-"""Each time that a profile disappoints again its cool-down is so many times as long, up to ``cool_down_max``."""
-
-EXPECTED: Final = 1.25
-"""A soft bound that the profile is declared to fall short of may be missed by so many times that; more is a
-disturbance."""
-
-
-@dataclass(frozen=True, slots=True)
-class AdaptationSettings:
-    """How patient a resource is.
-
-    Args:
-        violations: ``k``: so many violated windows …
-        windows: ``n``: … of the last so many are a disturbance.
-        improvement: ``h``: a change without a disturbance must lessen the distance by more than this.
-        dwell: Seconds that a profile runs at least before such a change.
-        settle: Seconds behind a change for which windows that begin in them are not judged: what the profile before
-            left in queues is still on its way.
-        cool_down: Seconds that a profile is left out after it failed or disappointed.
-        cool_down_max: The same at most, when it does so again and again.
-        apply_timeout: Seconds after which a profile that is being applied counts as hung.
-    """
-
-    violations: int = 2
-    windows: int = 3
-    improvement: float = 0.05
-    dwell: float = 2.0
-    settle: float = 1.0
-    cool_down: float = 10.0
-    cool_down_max: float = 160.0
-    apply_timeout: float = 5.0
 
 
 class ProfileState(Enum):
-    """Where the loop stands."""
+    """State of the control loop."""
 
     NONE = auto()
-    """Nothing was decided yet, or no profile can be taken."""
+    """Nothing was decided yet, or every profile is excluded."""
     APPLYING = auto()
     ACTIVE = auto()
 
 
-@dataclass(slots=True)
-class CoolDown:
-    """A profile that failed or disappointed is left out.
-
-    Args:
-        until: When that is over, monotonic seconds.
-        cool_down: How long it was to last; the next one is longer.
-        why: What was wrong.
-    """
-
-    until: float
-    cool_down: float
-    why: str
-
-
-@dataclass(slots=True)
-class _Knowledge:
-    """What the loop knows."""
-
-    requirements: dict[str, Requirement] = field(default_factory=dict)
-    merged: Merged = field(default_factory=Merged)
-    barred: dict[str, str] = field(default_factory=dict)
-    """Profiles whose preconditions do not hold, and why."""
-    troubles: dict[str, CoolDown] = field(default_factory=dict)
-    hanging: set[str] = field(default_factory=set)
-    """Profiles that were given up while their functions ran, and still run."""
-    windows: deque[tuple[float, tuple[Shortfall, ...]]] = field(default_factory=deque)
-    """When each of the last windows began, and what fell short in it; since the profile became active."""
-
-
 class Adaptation:
-    """The loop of one resource.
+    """The control loop of one resource. Times are monotonic seconds.
 
     Args:
         attributes: Declared ones, by name.
         decider: Of its profiles.
-        settings: How patient it is.
+        settings: Parameters of the loop.
     """
 
     def __init__(
@@ -136,29 +59,40 @@ class Adaptation:
     ) -> None:
         self._attributes = attributes
         self._decider = decider
-        self._settings = settings if settings is not None else AdaptationSettings()
-        self._knows = _Knowledge()
+        self._settings = settings = settings if settings is not None else AdaptationSettings()
+        self._requirements: dict[str, Requirement] = {}
+        self._merged = MergedRequirements()
+        self._blocked: dict[str, str] = {}
+        """Profiles that preconditions or the context do not allow, and why."""
+        self._cool_downs = CoolDowns(settings.cool_down, settings.cool_down_max)
+        self._hanging: set[str] = set()
+        """Profiles that were given up while their functions ran, and still run."""
+        self._detector = ViolationDetector(attributes, settings.violations, settings.windows)
         self._state = ProfileState.NONE
         self._profile = ""
         self._target = ""
         self._pinned = ""
-        self._before = ""
-        self._since = -math.inf
-        self._window: float | None = None
-        self._deadline = math.inf
-        self._caused = math.inf
+        self._restored_profile = ""
+        """The profile of before the restart, until the first decision."""
+        self._active_since = -math.inf
+        self._window_end: float | None = None
+        self._apply_deadline = math.inf
+        self._cause = math.inf
+        """When the cause of the present reconfiguration began; infinite: there is none."""
         self._alarm: Alarm | None = None
-        self._asked_meanwhile = False
-        self._spoilt = ""
+        self._replan_at_once = False
+        """Whether something that skips the dwell time has changed while a profile was being applied."""
+        self._reapply_reason = ""
+        """Why the profile that is being applied has to be applied once more, or empty."""
 
     @property
     def state(self) -> ProfileState:
-        """Where the loop stands."""
+        """State of the loop."""
         return self._state
 
     @property
     def profile(self) -> str:
-        """The profile that runs, or ran until the one that is being applied; empty before the first."""
+        """The profile that runs, or ran before the one that is being applied; empty before the first."""
         return self._profile
 
     @property
@@ -173,261 +107,235 @@ class Adaptation:
 
     @property
     def alarm(self) -> Alarm | None:
-        """What is wrong at present."""
+        """The alarm that is raised at present."""
         return self._alarm
 
     @property
-    def asked(self) -> Merged:
-        """What all clients ask together."""
-        return self._knows.merged
+    def merged(self) -> MergedRequirements:
+        """The requirements of all clients, merged."""
+        return self._merged
 
     @property
     def requirements(self) -> Mapping[str, Requirement]:
         """By client."""
-        return self._knows.requirements
+        return self._requirements
 
     def explain(self, now: float) -> tuple[ProfileScore, ...]:
-        """How each profile does at this moment, and which are left out."""
-        return self._decider.explain(self._knows.merged.bounds, self._left_out(now))
+        """The score of each profile at this moment, and the reasons of those that are excluded."""
+        return self._decider.explain(self._merged.bounds, self._excluded(now))
 
-    # --- what is asked ------------------------------------------------------------------------------------------
+    # --- requirements -------------------------------------------------------------------------------------------
 
-    def remember(
-        self,
-        requirements: Iterable[Requirement],
-        profile: str,
-        cooling: Mapping[str, CoolDown] | None = None,
-        now: float = 0.0,
+    def restore(
+        self, requirements: Iterable[Requirement], profile: str, cool_downs: Mapping[str, CoolDown], now: float
     ) -> None:
-        """Begin with what there was before a restart; to be called at first.
+        """Continue from the state of before a restart; called before ``start``.
 
         Args:
-            requirements: What was asked.
-            profile: That ran; it is taken if it is about as good as the best.
-            cooling: The profiles that were left out, and until when.
+            requirements: Of the clients of then.
+            profile: The profile that ran; it is taken again if it is about as good as the best.
+            cool_downs: By profile.
             now: The time.
         """
-        for name, one in (cooling or {}).items():
-            cool_down = min(one.cool_down, self._settings.cool_down_max)
-            self._knows.troubles[name] = CoolDown(min(one.until, now + cool_down), cool_down, one.why)
-        self._knows.requirements = {requirement.client: requirement for requirement in requirements}
-        self._knows.merged = merge(self._knows.requirements.values())
-        self._before = profile
+        self._cool_downs.restore(cool_downs, now)
+        self._requirements = {requirement.client: requirement for requirement in requirements}
+        self._merged = merge(self._requirements.values())
+        self._restored_profile = profile
 
     def cooling(self, now: float) -> dict[str, CoolDown]:
-        """The profiles that failed or disappointed and are left out at present."""
-        return {name: replace(one) for name, one in self._knows.troubles.items() if now < one.until < math.inf}
+        """The profiles that are excluded because they failed or were violated."""
+        return self._cool_downs.active(now)
 
     def start(self, now: float) -> list[Action]:
         """Take the first profile."""
         return self._plan(now, "the resource starts")
 
     def require(self, requirement: Requirement, now: float) -> list[Action]:
-        """A client asks for a quality, in place of what it asked for before."""
-        self._knows.requirements[requirement.client] = requirement
-        return self._asked_anew(now, f"{requirement.client} asks for a quality")
+        """Set a client's requirement, in place of its previous one."""
+        self._requirements[requirement.client] = requirement
+        return self._requirements_changed(now, f"{requirement.client} asks for a quality")
 
     def release(self, client: str, now: float) -> list[Action]:
-        """A client asks for nothing any more, or is gone.
+        """Drop a client's requirement.
 
         Raises:
-            PeerRefused: It had asked for nothing.
+            PeerRefused: It has none.
         """
-        if self._knows.requirements.pop(client, None) is None:
+        if self._requirements.pop(client, None) is None:
             raise PeerRefused("the resource", f"{client} has asked for nothing here")
-        return self._asked_anew(now, f"{client} asks for nothing any more")
+        return self._requirements_changed(now, f"{client} asks for nothing any more")
 
-    def bar(self, barred: Mapping[str, str], now: float) -> list[Action]:
-        """Say which profiles cannot be taken now (their preconditions, the context), and why; all others can."""
-        if barred == self._knows.barred:
+    def block(self, blocked: Mapping[str, str], now: float) -> list[Action]:
+        """Set the profiles that preconditions and the context do not allow, with reasons; all others are allowed."""
+        if blocked == self._blocked:
             return []
-        self._knows.barred = dict(barred)
+        self._blocked = dict(blocked)
         return self._plan(now, "the preconditions of profiles have changed")
 
-    def pin(self, profile: str, now: float, *, anew: bool = True) -> list[Action]:
-        """Run this profile whatever is asked; an empty name lets the loop decide again.
+    def pin(self, profile: str, now: float, *, restored: bool = False) -> list[Action]:
+        """Run this profile whatever is requested; an empty name lets the loop decide again.
 
         Args:
-            profile: Which one.
+            profile: Its name, or empty.
             now: The time.
-            anew: Whether somebody chose it just now; else it was chosen before a restart.
+            restored: Whether it was chosen before a restart: a cool-down goes on then. A choice made now ends it,
+                since the cause may have been mended.
 
         Raises:
             ConfigError: There is no such profile.
         """
         if profile:
             self._decider.profile(profile)
-            if anew:
-                self._knows.troubles.pop(profile, None)  # who chooses it may know that what was wrong is mended
+            if not restored:
+                self._cool_downs.reset(profile)
         self._pinned = profile
         why = f"{profile} was chosen by hand" if profile else "the choice by hand is over"
         return self._plan(now, why, at_once=True)
 
     def reconsider(self, why: str, now: float) -> list[Action]:
-        """Take what is best now, however little better it is: the question is another one."""
+        """Take the best profile without hysteresis and dwell time: the context has changed."""
         return self._plan(now, why, at_once=True)
 
-    # --- what is measured ---------------------------------------------------------------------------------------
+    # --- measurements -------------------------------------------------------------------------------------------
 
     def window(self, measured: Mapping[str, Value], now: float) -> list[Action]:
-        """A window of quality has ended under the active profile; what was not measured is not judged."""
-        began = max(self._window, self._since) if self._window is not None else now
-        self._window = now
-        if self._state is not ProfileState.ACTIVE or began < self._since + self._settings.settle:
+        """Judge a window of quality that ends now under the active profile."""
+        began = max(self._window_end, self._active_since) if self._window_end is not None else now
+        self._window_end = now
+        if self._state is not ProfileState.ACTIVE or began < self._active_since + self._settings.settle:
             return []
-        short = self._shortfalls(measured)
-        windows = self._knows.windows
-        windows.append((began, short))
-        while len(windows) > self._settings.windows:
-            windows.popleft()
-        violated = [(at, short) for at, short in windows if short]
-        if len(violated) >= self._settings.violations and not self._pinned:
-            return self._disturbed(violated[0][0], violated[-1][1], now)
-        if not short and not violated:
-            planned = self._plan(now, "a better profile can be taken")
-            if not self._pinned_or_best(now).feasible:
-                return planned  # what was not measured may fall short as it was declared to
-            return [*planned, *self._recovered()]
+        detector = self._detector
+        detector.add(began, measured, self._merged.bounds, self._decider.profile(self._profile).offers)
+        if detector.disturbed and not self._pinned:
+            return self._disturbed(detector.violated[0][0], detector.violated[-1][1], now)
+        if not detector.violated:
+            actions = self._plan(now, "a better profile can be taken")
+            if self._pinned_or_best(now).feasible:  # else an attribute that was not measured may fall short
+                actions += self._clear_alarm()
+            return actions
         return []
 
-    def _shortfalls(self, measured: Mapping[str, Value]) -> tuple[Shortfall, ...]:
-        short = []
-        for name, bound in self._knows.merged.bounds.items():
-            value = measured.get(name)
-            if value is not None and not bound.met_by(self._attributes[name], value) and not self._known(name, value):
-                short.append(Shortfall(name, bound, value))
-        return tuple(short)
-
-    def _known(self, name: str, value: Value) -> bool:
-        """Whether the profile was taken although it falls short of a soft bound so far: that is no disturbance."""
-        bound, attribute = self._knows.merged.bounds[name], self._attributes[name]
-        offer = self._decider.profile(self._profile).offers.get(name)
-        if bound.hard or offer is None or bound.met_by(attribute, offer):
-            return False
-        return _beyond(bound, attribute.place(value)) <= EXPECTED * _beyond(bound, attribute.place(offer))
-
     def _disturbed(self, since: float, short: tuple[Shortfall, ...], now: float) -> list[Action]:
-        """The active profile does not give what it was taken for."""
-        others = self._left_out(now) | {self._profile: "it does not give what is asked"}
-        decision = self._decider.decide(self._knows.merged.bounds, others)
+        """Replace the active profile, which does not deliver what it offers."""
+        why = f"{', '.join(s.attribute for s in short)} fell short"
+        others = self._excluded(now) | {self._profile: "it does not give what is asked"}
+        decision = self._decider.decide(self._merged.bounds, others)
         if decision.feasible:
-            self._disappoint(self._profile, f"{_named(short)} fell short", now)
+            self._cool_downs.begin(self._profile, why, now)
             alarm = Alarm(AlarmKind.ADAPTATION, short, self._profile, decision.profile, now)
-            return [*self._raise(alarm), *self._apply(decision.profile, f"{_named(short)} fell short", now, since)]
-        # Where nothing better can be had the profile stays, unless a best effort was declared for just this.
-        best = self._decider.decide(self._knows.merged.bounds, self._left_out(now))
-        after = decision if decision.best_effort else best
-        known = self._alarm is not None and self._alarm.kind is AlarmKind.NON_ADAPTABLE
+            return [*self._raise_alarm(alarm), *self._apply(decision.profile, why, now, since)]
+        # Without a better one the profile stays, unless a best-effort profile is declared for this case.
+        after = decision if decision.best_effort else self._decider.decide(self._merged.bounds, self._excluded(now))
         actions: list[Action] = []
-        if not known:
-            actions += self._raise(Alarm(AlarmKind.NON_ADAPTABLE, short, self._profile, after.profile, now))
+        if not self._non_adaptable:
+            alarm = Alarm(AlarmKind.NON_ADAPTABLE, short, self._profile, after.profile, now)
+            actions += self._raise_alarm(alarm)
         if decision.best_effort and decision.profile != self._profile:
-            self._disappoint(self._profile, f"{_named(short)} fell short", now)
+            self._cool_downs.begin(self._profile, why, now)
             actions += self._apply(decision.profile, "none can serve: best effort", now, since)
         return actions
 
-    # --- what the driver reports --------------------------------------------------------------------------------
+    # --- reports of the driver ----------------------------------------------------------------------------------
 
     def applied(self, profile: str, now: float) -> list[Action]:
-        """The profile that was asked for runs; a report about another one is late, and ignored."""
+        """The profile has been applied; a report about another one than the present target is ignored."""
         if self._state is not ProfileState.APPLYING or profile != self._target:
             return []
         self._state = ProfileState.ACTIVE
         self._profile, self._target = profile, ""
-        self._since, self._deadline = now, math.inf
-        self._knows.windows.clear()
-        reaction = max(0.0, now - self._caused)
-        # What was asked, or failed, meanwhile may want another one at once.
-        at_once, self._asked_meanwhile = self._asked_meanwhile, False
+        self._active_since, self._apply_deadline = now, math.inf
+        self._detector.clear()
+        reaction = max(0.0, now - self._cause)
+        at_once, self._replan_at_once = self._replan_at_once, False
         why = "what is asked has changed meanwhile"
-        if spoilt := self._spoilt:
+        if reason := self._reapply_reason:
             planned = self._plan(now, why, at_once=at_once)
-            return planned if self._target or not self._profile else [*planned, *self._again(spoilt, now)]
-        self._caused = math.inf
+            if self._target or not self._profile:
+                return planned
+            return [*planned, *self._apply(self._profile, reason, now, now)]
+        self._cause = math.inf
         return [Reacted(profile, reaction), *self._plan(now, why, at_once=at_once)]
 
     def failed(self, profile: str, why: str, now: float) -> list[Action]:
-        """The profile that was asked for could not be applied: the next best is."""
+        """The profile could not be applied; the next best one is."""
         if self._state is not ProfileState.APPLYING or profile != self._target:
             return []
-        self._disappoint(profile, why, now)
+        self._cool_downs.begin(profile, why, now)
         self._state = ProfileState.ACTIVE if self._profile else ProfileState.NONE
-        self._target, self._deadline = "", math.inf
-        # Half of the profile that failed may be in force: the one that ran before is to be applied again too.
+        self._target, self._apply_deadline = "", math.inf
+        # The failed profile may be in force in part, so the one that ran before is applied again as well.
         return self._plan(now, f"{profile} failed: {why}", again=True)
 
     def overdue(self, now: float) -> bool:
         """Whether the profile that is being applied hangs; ``handle_timer`` gives it up."""
-        return self._deadline <= now
+        return self._apply_deadline <= now
 
     def ended_late(self, profile: str, now: float, *, touched: bool) -> list[Action]:
-        """The function of a profile that was given up has ended after all; the profile may be taken again.
+        """The function of a profile that was given up has ended; the profile may be taken again.
 
         Args:
-            profile: Which one; until this is called it is left out, for two calls of one function would mix.
+            profile: Excluded until this call, because two calls of one function must not overlap.
             now: The time.
-            touched: Whether it may have touched the device since the function of the present profile began: that
-                one is applied once more then, behind what is being applied. Where none runs there is nothing to do.
+            touched: Whether it may have changed the device since the function of the present profile began: that
+                profile is applied once more then, after the one that is being applied.
         """
-        self._knows.hanging.discard(profile)
+        self._hanging.discard(profile)
         why = f"the function of {profile} has ended late"
         if touched and self._state is ProfileState.APPLYING:
-            self._spoilt = why
+            self._reapply_reason = why
         elif touched and self._state is ProfileState.ACTIVE:
-            return self._again(why, now)
+            return self._apply(self._profile, why, now, now)
         return self._plan(now, why)
 
     def next_timer(self) -> float | None:
-        """When ``handle_timer`` is due, monotonic seconds."""
-        due = [self._deadline, *(trouble.until for trouble in self._knows.troubles.values())]
-        due += [r.expires for r in self._knows.requirements.values() if r.expires is not None]
-        first = min(due)
+        """When ``handle_timer`` is due."""
+        expiries = (r.expires for r in self._requirements.values() if r.expires is not None)
+        first = min(self._apply_deadline, self._cool_downs.next_timer(), min(expiries, default=math.inf))
         return None if first == math.inf else first
 
     def handle_timer(self, now: float) -> list[Action]:
         """A requirement expires, a cool-down is over, or a profile hangs."""
-        if self._deadline <= now:
-            self._knows.hanging.add(self._target)
-            return self.failed(self._target, self._hangs, now)
-        over = [c for c, r in self._knows.requirements.items() if r.expires is not None and r.expires <= now]
+        if self.overdue(now):
+            self._hanging.add(self._target)
+            return self.failed(self._target, self._hang_reason, now)
+        over = [c for c, r in self._requirements.items() if r.expires is not None and r.expires <= now]
         for client in over:
-            del self._knows.requirements[client]
-        for trouble in self._knows.troubles.values():
-            if trouble.until <= now:
-                trouble.until = math.inf  # it may be taken again; how long it was out is remembered
-        if over and (actions := self._asked_anew(now, f"what {', '.join(over)} asked for has expired")):
+            del self._requirements[client]
+        self._cool_downs.handle_timer(now)
+        why = f"what {', '.join(over)} asked for has expired"
+        if over and (actions := self._requirements_changed(now, why)):
             return actions
         return self._plan(now, "a profile's cool-down is over")
 
     # --- planning -----------------------------------------------------------------------------------------------
 
-    def _asked_anew(self, now: float, why: str) -> list[Action]:
-        before, self._knows.merged = self._knows.merged.bounds, merge(self._knows.requirements.values())
-        if self._knows.merged.bounds == before and self._state is not ProfileState.NONE:
-            return []  # said again, as `rostopic pub -r` does: it must neither hide a disturbance nor skip the dwell
-        for name in self._knows.merged.bounds:
+    def _requirements_changed(self, now: float, why: str) -> list[Action]:
+        before, self._merged = self._merged.bounds, merge(self._requirements.values())
+        if self._merged.bounds == before and self._state is not ProfileState.NONE:
+            return []  # a repetition, as of `rostopic pub -r`: it must neither hide a disturbance nor skip the dwell
+        for name in self._merged.bounds:
             if name not in self._attributes:
                 raise LocalProtocolError(f"a bound of {name}, which is no attribute; check it before it comes here")
-        self._knows.windows.clear()
+        self._detector.clear()
         return self._plan(now, why, at_once=True)
 
     def _plan(self, now: float, why: str, *, at_once: bool = False, again: bool = False) -> list[Action]:
-        """Take another profile if that is worth it.
+        """Take another profile if the change is worth it.
 
         Args:
             now: The time.
             why: What may have changed.
-            at_once: A change need not wait for the dwell time, for it is another question that is asked.
-            again: Apply what is decided even if it is the profile that runs.
+            at_once: Whether to skip hysteresis and dwell time, because the requirements have changed.
+            again: Whether to apply the decided profile even if it runs already.
         """
         if self._state is ProfileState.APPLYING:
-            self._asked_meanwhile |= at_once
-            return []  # ``applied`` or ``failed`` looks again
-        decision = self._as_before(self._pinned_or_best(now), now)
+            self._replan_at_once |= at_once
+            return []  # ``applied`` or ``failed`` plans again
+        decision = self._prefer_restored(self._pinned_or_best(now), now)
         if not decision.profile:
             self._state, self._profile = ProfileState.NONE, ""
             return []
-        actions = self._judge(decision, now)
+        actions = self._update_alarm(decision, now)
         if decision.profile == self._profile and not again:
             return actions
         if not again and not at_once and not self._worth_it(decision, now):
@@ -435,17 +343,17 @@ class Adaptation:
         return [*actions, *self._apply(decision.profile, why, now, now)]
 
     def _pinned_or_best(self, now: float) -> ProfileDecision:
-        bounds = self._knows.merged.bounds
-        if not self._pinned or self._cooling(now).get(self._pinned):
-            # One chosen by hand that cannot be applied is tried again when its cool-down is over, not at once.
-            return self._decider.decide(bounds, self._left_out(now))
+        excluded = self._excluded_by_failure(now)
+        if not self._pinned or self._pinned in excluded:
+            # A pinned profile that cannot be applied is tried again after its cool-down.
+            return self._decider.decide(self._merged.bounds, excluded | self._blocked)
         others = {name: "another one was chosen by hand" for name in self._decider.profiles if name != self._pinned}
-        return self._decider.decide(bounds, others)
+        return self._decider.decide(self._merged.bounds, others)
 
-    def _as_before(self, decision: ProfileDecision, now: float) -> ProfileDecision:
-        """The first decision after a restart: the profile that ran before, unless another is worth a change."""
-        before, self._before = self._before, ""
-        if not before or self._pinned or before == decision.profile or before in self._left_out(now):
+    def _prefer_restored(self, decision: ProfileDecision, now: float) -> ProfileDecision:
+        """At the first decision after a restart: the profile of before, unless another is worth the change."""
+        before, self._restored_profile = self._restored_profile, ""
+        if not before or self._pinned or before == decision.profile or before in self._excluded(now):
             return decision
         score, best = self._score(before, now), self._score(decision.profile, now)
         if score.feasible != best.feasible or score.distance - best.distance > self._settings.improvement:
@@ -453,83 +361,64 @@ class Adaptation:
         return replace(decision, profile=before)
 
     def _worth_it(self, decision: ProfileDecision, now: float) -> bool:
-        """Whether a change without a new question pays."""
-        if not self._profile or self._profile in self._left_out(now) or self._pinned:
+        """Whether a change pays while the requirements are the same: hysteresis and dwell time."""
+        if not self._profile or self._profile in self._excluded(now) or self._pinned:
             return True
         current = self._score(self._profile, now)
         if decision.feasible and not current.feasible:
             return True
-        if now - self._since < self._settings.dwell:
+        if now - self._active_since < self._settings.dwell:
             return False
         return current.distance - decision.distance > self._settings.improvement
 
-    def _judge(self, decision: ProfileDecision, now: float) -> list[Action]:
-        """Raise the alarm if not even the best profile is declared to meet what is asked; clear it if one does."""
-        known = self._alarm is not None and self._alarm.kind is AlarmKind.NON_ADAPTABLE
+    def _update_alarm(self, decision: ProfileDecision, now: float) -> list[Action]:
+        """Raise the non-adaptable alarm if even the best profile is declared to fall short; else clear it."""
         if decision.feasible:
-            disturbed = any(short for _, short in self._knows.windows)
-            return self._recovered() if known and not disturbed else []
-        if known or self._pinned:
+            return self._clear_alarm() if self._non_adaptable and not self._detector.violated else []
+        if self._non_adaptable or self._pinned:
             return []
         offers = self._decider.profile(decision.profile).offers
-        score = self._score(decision.profile, now)
         short = tuple(
-            Shortfall(term.attribute, self._knows.merged.bounds[term.attribute], offers.get(term.attribute))
-            for term in score.terms
+            Shortfall(term.attribute, self._merged.bounds[term.attribute], offers.get(term.attribute))
+            for term in self._score(decision.profile, now).terms
             if term.hard and not term.met
         )
-        return self._raise(Alarm(AlarmKind.NON_ADAPTABLE, short, self._profile, decision.profile, now))
+        return self._raise_alarm(Alarm(AlarmKind.NON_ADAPTABLE, short, self._profile, decision.profile, now))
 
-    def _apply(self, profile: str, why: str, now: float, since: float) -> list[Action]:
+    def _apply(self, profile: str, why: str, now: float, cause: float) -> list[Action]:
         self._state = ProfileState.APPLYING
         self._target = profile
-        self._deadline = now + self._settings.apply_timeout
-        self._caused = min(self._caused, since)
-        self._spoilt = ""
+        self._apply_deadline = now + self._settings.apply_timeout
+        self._cause = min(self._cause, cause)
+        self._reapply_reason = ""
         return [Apply(profile, why)]
-
-    def _again(self, why: str, now: float) -> list[Action]:
-        """Apply the profile that runs once more."""
-        return self._apply(self._profile, why, now, now)
 
     def _score(self, profile: str, now: float) -> ProfileScore:
         return next(score for score in self.explain(now) if score.profile == profile)
 
-    def _left_out(self, now: float) -> dict[str, str]:
-        return self._cooling(now) | self._knows.barred
+    def _excluded(self, now: float) -> dict[str, str]:
+        """All profiles that may not be taken, and why."""
+        return self._excluded_by_failure(now) | self._blocked
 
-    def _cooling(self, now: float) -> dict[str, str]:
+    def _excluded_by_failure(self, now: float) -> dict[str, str]:
         cooling = {name: one.why for name, one in self.cooling(now).items()}
-        return cooling | dict.fromkeys(self._knows.hanging, f"{self._hangs}, and its function still runs")
+        return cooling | dict.fromkeys(self._hanging, f"{self._hang_reason}, and its function still runs")
 
     @property
-    def _hangs(self) -> str:
+    def _hang_reason(self) -> str:
         return f"not applied within {self._settings.apply_timeout:g} s"
 
-    def _disappoint(self, profile: str, why: str, now: float) -> None:
-        before = self._knows.troubles.get(profile)
-        cool_down = self._settings.cool_down
-        if before is not None:
-            cool_down = min(before.cool_down * COOL_DOWN_GROWTH, self._settings.cool_down_max)
-        self._knows.troubles[profile] = CoolDown(now + cool_down, cool_down, why)
+    @property
+    def _non_adaptable(self) -> bool:
+        return self._alarm is not None and self._alarm.kind is AlarmKind.NON_ADAPTABLE
 
-    def _raise(self, alarm: Alarm) -> list[Action]:
+    def _raise_alarm(self, alarm: Alarm) -> list[Action]:
         before, self._alarm = self._alarm, alarm
         return [Raise(alarm)] if before is None else [Clear(before), Raise(alarm)]
 
-    def _recovered(self) -> list[Action]:
+    def _clear_alarm(self) -> list[Action]:
         if self._alarm is None:
             return []
         alarm, self._alarm = self._alarm, None
-        # Under it the quality is as asked again: the next disturbance starts with a short cool-down.
-        self._knows.troubles.pop(self._profile, None)
+        self._cool_downs.reset(self._profile)  # it delivers again: its next cool-down is a short one
         return [Clear(alarm)]
-
-
-def _beyond(bound: Bound, place: float) -> float:
-    """How far a place lies outside a bound; words have no distance."""
-    return 0.0 if bound.words else max(bound.low - place, place - bound.high, 0.0)
-
-
-def _named(short: tuple[Shortfall, ...]) -> str:
-    return ", ".join(s.attribute for s in short)

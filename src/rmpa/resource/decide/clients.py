@@ -1,16 +1,15 @@
-"""Who asks something of a resource, in which words, and who of them is gone.
+"""The clients of a resource: their last messages, refusals and presence.
 
-What is asked together is ``resource.declare.requirements``'; here is what belongs to each client: the mark on its
-request, by
-which it knows the answer; its stamp, so that the same message, latched, is the same request when it comes again; why
-its last one cannot be; and how long it may be away.
+Requirements themselves are merged by ``resource.declare.requirements``. Here is what belongs to one client: the mark
+on its request, by which it recognises the answer; the stamp of its request, so that a latched message that arrives
+again is the same request; the reason of a refusal; and how long it has been absent.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rmpa.resource import limits
 from rmpa.resource.decide.saved_state import SavedRequirement
@@ -22,21 +21,22 @@ if TYPE_CHECKING:
     from rmpa.resource.declare.attributes import Attribute
     from rmpa.resource.declare.requirements import Requirement
 
-_ABSENT: int = 2
-"""Looks in a row: a proxy's subscribers connect anew when its link was gone for a moment."""
+_ABSENT: Final = 2
+"""Consecutive checks without a connection after which a client is gone: the subscribers of a proxy connect anew after
+a short interruption of its link."""
 
 
 @dataclass(slots=True)
 class _Client:
-    """One that has said something.
+    """A client that has sent a message.
 
     Args:
-        mark: On its last message.
+        mark: Of its last message.
         stamp: Of its last message, or empty.
-        values: What it asks, in its own words; ``None``: nothing that could be.
-        refusal: Why what it said last cannot be, or empty.
-        absent: Looks in a row at which it was not there.
-        grace: It asked before a restart: until when it may come back, monotonic seconds.
+        values: Its requirement as text; ``None``: none that is valid.
+        refusal: Why its last message was refused, or empty.
+        absent: Consecutive checks without a connection.
+        grace: For a client of before a restart: until when it may come back, monotonic seconds.
     """
 
     mark: str = ""
@@ -52,7 +52,7 @@ class Clients:
 
     Args:
         resource: Its name, for errors.
-        attributes: What can be asked for, by name.
+        attributes: The attributes that clients may request, by name.
     """
 
     def __init__(self, resource: str, attributes: Mapping[str, Attribute]) -> None:
@@ -60,14 +60,14 @@ class Clients:
         self._attributes = attributes
         self._known: dict[str, _Client] = {}
         self.expiries: dict[tuple[str, str], float] = {}
-        """By client and stamp: when a request expires, so that the same message, latched, does not begin anew."""
+        """Expiry of requests by client and stamp: a latched request that arrives again does not begin anew."""
 
-    def speaks(self, name: str, mark: str, stamp: str) -> None:
-        """A message of a client has come.
+    def received(self, name: str, mark: str, stamp: str) -> None:
+        """A client has sent a message.
 
         Args:
             name: Its node.
-            mark: On the message; what is too long is cut, for it goes to everybody, again and again.
+            mark: On the message; cut to a bound, because it is repeated in each response.
             stamp: The message's, ``seconds.nanoseconds``; or empty.
         """
         client = self._client(name)
@@ -75,18 +75,18 @@ class Clients:
         client.grace = -math.inf
 
     def read(self, name: str, values: Sequence[tuple[str, str]], now: float) -> Requirement | None:
-        """What a client asks for, in place of what it asked before; without bounds: nothing any more.
+        """Read a client's requirement, which replaces its previous one; without bounds it releases that.
 
         Args:
             name: Its node.
-            values: Attribute and text, as it said it.
+            values: Attributes and texts of the message.
             now: Monotonic seconds.
 
         Returns:
-            ``None`` if it is a latched message that comes again, behind its time.
+            ``None`` for a latched request that arrives again after it has expired.
 
         Raises:
-            ConfigError: It cannot be; what it asked before stays.
+            ConfigError: It is invalid; the previous one stays in force.
         """
         requirement = parse_requirement(name, list(values), self._attributes, self._resource, now)
         client = self._client(name)
@@ -101,54 +101,54 @@ class Clients:
         return requirement
 
     def refuse(self, name: str, why: str) -> None:
-        """What a client said cannot be."""
+        """A client's last message is invalid."""
         self._client(name).refusal = why
 
     def refusal(self, name: str) -> str:
-        """Why what a client said last cannot be, or empty."""
+        """Why a client's last message was refused, or empty."""
         client = self._known.get(name)
         return client.refusal if client is not None else ""
 
     def mark(self, name: str) -> str:
-        """The one on a client's last message; it comes back on the answer."""
+        """The mark of a client's last message, which its response repeats."""
         client = self._known.get(name)
         return client.mark if client is not None else ""
 
     @property
     def refused(self) -> list[str]:
-        """Those whose last message cannot be."""
+        """The clients whose last message was refused."""
         return [name for name, client in self._known.items() if client.refusal]
 
-    def gone(self, here: Collection[str], now: float) -> list[str]:
-        """Forget those that are not here: killed, unplugged, or simply over; to be called again and again.
+    def remove_absent(self, connected: Collection[str], now: float) -> list[str]:
+        """Remove clients that are no longer connected; called periodically.
 
         Args:
-            here: Those that are connected.
+            connected: The nodes that are connected.
             now: Monotonic seconds.
 
         Returns:
-            Those that are forgotten.
+            The clients that were removed.
         """
-        found = []
+        removed = []
         for name, client in list(self._known.items()):
-            if name in here:
+            if name in connected:
                 client.absent, client.grace = 0, -math.inf
             elif client.grace <= now:
                 client.absent += 1
                 if client.absent >= _ABSENT:
                     del self._known[name]
-                    found.append(name)
-        return found
+                    removed.append(name)
+        return removed
 
     # --- over a restart -----------------------------------------------------------------------------------------
 
-    def asked(self, requirements: Mapping[str, Requirement], now: float, now_ns: int) -> list[SavedRequirement]:
-        """What each client asks, in its own words.
+    def save(self, requirements: Mapping[str, Requirement], now: float, now_ns: int) -> list[SavedRequirement]:
+        """The requirements of all clients as they are stored.
 
         Args:
             requirements: In force, by client.
             now: Monotonic seconds.
-            now_ns: The same by the wall clock.
+            now_ns: The same moment by the wall clock.
         """
         found = []
         for name, requirement in requirements.items():
@@ -165,18 +165,18 @@ class Clients:
             )
         return found
 
-    def recall(self, before: Iterable[SavedRequirement], now: float, now_ns: int) -> list[Requirement]:
-        """Take up what was asked before a restart; who does not come back within the grace is forgotten."""
+    def restore(self, saved: Iterable[SavedRequirement], now: float, now_ns: int) -> list[Requirement]:
+        """Put stored requirements in force; a client that does not return within the grace period is removed."""
         found = []
-        for asked in before:
-            requirement = asked.requirement(self._attributes, self._resource, now, now_ns)
+        for one in saved:
+            requirement = one.requirement(self._attributes, self._resource, now, now_ns)
             if requirement is None:
                 continue
             found.append(requirement)
             grace = now + limits.RESOURCE_CLIENT_GRACE
-            self._known[asked.client] = _Client(asked.mark, asked.stamp, asked.values, grace=grace)
-            if asked.stamp and requirement.expires is not None:
-                self.expiries[asked.client, asked.stamp] = requirement.expires
+            self._known[one.client] = _Client(one.mark, one.stamp, one.values, grace=grace)
+            if one.stamp and requirement.expires is not None:
+                self.expiries[one.client, one.stamp] = requirement.expires
         return found
 
     def _client(self, name: str) -> _Client:

@@ -1,9 +1,8 @@
-"""The most similar profile: which System Profile serves best what all clients ask (paper, section 3.1).
+"""The most similar profile: the System Profile that serves the merged requirements best (paper, section 3.1).
 
-For each attribute that is asked for, a profile's *shortfall* is how far its value lies on the wrong side of the
-bound, as a part of the attribute's tolerance, or else of its range over all profiles (0 or 1 where that is 0); better
-than asked is no shortfall. Its *distance* is the weighted root mean square of the shortfalls, plus a little for its
-cost::
+For each requested attribute, a profile's *shortfall* is the distance of its value outside of the bound, relative to
+the attribute's tolerance, or else to its range over all profiles (0 or 1 where that is 0); a better value than the
+requested one has none. Its *distance* is the weighted root mean square of the shortfalls, plus a part of its cost::
 
     delta = max(0, shortfall) / s        D = sqrt(sum(w * delta^2) / sum(w)) + EPSILON * cost
 
@@ -29,11 +28,11 @@ if TYPE_CHECKING:
     from rmpa.resource.declare.requirements import Bound
 
 EPSILON: Final = 1e-3
-"""What one unit of cost adds to the distance: it decides among profiles that serve nearly alike."""
+"""Contribution of one unit of cost to the distance: it decides among profiles of nearly equal shortfall."""
 _FEW: Final = 3
-"""Of more than one in so many profiles the distances are worked out at once, of fewer one by one."""
+"""If more than one in so many profiles is feasible, all distances are computed at once, else one by one."""
 _MISSING: Final = 1.0
-"""The shortfall of an attribute that a profile does not offer: as far as the whole range."""
+"""The shortfall of an attribute that a profile does not offer: the whole range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,16 +41,16 @@ class Term:
 
     Args:
         attribute: Its name.
+        wanted: The requested bound, for people.
         offered: The profile's value, ``None`` if it has none.
-        wanted: What is asked, ready to read.
         delta: The shortfall, 0 where the request is met.
         weight: Of the attribute.
-        hard: Whether a shortfall excludes.
+        hard: Whether a shortfall excludes the profile.
     """
 
     attribute: str
-    offered: Value | None
     wanted: str
+    offered: Value | None
     delta: float
     weight: float
     hard: bool
@@ -64,14 +63,14 @@ class Term:
 
 @dataclass(frozen=True, slots=True)
 class ProfileScore:
-    """How one profile does.
+    """How well one profile serves the requirements.
 
     Args:
         profile: Its name.
         distance: ``D``.
         hard_shortfall: The largest weighted shortfall of a hard requirement; 0: it is feasible.
-        excluded: Why it is left out (a precondition, a failure within the cool-down), or empty.
-        terms: The parts of the distance, in the order of the attributes asked for.
+        excluded: Why it is excluded (a precondition, a cool-down), or empty.
+        terms: The parts of the distance, in the order of the requested attributes.
     """
 
     profile: str
@@ -88,10 +87,10 @@ class ProfileScore:
 
 @dataclass(frozen=True, slots=True)
 class ProfileDecision:
-    """Which profile serves best.
+    """The profile that serves best.
 
     Args:
-        profile: Its name; empty if all are left out.
+        profile: Its name; empty if all are excluded.
         distance: Its ``D``.
         feasible: Whether it meets every hard requirement; if not, this is a non-adaptable event.
         best_effort: Whether it was taken because it is the declared best-effort profile.
@@ -104,11 +103,11 @@ class ProfileDecision:
 
 
 class _Column:
-    """One attribute under one bound, a value for each profile.
+    """The shortfalls of all profiles in one attribute.
 
     Args:
-        bound: What is asked.
-        deltas: The shortfalls.
+        bound: The requested one.
+        deltas: One shortfall for each profile.
     """
 
     __slots__ = ("_squares", "bound", "deltas")
@@ -120,13 +119,13 @@ class _Column:
 
     @property
     def weighted(self) -> list[float]:
-        """Times the weight."""
+        """The shortfalls times the weight."""
         weight = self.bound.weight
         return self.deltas if weight == 1 else [weight * delta for delta in self.deltas]
 
     @property
     def squares(self) -> list[float]:
-        """Their squares, times the weight; most decisions need few of them."""
+        """The squares times the weight; lazy, because most decisions need few of them."""
         if self._squares is None:
             weight = self.bound.weight
             if weight == 1:
@@ -137,7 +136,7 @@ class _Column:
 
 
 class Decider:
-    """Decides for one resource; what does not change between decisions is worked out once.
+    """Decides for one resource; values that are the same for all decisions are computed once.
 
     Args:
         resource: Its name, for errors.
@@ -160,12 +159,12 @@ class Decider:
         """The places of the attributes that every profile offers."""
         self._columns: dict[str, _Column] = {}
         for name, attribute in attributes.items():
-            places = [attribute.place(p.offers[name]) if name in p.offers else None for p in profiles]
+            places = [attribute.position(p.offers[name]) if name in p.offers else None for p in profiles]
             known = [place for place in places if place is not None]
             self._places[name] = places
             if len(known) == len(places):
                 self._known[name] = known
-            span = attribute.tolerated
+            span = attribute.tolerated_distance
             self._spans[name] = span if span is not None else (max(known) - min(known) if known else 0.0)
         self._offered = {name for profile in profiles for name in profile.offers}
         self._best_effort = next((profile.name for profile in profiles if profile.best_effort), "")
@@ -176,7 +175,7 @@ class Decider:
         return tuple(self._profiles)
 
     def profile(self, name: str) -> Profile:
-        """One of them.
+        """The profile of this name.
 
         Raises:
             ConfigError: There is none of that name.
@@ -189,15 +188,15 @@ class Decider:
         return found
 
     def decide(self, bounds: Mapping[str, Bound], excluded: Mapping[str, str] | None = None) -> ProfileDecision:
-        """The profile that serves best what is asked.
+        """The profile that serves the requirements best.
 
         Args:
-            bounds: By attribute; those of attributes that are not declared raise ``KeyError``.
-            excluded: Profiles that are left out, by name, and why.
+            bounds: By attribute; undeclared attributes raise ``KeyError``.
+            excluded: Reasons by the names of profiles that may not be taken.
         """
         columns = [self._column(name, bound) for name, bound in bounds.items()]
-        left_out = excluded or {}
-        allowed = [index for index, name in enumerate(self._profiles) if name not in left_out]
+        reasons = excluded or {}
+        allowed = [index for index, name in enumerate(self._profiles) if name not in reasons]
         names = self.profiles
         hard_deltas = [column.deltas for column in columns if column.bound.hard]
         fails = [*map(any, zip(*hard_deltas, strict=True))]  # a shortfall is above 0
@@ -210,7 +209,7 @@ class Decider:
             distances = self._distances(columns)
             best = min(feasible, key=distances.__getitem__)
             return ProfileDecision(names[best], distances[best], feasible=True)
-        if self._best_effort and self._best_effort not in left_out:
+        if self._best_effort and self._best_effort not in reasons:
             best = names.index(self._best_effort)
             return ProfileDecision(names[best], self._distance(best, columns), feasible=False, best_effort=True)
         if not allowed:
@@ -224,11 +223,15 @@ class Decider:
     ) -> tuple[ProfileScore, ...]:
         """Every profile's score with all its terms, in order of declaration."""
         distances, hard = self._judge(bounds)
-        left_out = excluded or {}
-        said = {name: wanted(self._attributes[name], bound) for name, bound in bounds.items()}
+        reasons = excluded or {}
+        texts = {name: describe_bound(self._attributes[name], bound) for name, bound in bounds.items()}
         return tuple(
             ProfileScore(
-                name, distances[index], hard[index], left_out.get(name, ""), self._terms(index, profile, said, bounds)
+                name,
+                distances[index],
+                hard[index],
+                reasons.get(name, ""),
+                self._terms(index, profile, texts, bounds),
             )
             for index, (name, profile) in enumerate(self._profiles.items())
         )
@@ -239,7 +242,7 @@ class Decider:
         return self._distance(self.profiles.index(name), columns)
 
     def _judge(self, bounds: Mapping[str, Bound]) -> tuple[list[float], list[float]]:
-        """Distances, and largest weighted hard shortfalls, by profile."""
+        """Distances and largest weighted hard shortfalls of all profiles."""
         columns = [self._column(name, bound) for name, bound in bounds.items()]
         distances = self._distances(columns)
         hard = [column.weighted for column in columns if column.bound.hard]
@@ -256,7 +259,7 @@ class Decider:
         return [math.sqrt(total / scale) + cost for total, cost in zip(sums, self._costs, strict=True)]
 
     def _distance(self, index: int, columns: Sequence[_Column]) -> float:
-        """``D`` of one profile, to the bit as ``_distances`` has it."""
+        """``D`` of one profile, bit for bit the value of ``_distances``."""
         if not columns:
             return self._costs[index]
         scale = sum(column.bound.weight for column in columns)
@@ -264,7 +267,7 @@ class Decider:
         return math.sqrt(total / scale) + self._costs[index]
 
     def _column(self, name: str, bound: Bound) -> _Column:
-        """One attribute's part in every profile's distance; most bounds are as they were at the last decision."""
+        """The column of an attribute; cached, because most bounds are the same as at the last decision."""
         known = self._columns.get(name)
         if known is not None and known.bound == bound:
             return known
@@ -274,14 +277,14 @@ class Decider:
     def _deltas(self, name: str, bound: Bound) -> list[float]:
         places, span = self._places[name], self._spans[name]
         if name not in self._offered:
-            return [0.0] * len(places)  # no profile says anything of it: what is measured will tell
+            return [0.0] * len(places)  # no profile offers it, so only measurements count
         if bound.words:
             words = self._attributes[name].words
             wanted = {float(words.index(word)) for word in bound.words}
             return [0.0 if place in wanted else _MISSING for place in places]
         low, high = bound.low, bound.high
         if span > 0:
-            if (known := self._known.get(name)) is not None:  # the usual ones, in half of the time
+            if (known := self._known.get(name)) is not None:  # the usual case, in half of the time
                 if high == math.inf:
                     return [(low - place) / span if place < low else 0.0 for place in known]
                 if low == -math.inf:
@@ -299,13 +302,13 @@ class Decider:
         return [_MISSING if place is None or not low <= place <= high else 0.0 for place in places]
 
     def _terms(
-        self, index: int, profile: Profile, said: Mapping[str, str], bounds: Mapping[str, Bound]
+        self, index: int, profile: Profile, texts: Mapping[str, str], bounds: Mapping[str, Bound]
     ) -> tuple[Term, ...]:
         return tuple(
             Term(
                 name,
+                texts[name],
                 profile.offers.get(name),
-                said[name],
                 self._column(name, bound).deltas[index],
                 bound.weight,
                 bound.hard,
@@ -314,12 +317,12 @@ class Decider:
         )
 
 
-def wanted(attribute: Attribute, bound: Bound) -> str:
-    """What is asked of an attribute, for people: ``at least 20 Hz``."""
+def describe_bound(attribute: Attribute, bound: Bound) -> str:
+    """A bound for people: ``at least 20 Hz``."""
     if bound.words:
         return " or ".join(word for word in attribute.words if word in bound.words)
-    low = attribute.show(attribute.value(bound.low)) if bound.low > -math.inf else ""
-    high = attribute.show(attribute.value(bound.high)) if bound.high < math.inf else ""
+    low = attribute.format(attribute.value_at(bound.low)) if bound.low > -math.inf else ""
+    high = attribute.format(attribute.value_at(bound.high)) if bound.high < math.inf else ""
     if low == high:
         return f"exactly {low}"
     if low and high:

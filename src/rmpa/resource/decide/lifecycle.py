@@ -1,4 +1,4 @@
-"""The life cycle of a resource, in the words of ROS 2's managed nodes (design.ros2.org/articles/node_lifecycle).
+"""The life cycle of a resource, with the states of ROS 2's managed nodes (design.ros2.org/articles/node_lifecycle).
 
 ::
 
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
 
 
 class LifecycleState(StrEnum):
-    """Where a resource stands."""
+    """State of a resource."""
 
     UNCONFIGURED = "unconfigured"
-    """It is there, and has nothing of what it works with."""
+    """Registered; holds no resources of the device yet."""
     INACTIVE = "inactive"
-    """Ready: parameters can be set; nothing runs and nothing is published."""
+    """Parameters can be set; no task runs and nothing is published."""
     ACTIVE = "active"
     """Its tasks run."""
     FINALIZED = "finalized"
-    """Over."""
+    """Terminal."""
 
 
 class Transition(StrEnum):
-    """What leads from one state to another."""
+    """Transition between two states."""
 
     CONFIGURE = "configure"
     CLEANUP = "cleanup"
@@ -52,11 +52,11 @@ TRANSITIONS: Final[Mapping[tuple[LifecycleState, Transition], LifecycleState]] =
     (_S.INACTIVE, _T.FINALIZE): _S.FINALIZED,
     (_S.ACTIVE, _T.FINALIZE): _S.FINALIZED,
 }
-"""Where each transition leads; what is not here cannot be."""
+"""Target state of each valid transition."""
 
 
 class LifeCycle:
-    """One resource's state; the driver calls the hooks and then says how they ended."""
+    """State machine of one resource; the driver calls the user's callbacks and reports how they ended."""
 
     def __init__(self) -> None:
         self._state = LifecycleState.UNCONFIGURED
@@ -66,19 +66,19 @@ class LifeCycle:
 
     @property
     def state(self) -> LifecycleState:
-        """Where it stands; during a transition still where that began."""
+        """The state; during a transition the one where that began."""
         return self._state
 
     @property
     def under_way(self) -> Transition | None:
-        """The transition whose hook runs."""
+        """The transition whose callback runs."""
         return self._under_way
 
     def begin(self, transition: Transition) -> None:
         """Begin a transition; ``succeeded`` or ``failed`` ends it.
 
         Raises:
-            LocalProtocolError: It does not begin at this state, or another one is under way.
+            LocalProtocolError: It is not valid in this state, or another one is under way.
         """
         if self._under_way is not None:
             raise LocalProtocolError(f"{transition} while {self._under_way} is under way")
@@ -87,7 +87,7 @@ class LifeCycle:
         self._under_way = transition
 
     def succeeded(self) -> LifecycleState:
-        """The hook has ended well; return the new state."""
+        """The callback has returned; return the new state."""
         if self._under_way is None:
             raise LocalProtocolError("no transition is under way")
         self._state = TRANSITIONS[self._state, self._under_way]
@@ -96,9 +96,9 @@ class LifeCycle:
         return self._state
 
     def failed(self, why: str) -> LifecycleState:
-        """The hook has raised; return the state, which is the old one, but ``finalize`` and ``deactivate`` succeed.
+        """The callback has raised; return the state.
 
-        What ends must end, whatever its own clearing up says.
+        That is the old one, except after ``finalize`` and ``deactivate``: an error must not prevent the end.
         """
         transition = self._under_way
         if transition in (Transition.FINALIZE, Transition.DEACTIVATE):

@@ -1,6 +1,6 @@
-"""What clients observe of a resource's quality, and what the resource itself lacks: both are judged once a window.
+"""Quality as clients observe it, and inputs that are missing; both are judged once a window.
 
-A resource measures what it sends. What arrives in another module may be less, and only the client there sees it.
+A resource measures the messages that it sends. Fewer may arrive in another module, which only the client there sees.
 """
 
 from __future__ import annotations
@@ -11,90 +11,95 @@ from rmpa.core.errors import ConfigError
 from rmpa.resource import limits
 from rmpa.resource.declare.attributes import Direction
 from rmpa.resource.declare.requirements import find_attribute
-from rmpa.resource.declare.units import quantity
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Collection, Iterable, Mapping
 
     from rmpa.resource.declare.attributes import Attribute, Value
-    from rmpa.resource.declare.requirements import Requirement
 
 MISSING_WINDOWS: Final = 2
-"""Windows running in which something is missing before it is said: at the start it takes a while to connect."""
+"""Consecutive windows in which something is missing before it is reported: connecting takes a while at the start."""
 _WORSE: Final = {Direction.MAX: -1, Direction.MIN: 1}
 
 
 class ObservedQualities:
-    """What each client said last.
+    """The last report of each client.
 
     Args:
-        attributes: The resource's.
+        attributes: The resource's, by name.
         resource: Its name, for errors.
-        patience: Seconds for which that counts.
+        lifespan: Seconds for which a report counts.
     """
 
-    def __init__(self, attributes: Mapping[str, Attribute], resource: str, patience: float) -> None:
+    def __init__(self, attributes: Mapping[str, Attribute], resource: str, lifespan: float) -> None:
         self._attributes = attributes
         self._resource = resource
-        self._patience = patience
-        self._seen: dict[str, tuple[float, dict[str, Value]]] = {}
+        self._lifespan = lifespan
+        self._reports: dict[str, tuple[float, dict[str, Value]]] = {}
 
-    def told(self, client: str, values: Iterable[tuple[str, str]], now: float) -> None:
-        """A client says what it observes, in place of what it said before.
+    def report(self, client: str, values: Iterable[tuple[str, str]], now: float) -> None:
+        """Take a client's report, in place of its previous one.
 
         Raises:
-            ConfigError: There is no such attribute, or that is no value of it; nothing of it counts then.
+            ConfigError: An unknown attribute or an invalid value; the whole report is dropped then.
         """
         found: dict[str, Value] = {}
         for number, (name, text) in enumerate(values):
             where = f"observation of {name}"
             if number >= limits.REQUIREMENT_BOUNDS_MAX:
                 raise ConfigError(where, f"more than {limits.REQUIREMENT_BOUNDS_MAX} attributes")
-            attribute = find_attribute(self._attributes, name, self._resource)
-            value = text if attribute.of_words else quantity(text, attribute.unit, where)
-            found[name] = attribute.check(value, where)
-        self._seen[client] = (now, found)
+            found[name] = find_attribute(self._attributes, name, self._resource).parse(text, where)
+        self._reports[client] = (now, found)
 
-    def given(self, client: str, name: str) -> Value | None:
-        """What this client said of an attribute, if anything."""
-        _, found = self._seen.get(client, (0.0, {}))
+    def observed(self, client: str, name: str) -> Value | None:
+        """The value of an attribute in a client's report, if any."""
+        _, found = self._reports.get(client, (0.0, {}))
         return found.get(name)
 
-    def judge(self, measured: dict[str, Value], requirements: Mapping[str, Requirement], now: float) -> None:
-        """Let the worst count: of what was measured here, and of what those observe who ask for something.
+    def worst(self, measured: Mapping[str, Value], clients: Collection[str], now: float) -> dict[str, Value]:
+        """The worse of the measured values and the reported ones.
 
         Args:
-            measured: Changed in place.
-            requirements: By client.
+            measured: By attribute.
+            clients: Those that have a requirement; reports of others do not count.
             now: Monotonic seconds.
         """
-        for client in [client for client, (at, _) in self._seen.items() if now - at > self._patience]:
-            del self._seen[client]
-        for client, (_, found) in self._seen.items():
-            for name, value in found.items() if client in requirements else ():
-                attribute, known = self._attributes[name], measured.get(name)
-                worse = _WORSE.get(attribute.direction)
-                if known is None or worse is None or worse * (attribute.place(value) - attribute.place(known)) > 0:
-                    measured[name] = value
+        self._reports = {client: r for client, r in self._reports.items() if now - r[0] <= self._lifespan}
+        worst = dict(measured)
+        for client, (_, found) in self._reports.items():
+            for name, value in found.items() if client in clients else ():
+                attribute, known = self._attributes[name], worst.get(name)
+                sign = _WORSE.get(attribute.direction)
+                if (
+                    known is None
+                    or sign is None
+                    or sign * (attribute.position(value) - attribute.position(known)) > 0
+                ):
+                    worst[name] = value
+        return worst
 
     def clear(self) -> None:
-        """Another profile runs: what was observed was of the one before."""
-        self._seen.clear()
+        """Drop all reports: they are about the previous profile."""
+        self._reports.clear()
 
 
 class MissingInputs:
-    """What a resource needs and does not have."""
+    """Tracks what a resource needs and lacks."""
 
     def __init__(self) -> None:
         self._windows: dict[str, int] = {}
 
-    def look(self, missing: Iterable[str]) -> list[tuple[str, bool]]:
-        """Return what has gone (true) and what is back (false), to be said; called once a window."""
+    def update(self, missing: Iterable[str]) -> list[tuple[str, bool]]:
+        """Take what is missing in this window.
+
+        Returns:
+            The changes to report: each text with true (missing) or false (back).
+        """
         texts = set(missing)
         back = [text for text in self._windows if text not in texts]
-        news = [(text, False) for text in back if self._windows.pop(text) >= MISSING_WINDOWS]
+        changes = [(text, False) for text in back if self._windows.pop(text) >= MISSING_WINDOWS]
         for text in sorted(texts):
             self._windows[text] = self._windows.get(text, 0) + 1
             if self._windows[text] == MISSING_WINDOWS:
-                news.append((text, True))
-        return news
+                changes.append((text, True))
+        return changes

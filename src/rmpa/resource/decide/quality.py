@@ -1,7 +1,7 @@
-"""Quality as it was measured: of an output, an input, or an attribute of the user's own, a window at a time.
+"""Measured quality of an output, an input, or a declared attribute, window by window.
 
-A message costs the same however many there were: sums, no samples. What a window cannot say (a period's deviation of
-one message, a latency without a stamp) is left out of it, and then judged by nobody.
+Only sums are kept, so each message costs the same. Values that a window does not determine (the standard deviation of
+a single period, a latency without a stamp) are left out of it and not judged.
 """
 
 from __future__ import annotations
@@ -10,25 +10,25 @@ import math
 import struct
 from typing import TYPE_CHECKING, Final
 
+from rmpa.core.serial_number import SERIAL_HALF, SERIAL_MASK
+
 if TYPE_CHECKING:
     from rmpa.resource.declare.attributes import Attribute, Value
 
 _HEADER: Final = struct.Struct("<III")
 _SECOND: Final = 1_000_000_000
 _SOURCES: Final = 64
-"""Publishers of one topic whose numbers are followed; with more of them all begin anew."""
-_SEQUENCES: Final = 1 << 32
-_HALF: Final = 1 << 31
+"""Publishers of one topic whose sequence numbers are tracked; with more of them all begin anew."""
 
 
 class TopicQuality:
-    """What is measured of one output or input.
+    """Measures one output or input.
 
     Args:
         now: Monotonic seconds.
         stamped: Whether its messages begin with a ``std_msgs/Header``.
-        numbered: Whether that header's ``seq`` counts the messages of each source, as the client libraries let it.
-        deadline: Seconds from one message to the next at the most, or ``None``.
+        numbered: Whether that header's ``seq`` counts the messages of each source, as client libraries set it.
+        deadline: Longest time between two messages in seconds (the QoS policy), or ``None``.
     """
 
     def __init__(
@@ -58,10 +58,10 @@ class TopicQuality:
         """Take one message.
 
         Args:
-            raw: Its bytes, without the length.
-            now: Monotonic seconds at which it left, or came.
-            now_ns: The same by the wall clock, which its stamp is of.
-            source: Who sent it: each publisher has its own numbers.
+            raw: Its bytes, without the length prefix.
+            now: When it was sent or received, monotonic seconds.
+            now_ns: The same moment by the wall clock, to which its stamp refers.
+            source: The publisher; each has its own sequence numbers.
         """
         last, self._last = self._last, now
         if last is not None:
@@ -80,31 +80,31 @@ class TopicQuality:
                 self._latency += self._last_age
                 self._stamps += 1
             if self._numbered:
-                self._follow(sequence, source)
+                self._count_lost(sequence, source)
 
-    def _follow(self, sequence: int, source: str) -> None:
+    def _count_lost(self, sequence: int, source: str) -> None:
         before = self._sequences.get(source)
         if before is None and len(self._sequences) >= _SOURCES:
             self._sequences.clear()
         self._sequences[source] = sequence
         if before is not None:
-            gap = (sequence - before - 1) % _SEQUENCES
-            if gap < _HALF:
+            gap = sequence - before - 1 & SERIAL_MASK
+            if gap < SERIAL_HALF:
                 self._lost += gap
 
     def restart(self, now: float) -> None:
-        """Another profile runs: a new window begins, without what was measured before."""
+        """Begin a new window without the measurements so far, because another profile runs."""
         self._began = now
         if self._last is not None:
-            self._last = now  # the pause between the two is nobody's period
+            self._last = now  # the time between the two profiles is no period
         self._clear()
 
     def window(self, now: float) -> dict[str, Value]:
-        """What was measured since the last window, by the names of ``attributes.MEASURED``; a new window begins."""
+        """End the window; return its values by the names of ``attributes.MEASURED``."""
         span = max(now - self._began, 1e-9)
         silent = now - (self._last if self._last is not None else self._began)
         found: dict[str, Value] = {"bandwidth": self._bytes / span}
-        # Until the next message comes the period is at least the silence so far: a source that stops is slow at once.
+        # The present period is at least as long as the silence: the rate of a source that stops falls at once.
         mean = self._sum / self._periods if self._periods else math.inf
         if self._last is None:
             found["rate"] = 0.0
@@ -130,10 +130,10 @@ class TopicQuality:
 
 
 class ObservedQuality:
-    """An attribute of the user's own: the mean of a window's observations, or its last word.
+    """A declared attribute: the mean of a window's observations, or the last word.
 
-    Without a new observation the last window's value stands: a battery's charge is not unknown because nobody looked.
-    But under another profile nothing is known before it is observed anew.
+    Without a new observation the value of the last window stays valid: a battery's charge remains known between two
+    readings. Under another profile the attribute is unknown until it is observed again.
     """
 
     def __init__(self, attribute: Attribute) -> None:
@@ -141,13 +141,13 @@ class ObservedQuality:
         self.restart()
 
     def restart(self) -> None:
-        """Another profile runs: what was observed before says nothing of it."""
+        """Forget the value, because another profile runs."""
         self._sum = 0.0
         self._count = 0
         self._value: Value | None = None
 
     def observe(self, value: Value) -> None:
-        """Take one observation, checked already."""
+        """Take one valid observation."""
         if isinstance(value, str):
             self._value = value
         else:
@@ -155,7 +155,7 @@ class ObservedQuality:
             self._count += 1
 
     def window(self) -> Value | None:
-        """The window's value, or ``None`` if nothing was ever observed; a new window begins."""
+        """End the window; return its value, or ``None`` if it was never observed."""
         if self._count:
             self._value = self._sum / self._count
             self._sum, self._count = 0.0, 0

@@ -1,4 +1,4 @@
-"""What a resource tells one client."""
+"""A resource's answer to the requirement of one client."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class RequirementAnswer:
-    """What a resource tells one client.
+    """How a resource serves one client.
 
     Args:
-        level: OK; WARN: something falls short; ERROR: no profile can serve, or the request cannot be.
-        message: In a few words.
-        values: By attribute: what was wanted, and what is given.
+        level: OK; WARN: a quality falls short; ERROR: no profile can serve, or the request is invalid.
+        message: A short explanation.
+        values: By attribute: the quality that was requested, and the one that is offered.
     """
 
     level: DiagnosticLevel

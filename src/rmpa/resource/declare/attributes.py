@@ -1,7 +1,7 @@
-"""Quality attributes: what a quality is measured in, and which way is better.
+"""Quality attributes: the unit and scale of a quality, and which direction is better.
 
 The literature sorts requirements into four classes (paper, section 3.1: "temporal and spatial requirements,
-information reliability and operation performance"); the class is for people and reports, and decides nothing.
+information reliability and operation performance"); the class is shown in reports and has no influence on decisions.
 """
 
 from __future__ import annotations
@@ -12,65 +12,66 @@ from enum import StrEnum
 from typing import Final
 
 from rmpa.core.errors import ConfigError
+from rmpa.resource.declare.units import quantity
 
 
 class Direction(StrEnum):
-    """Which values satisfy whoever asked."""
+    """Which values satisfy a request."""
 
     MAX = "max"
     """More is better: a request is a lower bound (rate, resolution)."""
     MIN = "min"
     """Less is better: a request is an upper bound (latency, energy)."""
     TARGET = "target"
-    """As near as can be to an interval or a value (zoom, speed)."""
+    """As near as possible to an interval or a value (zoom, speed)."""
     EXACT = "exact"
-    """This or nothing (frame id, encoding)."""
+    """Exactly this value (frame id, encoding)."""
 
 
 class Scale(StrEnum):
-    """How far apart two values are."""
+    """How the distance between two values is measured."""
 
     LINEAR = "linear"
     LOG = "log"
-    """By their ratio: 10 to 20 Hz is as far as 20 to 40. Rates, latencies and bandwidths are so."""
+    """By their ratio: 10 to 20 Hz is as far as 20 to 40 Hz. For rates, latencies and bandwidths."""
     ORDINAL = "ordinal"
-    """Words in an order, as far apart as their places."""
+    """Ordered words; the distance is the difference of their positions."""
     NOMINAL = "nominal"
-    """Words without an order: the same, or not."""
+    """Words without an order: equal or not."""
 
 
 class Category(StrEnum):
-    """The four classes of requirement."""
+    """The four classes of requirements."""
 
     TEMPORAL = "temporal"
     SPATIAL = "spatial"
     RELIABILITY = "reliability"
-    """Of the information: accuracy, confidence, loss."""
+    """Of information: accuracy, confidence, loss."""
     PERFORMANCE = "performance"
     """Of the operation: energy, CPU, cost."""
 
 
-_NEARLY_NOTHING: Final = 1e-12
+_LOG_FLOOR: Final = 1e-12
 Value = float | str
-"""A quality's value: a number in the attribute's unit, or one of its words."""
+"""The value of a quality: a number in the attribute's unit, or one of its words."""
 
 
 @dataclass(frozen=True, slots=True)
 class Attribute:
-    """One quality, as a resource declares it.
+    """One quality attribute, as a resource declares it.
 
     Args:
         name: ``rate``, ``latency``, ``accuracy`` …
-        direction: Which way is better.
-        unit: Of its values (``resource.declare.units``); empty: a ratio.
-        scale: How far apart two values are.
+        direction: Which values are better.
+        unit: Unit of its values (``resource.declare.units``); empty: a ratio.
+        scale: How distances are measured.
         category: The class of requirement, for reports.
-        tolerance: A shortfall of this size counts 1: in the unit (linear), as a ratio above 1 (log), in places
-            (ordinal). ``None``: the range over all profiles.
-        words: Of ordinal and nominal scales; ordinal ones from worst to best, or in their order for ``target``.
+        tolerance: A shortfall of this size counts as 1: in the unit (linear), as a ratio above 1 (log), in
+            positions (ordinal). ``None``: the range over all profiles.
+        words: The values of ordinal and nominal scales; ordinal ones from worst to best, or in order for ``target``.
 
     Raises:
-        ConfigError: What was declared contradicts itself.
+        ConfigError: The declaration contradicts itself.
     """
 
     name: str
@@ -83,12 +84,12 @@ class Attribute:
 
     def __post_init__(self) -> None:
         where = f"attribute {self.name}"
-        if self.of_words and not self.words:
+        if self.has_words and not self.words:
             remedy = 'for example words = ("low", "high")'
             raise ConfigError(where, f"a scale that is {self.scale} needs its words", remedy)
         if len(set(self.words)) != len(self.words):
             raise ConfigError(where, "it has a word twice")
-        if self.words and not self.of_words:
+        if self.words and not self.has_words:
             raise ConfigError(where, f"a scale that is {self.scale} has no words", "make it ordinal or nominal")
         if self.scale is Scale.NOMINAL and self.direction is not Direction.EXACT:
             raise ConfigError(where, f"words without an order have no {self.direction}", "make its direction exact")
@@ -98,17 +99,17 @@ class Attribute:
             raise ConfigError(where, f"a tolerance of {self.tolerance:g}", f"it is {kind}")
 
     @property
-    def of_words(self) -> bool:
+    def has_words(self) -> bool:
         """Whether its values are words."""
         return self.scale in (Scale.ORDINAL, Scale.NOMINAL)
 
     def check(self, value: Value, where: str) -> Value:
-        """A value of this attribute, as it is.
+        """Return the value if it is a valid value of this attribute.
 
         Raises:
-            ConfigError: It cannot be one.
+            ConfigError: It is not.
         """
-        if self.of_words:
+        if self.has_words:
             if value not in self.words:
                 remedy = f"it is one of {', '.join(self.words)}"
                 raise ConfigError(where, f"{value!r} is no value of {self.name}", remedy)
@@ -119,31 +120,39 @@ class Attribute:
             raise ConfigError(where, f"{value:g} is below 0", f"{self.name} has a logarithmic scale")
         return float(value)
 
-    def place(self, value: Value) -> float:
-        """Where a value lies on a line on which equal distances count alike; words by their places.
+    def parse(self, value: Value, where: str) -> Value:
+        """Read a value as a user writes it: a number, ``"20 Hz"`` in any unit of the dimension, or a word.
 
-        On a logarithmic scale 0 lies where ``_NEARLY_NOTHING`` does, so that every distance is finite.
+        Raises:
+            ConfigError: It is not a value of this attribute.
+        """
+        return self.check(value if self.has_words else quantity(value, self.unit, where), where)
+
+    def position(self, value: Value) -> float:
+        """Position of a value on the attribute's scale: its number, its logarithm, or the index of its word.
+
+        On a logarithmic scale 0 counts as ``_LOG_FLOOR``, so that every distance is finite.
         """
         if isinstance(value, str):
             return float(self.words.index(value))
         if self.scale is Scale.LOG:
-            return math.log(max(value, _NEARLY_NOTHING))
+            return math.log(max(value, _LOG_FLOOR))
         return value
 
-    def value(self, place: float) -> Value:
-        """What lies at a place; the inverse of ``place``."""
-        if self.of_words:
-            return self.words[round(place)]
-        return math.exp(place) if self.scale is Scale.LOG else place
+    def value_at(self, position: float) -> Value:
+        """The value at a position; the inverse of ``position``."""
+        if self.has_words:
+            return self.words[round(position)]
+        return math.exp(position) if self.scale is Scale.LOG else position
 
     @property
-    def tolerated(self) -> float | None:
-        """The tolerance as a distance between places, or ``None``."""
+    def tolerated_distance(self) -> float | None:
+        """The tolerance as a distance between positions, or ``None``."""
         if self.tolerance is None:
             return None
         return math.log(self.tolerance) if self.scale is Scale.LOG else self.tolerance
 
-    def show(self, value: Value) -> str:
+    def format(self, value: Value) -> str:
         """A value with its unit, for people."""
         return value if isinstance(value, str) else f"{value:.6g} {self.unit}".rstrip()
 
@@ -157,4 +166,5 @@ DEADLINE_MISSES: Final = Attribute("deadline_misses", Direction.MIN, "", Scale.L
 BANDWIDTH: Final = Attribute("bandwidth", Direction.MIN, "B/s", Scale.LOG, Category.PERFORMANCE)
 
 MEASURED: Final = {a.name: a for a in (RATE, PERIOD_SD, LATENCY, AGE, LOSS, DEADLINE_MISSES, BANDWIDTH)}
-"""The attributes that are measured for every output and input, declared or not; losses and misses are shares."""
+"""The attributes that are measured for every output and input without being declared; losses and misses are shares
+of 1."""

@@ -1,4 +1,4 @@
-"""What a resource does: its tasks, the profiles that it may run in, the contexts that it may be in."""
+"""Behaviour of a resource: its tasks, profiles with their functions, and contexts."""
 
 from __future__ import annotations
 
@@ -15,40 +15,40 @@ if TYPE_CHECKING:
 
 Hook = Callable[[], Awaitable[None] | None]
 TaskFunction = Callable[..., Awaitable[None] | None]
-"""Without arguments if periodic; with the message if it runs on an input."""
+"""Takes no argument if periodic, the message if it runs on an input."""
 
 
 class OnFailure(StrEnum):
-    """What becomes of a task that raised, or that is stuck."""
+    """Restart policy of a task that raised or is stuck."""
 
     RESTART = "restart"
-    """It goes on, after a pause that grows with each failure in a row."""
+    """It runs again, after a back-off that grows with each failure in a row."""
     STOP = "stop"
-    """It ends; the resource goes on without it, and says so."""
+    """It ends; the resource runs on without it and reports it."""
     DEACTIVATE = "deactivate"
     """The whole resource becomes inactive."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeclaredProfile:
-    """A System Profile with what applies it."""
+    """A System Profile with the function that applies it."""
 
     profile: Profile
     apply: Hook
     needs: Callable[[], str | bool | None] | None = None
-    """Its precondition: true or ``None`` while it can be taken; else false, or a text why it cannot."""
+    """Its precondition: true or ``None`` while the profile may be used; else false, or a text with the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """A situation of the robot: what it requires, and which information flows.
+    """A situation of the robot: what it requires, and which outputs are published in it.
 
     Args:
         name: Unique.
-        when: A rule over topics and parameters (``resource.declare.context_rules``) that chooses it, or empty.
-        requires: What it asks of the resource's quality, by attribute.
+        when: A rule over topics and parameters (``resource.declare.context_rules``) that selects it, or empty.
+        requires: QoS requests to the resource itself, by attribute.
         profiles: The only profiles that may run in it; empty: any.
-        outputs: The only outputs that flow in it; ``None``: all.
+        outputs: The only outputs that are published in it; ``None``: all.
         enter: Called when it begins.
     """
 
@@ -62,16 +62,16 @@ class Context:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """Something that the resource does again and again.
+    """A function of the resource that runs periodically or on each message of an input.
 
     Args:
         name: Unique; the function's name by default.
         function: Plain (then it runs in a thread of its own) or ``async``.
         rate: Hz of a periodic one, else ``None``.
         on: The input whose messages it runs on, else ``None``.
-        on_failure: What becomes of it when it raises or is stuck.
+        on_failure: Restart policy when it raises or is stuck.
         stuck_after: Seconds that one run may take before it counts as stuck; ``None``: ten periods, at least 5 s.
-        follows: The parameter whose value is the rate, if there is one; profiles and people change it.
+        rate_parameter: The parameter whose value is the rate, or ``None``.
     """
 
     name: str
@@ -80,4 +80,4 @@ class Task:
     on: Input | None = None
     on_failure: OnFailure = OnFailure.RESTART
     stuck_after: float | None = None
-    follows: Parameter | None = None
+    rate_parameter: Parameter | None = None

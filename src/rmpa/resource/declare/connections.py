@@ -1,17 +1,21 @@
-"""What connects a resource with others: outputs, inputs, what it observes of itself, what it asks of another one."""
+"""Interfaces of a resource: outputs, inputs, attributes that it observes, requirements of other resources.
+
+While the resource runs, ``rmpa.resource.run`` binds them to a node: the fields ``on_…`` are its functions then.
+"""
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from rmpa.core.errors import LocalProtocolError
-from rmpa.resource.declare.fence import passage
+from rmpa.resource.declare.fence import fenced_action
 from rmpa.ros.types.definitions import UnknownTypeError
 from rmpa.ros.types.find import find_message_type
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from rmpa.core.contract import Contract
     from rmpa.resource.declare.answer import RequirementAnswer
@@ -20,38 +24,14 @@ if TYPE_CHECKING:
     from rmpa.ros.types.messages import MessageType
 
 
-class OutputSink(Protocol):
-    """Where an output's messages go while the resource is active."""
-
-    def publish(self, values: Mapping[str, Any], message: object | None) -> None:
-        """Send a message, built from values or given whole."""
-        ...
-
-
-class ObservationSink(Protocol):
-    """Where an attribute's observations go."""
-
-    def observe(self, attribute: str, value: Value) -> None:
-        """Take one."""
-        ...
-
-
-class DemandCarrier(Protocol):
-    """Carries what a resource asks of others while it runs."""
-
-    def asked(self, demand: Demand) -> None:
-        """It asks for something else; called in any thread."""
-        ...
-
-
 class TopicType:
-    """The message type of an output or input: found on this machine, or told later by a publisher.
+    """The message type of an output or input: found on this machine, or learnt later from a publisher.
 
     Args:
         name: ``package/Name``.
 
     Raises:
-        DefinitionError: It is malformed, or of a package that comes with rmpa, and not in it.
+        DefinitionError: The name is malformed, or rmpa comes with its package, which has no such type.
     """
 
     def __init__(self, name: str) -> None:
@@ -59,7 +39,7 @@ class TopicType:
         self.known: MessageType | None = None
         """The type, once it is known."""
         self.problem: UnknownTypeError | None = None
-        """Where it was looked for in vain."""
+        """Why it is not known on this machine."""
         try:
             self.known = find_message_type(name)
         except UnknownTypeError as error:
@@ -74,7 +54,7 @@ class TopicType:
             UnknownTypeError: It is not known yet.
         """
         if self.known is None:
-            assert self.problem is not None  # noqa: S101 - it is either
+            assert self.problem is not None  # noqa: S101 - one of them is set
             raise self.problem
         return self.known
 
@@ -85,36 +65,38 @@ class Output:
 
     Args:
         name: As declared, in the resource's namespace unless it is global.
-        kind: Its message type, which may be told later.
-        contract: What its messages need; the agent's rules apply on top.
+        kind: Its message type, which may be learnt later.
+        contract: The offered QoS of its messages; the agent's rules are applied on top.
         latch: Whether a late subscriber gets the last message.
+        on_publish: ``(message fields, whole message)``; called in any thread. ``None`` while the resource does not
+            run.
     """
 
     name: str
     kind: TopicType
     contract: Contract
     latch: bool = False
-    outlet: OutputSink | None = field(default=None, repr=False)
+    on_publish: Callable[[Mapping[str, Any], object | None], None] | None = field(default=None, repr=False)
 
     @property
     def type(self) -> MessageType:
         """Its message type.
 
         Raises:
-            UnknownTypeError: It is not known here, and no publisher has told it yet.
+            UnknownTypeError: It is unknown on this machine, and no publisher was found yet.
         """
         return self.kind.get()
 
     def publish(self, message: object | None = None, /, **values: Any) -> None:
-        """Send a message: whole, or its fields; it is dropped while the resource is not active.
+        """Publish a whole message, or one made of field values; it is dropped while the resource is not active.
 
         Raises:
             MessageError: It does not fit the output's type.
-            LocalProtocolError: The resource does not run, or the profile whose function calls was given up.
+            LocalProtocolError: The resource does not run, or the calling profile function was given up.
         """
-        if self.outlet is None:
+        if self.on_publish is None:
             raise LocalProtocolError(f"{self.name} has nowhere to go: its resource does not run (rmpa run)")
-        self.outlet.publish(values, message)
+        self.on_publish(values, message)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,9 +105,9 @@ class Input:
 
     Args:
         name: As declared.
-        kind: Its message type, which its first publisher tells where it is not known here.
-        contract: What is asked of its messages.
-        required: Whether the resource is stale while nobody publishes it.
+        kind: Its message type; its first publisher tells it if it is unknown on this machine.
+        contract: The requested QoS of its messages.
+        required: Whether the resource is stale while the topic has no publisher.
     """
 
     name: str
@@ -141,48 +123,61 @@ class Input:
 
 @dataclass(eq=False)
 class DeclaredAttribute:
-    """An attribute of the user's own; ``observe`` what was measured of it."""
+    """An attribute of the user's own; ``observe`` reports its measured value.
+
+    Args:
+        attribute: The attribute.
+        on_observation: ``(attribute's name, value)``; called in any thread. ``None`` while the resource does not run.
+    """
 
     attribute: Attribute
-    observer: ObservationSink | None = field(default=None, repr=False)
+    on_observation: Callable[[str, Value], None] | None = field(default=None, repr=False)
 
     def observe(self, value: Value) -> None:
-        """Take one observation, in the attribute's unit; without effect while the resource does not run.
+        """Report one observation in the attribute's unit; without effect while the resource does not run.
 
         Raises:
-            ConfigError: It is no value of this attribute.
-            LocalProtocolError: The profile whose function calls was given up.
+            ConfigError: It is not a value of this attribute.
+            LocalProtocolError: The calling profile function was given up.
         """
         checked = self.attribute.check(value, f"observation of {self.attribute.name}")
-        if self.observer is not None:
-            with passage(f"observe {self.attribute.name}"):
-                self.observer.observe(self.attribute.name, checked)
+        if self.on_observation is not None:
+            with fenced_action(f"observe {self.attribute.name}"):
+                self.on_observation(self.attribute.name, checked)
 
 
 @dataclass(eq=False)
 class Demand:
-    """What a resource asks of another one, here or in another module, for as long as it runs.
+    """The standing requirement of this resource on another one, here or in another module.
 
     Args:
-        resource: The other one's node, as this module's graph has it: ``sonar``, ``/robot1/sonar``.
-        wishes: By attribute; empty: nothing at present.
+        resource: The other resource's node in this module's graph: ``/sonar``, ``/robot1/sonar``.
+        requests: By attribute of the other one; empty: none at present.
         priority: The higher one wins a conflict between clients.
-        answer: What the other one says to it, the last time; ``None`` before it said anything.
+        answer: The last answer; ``None`` before the first.
+        on_change: Called with this demand, in any thread, when the requests change; ``None`` while the resource does
+            not run.
     """
 
     resource: str
-    wishes: Mapping[str, QoSRequest] = field(default_factory=dict)
+    requests: Mapping[str, QoSRequest] = field(default_factory=dict)
     priority: int = 0
     answer: RequirementAnswer | None = field(default=None, repr=False)
-    asker: DemandCarrier | None = field(default=None, repr=False)
+    on_change: Callable[[Demand], None] | None = field(default=None, repr=False)
 
-    def ask(self, **wishes: QoSRequest) -> None:
-        """Ask for this instead, from now on; from a profile or a task, in any thread. Nothing: ask for nothing.
+    def ask(self, **requests: QoSRequest) -> None:
+        """Replace the requests, from a profile or a task, in any thread; without arguments nothing is requested.
 
         Raises:
-            LocalProtocolError: The profile whose function calls was given up.
+            LocalProtocolError: The calling profile function was given up.
         """
-        with passage(f"ask {self.resource}"):
-            self.wishes = wishes
-            if self.asker is not None:
-                self.asker.asked(self)
+        with fenced_action(f"ask {self.resource}"):
+            self.requests = requests
+            if self.on_change is not None:
+                self.on_change(self)
+
+    @property
+    def wishes(self) -> Mapping[str, QoSRequest]:
+        """The former name of ``requests``."""
+        warnings.warn("Demand.wishes is deprecated: it is called requests now", DeprecationWarning, stacklevel=2)
+        return self.requests

@@ -1,4 +1,4 @@
-"""Contexts: the rules that choose one, over fields of topics and the resource's parameters.
+"""Rules that select a context, over fields of topics and the resource's parameters.
 
 ::
 
@@ -7,12 +7,12 @@
     negation   = "not" negation | "(" rule ")" | value [ ("==" | "!=" | "<" | "<=" | ">" | ">=") value ]
     value      = number | 'text' | "text" | true | false | ~parameter | /topic | /topic/field | /topic.field.field
 
-``/battery/charging == true and ~gain > 3``. Which part of ``/battery/charging`` is the topic tells the graph: the
-longest that is one, as for rostopic; ``/battery.charging`` says it itself. A topic alone means its only field
-(``std_msgs/Bool``). What is not known yet (no message came, no publisher is there) makes a comparison neither true
-nor false, and a rule counts only where it is true whatever that is.
+Example: ``/battery/charging == true and ~gain > 3``. The topic in ``/battery/charging`` is the longest part that the
+graph has as a topic, as for rostopic; ``/battery.charging`` is explicit. A topic alone means its only field
+(``std_msgs/Bool``). A value that is unknown (no message yet, no publisher) makes a comparison neither true nor false;
+a rule holds only if it is true for every value of the unknown ones (Kleene's logic).
 
-Pure: a rule is parsed into a tree once and walked with the values; nothing of it is ever evaluated as Python.
+Pure: a rule is parsed into a tree once, which is evaluated with the values; nothing is evaluated as Python.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping
 
 Scalar = bool | int | float | str
-"""What a field or parameter holds, as far as rules look at it."""
-_PIECE: Final = re.compile(
+"""A value that rules can compare."""
+_TOKEN: Final = re.compile(
     r"\s*(?:(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.]))"
     r"|(?P<text>'[^']*'|\"[^\"]*\")"
     r"|(?P<topic>/[A-Za-z]\w*(?:/\w+)*(?:\.\w+)*)"
@@ -52,7 +52,7 @@ _EXAMPLE: Final = "for example /battery/charging == true and ~gain > 3"
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """A value that is looked up: ``/topic.field`` or ``~parameter``, as written."""
+    """A variable of a rule: ``/topic.field`` or ``~parameter``, as written."""
 
     text: str
 
@@ -62,7 +62,7 @@ class Reference:
         return self.text[1:] if self.text.startswith("~") else ""
 
     def candidates(self) -> Iterator[tuple[str, tuple[str, ...]]]:
-        """The topics and fields that may be meant, the longest topic first; no field: the only one that there is."""
+        """The possible topics and fields, the longest topic first; no field: the only one of the message."""
         topic, dot, fields = self.text.partition(".")
         if dot:
             yield topic, tuple(fields.split("."))
@@ -90,43 +90,43 @@ class _Not:
 
 
 @dataclass(frozen=True, slots=True)
-class _Both:
+class _BooleanOperation:
     """``and`` where ``conjunction``, else ``or``."""
 
     conjunction: bool
     parts: tuple[_Node, ...]
 
 
-_Node = _Compare | _Not | _Both
+_Node = _Compare | _Not | _BooleanOperation
 
 
 @dataclass(frozen=True, slots=True)
 class ContextRule:
-    """A rule that was read; ``references`` are what it looks at, each once."""
+    """A parsed rule; ``references`` are its variables, each once."""
 
     text: str
     root: _Node
     references: tuple[Reference, ...]
 
     def holds(self, values: Mapping[str, Scalar]) -> bool | None:
-        """Whether it is true; ``None`` while that depends on what is not known.
+        """Whether it is true; ``None`` if that depends on unknown values.
 
         Args:
-            values: By the text of the reference, as far as they are known.
+            values: The known values by the text of the reference.
         """
         return _holds(self.root, values)
 
 
 def parse_rule(text: str, parameters: Collection[str], where: str = "rule") -> ContextRule:
-    """Read a rule.
+    """Parse a rule.
 
     Args:
-        text: As above.
-        parameters: Those of the resource.
+        text: A ``rule`` of the grammar above.
+        parameters: Names of the resource's parameters.
         where: For errors.
 
     Raises:
-        ConfigError: It is not written so, or names a parameter that is not there.
+        ConfigError: A syntax error, or an unknown parameter.
     """
     if len(text) > limits.CONTEXT_RULE_MAX:
         raise ConfigError(where, f"{len(text)} characters", f"at most {limits.CONTEXT_RULE_MAX}")
@@ -144,14 +144,14 @@ def parse_rule(text: str, parameters: Collection[str], where: str = "rule") -> C
 
 
 class _Parser:
-    """Reads one rule from left to right."""
+    """A recursive-descent parser of one rule."""
 
     def __init__(self, text: str, where: str) -> None:
         self._text = text
         self._where = where
         self._at = 0
         self._kind = ""
-        self._piece = ""
+        self._lexeme = ""
         self.references: list[Reference] = []
         self._next()
 
@@ -160,37 +160,37 @@ class _Parser:
 
     def end(self) -> None:
         if self._kind:
-            raise self._error(f"{self._piece!r} stands where the rule must end, or go on with and/or")
+            raise self._error(f"{self._lexeme!r} stands where the rule must end, or go on with and/or")
 
     def _chain(self, word: str, part: Callable[[], _Node]) -> _Node:
         parts = [part()]
-        while self._piece == word:
+        while self._lexeme == word:
             self._next()
             parts.append(part())
-        return parts[0] if len(parts) == 1 else _Both(word == "and", tuple(parts))
+        return parts[0] if len(parts) == 1 else _BooleanOperation(word == "and", tuple(parts))
 
     def _negation(self, depth: int) -> _Node:
         if depth > limits.CONTEXT_RULE_DEPTH:
             raise self._error(f"deeper than {limits.CONTEXT_RULE_DEPTH} brackets")
-        if self._piece == "not":
+        if self._lexeme == "not":
             self._next()
             return _Not(self._negation(depth + 1))
-        if self._piece == "(":
+        if self._lexeme == "(":
             self._next()
             inner = self.rule(depth + 1)
-            if self._piece != ")":
+            if self._lexeme != ")":
                 raise self._error("a bracket is not closed")
             self._next()
             return inner
         left = self._value()
-        if self._piece in ("==", "!=", *_ORDERS):
-            sign = self._piece
+        if self._lexeme in ("==", "!=", *_ORDERS):
+            sign = self._lexeme
             self._next()
             return _Compare(sign, left, self._value())
         return _Compare("==", left, _Constant(True))
 
     def _value(self) -> Reference | _Constant:
-        kind, piece = self._kind, self._piece
+        kind, piece = self._kind, self._lexeme
         if kind == "word" and piece not in ("true", "false"):
             near = did_you_mean(piece, _KEYWORDS) if piece not in _KEYWORDS else None
             raise self._error(f"{piece!r} is no value", f"did you mean {near}?" if near else "texts have quotes")
@@ -208,14 +208,14 @@ class _Parser:
 
     def _next(self) -> None:
         if not self._text[self._at :].strip():
-            self._kind = self._piece = ""
+            self._kind = self._lexeme = ""
             return
-        match = _PIECE.match(self._text, self._at)
+        match = _TOKEN.match(self._text, self._at)
         if match is None:
             raise self._error(f"{self._text[self._at :].strip()[:20]!r} cannot be read")
         self._at = match.end()
         self._kind = match.lastgroup or ""
-        self._piece = match[self._kind]
+        self._lexeme = match[self._kind]
 
     def _error(self, problem: str, remedy: str = _EXAMPLE) -> ConfigError:
         return ConfigError(self._where, f"{self._text!r}: {problem}", remedy)
@@ -226,7 +226,7 @@ def _holds(node: _Node, values: Mapping[str, Scalar]) -> bool | None:
         case _Not():
             inner = _holds(node.inner, values)
             return None if inner is None else not inner
-        case _Both():
+        case _BooleanOperation():
             found = [_holds(part, values) for part in node.parts]
             decisive = not node.conjunction  # one true decides an "or", one false an "and"
             if decisive in found:
@@ -248,32 +248,31 @@ def _look_up(value: Reference | _Constant, values: Mapping[str, Scalar]) -> Scal
 
 
 def _equal(left: Scalar, right: Scalar) -> bool:
-    """Numbers and truths as Python has them (ROS's ``bool`` may come as 0 or 1); a text equals texts alone."""
+    """Compare numbers and booleans as Python does (a ROS ``bool`` may be 0 or 1); a text equals only texts."""
     return isinstance(left, str) == isinstance(right, str) and left == right
 
 
 @dataclass(slots=True)
-class Chooser:
-    """Which context there is to be: the one chosen by hand, or the first whose rule holds.
+class ContextSelector:
+    """Selects the context: the one chosen by hand, or the first whose rule holds.
 
     Args:
-        rules: By context, in the order of declaration; those without a rule are chosen by hand only.
-        dwell: Seconds that a context which a rule has chosen stays, so that a value at its edge does not make the
-            resource flutter.
+        rules: By context, in order of declaration; contexts without a rule are chosen by hand only.
+        dwell: Seconds for which a context that a rule has selected stays at least.
     """
 
     rules: Mapping[str, ContextRule]
     dwell: float = limits.CONTEXT_DWELL
     chosen: str = ""
-    """By hand; empty: the rules decide."""
+    """The context chosen by hand; empty: the rules decide."""
     since: float = field(default=-math.inf)
-    """When the present one began, monotonic seconds."""
+    """When the present context began, monotonic seconds."""
 
-    def choose(self, current: str, values: Mapping[str, Scalar], now: float) -> str:
-        """The context that there is to be; empty: none.
+    def select(self, current: str, values: Mapping[str, Scalar], now: float) -> str:
+        """The context to be in; empty: none.
 
         Args:
-            current: The present one.
+            current: The present context.
             values: As for ``ContextRule.holds``.
             now: Monotonic seconds.
         """

@@ -1,10 +1,10 @@
-"""Whether what is done through a resource's API still counts: not if its function was given up meanwhile.
+"""Fencing: actions of a user's function have no effect once the function was given up.
 
-A function of the user's that hangs cannot be ended from outside. What it does later, when another profile runs, must
-not land on top of that one. So each call of such a function has a fence around it; when it is given up the fence is
-closed. All that a resource offers to act with (publishing, parameters, observations, what is asked of others) asks
-here whether the way is open. Threads that the function starts by itself are not within its fence; its coroutines and
-``asyncio.to_thread`` are.
+A function that hangs in a thread cannot be stopped from outside. What it does later, under another profile, must not
+take effect. Each call of such a function is surrounded by a fence, which is closed when the call is given up. All
+actions that a resource offers (publishing, parameters, observations, requirements of other resources) check the fence
+first. Coroutines of the function and ``asyncio.to_thread`` are inside its fence; threads that it starts by itself are
+not.
 """
 
 from __future__ import annotations
@@ -18,51 +18,51 @@ if TYPE_CHECKING:
 
 
 class Fence(Protocol):
-    """Around one call of a function of the user's."""
+    """Surrounds one call of a user's function."""
 
-    who: str
-    """What the function brings about: ``profile`` or ``context``."""
+    kind: str
+    """What the function applies: ``profile`` or ``context``."""
 
     @property
     def closed(self) -> bool:
-        """Whether the function was given up."""
+        """Whether the call was given up."""
         ...
 
-    def passage(self, what: str) -> contextlib.AbstractContextManager[None]:
-        """Act within; the fence is not closed meanwhile.
+    def action(self, what: str) -> contextlib.AbstractContextManager[None]:
+        """Perform an action; the fence is not closed meanwhile.
 
         Args:
-            what: What is done, as in "publish on ranges".
+            what: The action, as in "publish on ranges".
 
         Raises:
-            LocalProtocolError: The function was given up; what it wanted to do is reported.
+            LocalProtocolError: The call was given up; the action is reported and not performed.
         """
         ...
 
-    def stopped(self, what: str) -> None:
-        """Report something that came too late."""
+    def report_blocked(self, what: str) -> None:
+        """Report an action that came after the call was given up."""
         ...
 
 
-_AROUND: ContextVar[Fence | None] = ContextVar("fence", default=None)
+_CURRENT: ContextVar[Fence | None] = ContextVar("fence", default=None)
 
 
-def around() -> Fence | None:
-    """The fence around who calls; ``None`` around what is never given up."""
-    return _AROUND.get()
+def current_fence() -> Fence | None:
+    """The fence around the calling code; ``None`` around code that is never given up."""
+    return _CURRENT.get()
 
 
-def passage(what: str) -> contextlib.AbstractContextManager[None]:
-    """Act, unless the function that does so was given up; see ``Fence.passage``."""
-    fence = _AROUND.get()
-    return contextlib.nullcontext() if fence is None else fence.passage(what)
+def fenced_action(what: str) -> contextlib.AbstractContextManager[None]:
+    """Perform an action unless the calling function was given up; see ``Fence.action``."""
+    fence = _CURRENT.get()
+    return contextlib.nullcontext() if fence is None else fence.action(what)
 
 
 @contextlib.contextmanager
-def within(fence: Fence) -> Iterator[None]:
-    """Put a fence around what is called, here and in the threads and tasks that are begun from here."""
-    token = _AROUND.set(fence)
+def inside(fence: Fence) -> Iterator[None]:
+    """Surround the calls in this block with a fence, and the threads and tasks that they start."""
+    token = _CURRENT.set(fence)
     try:
         yield
     finally:
-        _AROUND.reset(token)
+        _CURRENT.reset(token)

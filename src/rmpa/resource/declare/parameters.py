@@ -1,40 +1,39 @@
-"""A resource's parameters: values that may change while it runs, and what they can be."""
+"""Parameters of a resource: typed values with a range, which may change while it runs."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError
-from rmpa.resource.declare.fence import passage
+from rmpa.core.sizes import INT32_MAX, INT32_MIN
+from rmpa.resource.declare.fence import fenced_action
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 ParameterValue = bool | int | float | str
-INT_MIN: Final = -(2**31)
-INT_MAX: Final = 2**31 - 1
-
-
-class ParameterWatch(Protocol):
-    """Who hears of a parameter's changes while the resource runs."""
-
-    def changed(self, parameter: Parameter) -> None:
-        """It has another value; called in whichever thread set it."""
-        ...
+INT_MIN: Final = INT32_MIN
+INT_MAX: Final = INT32_MAX
+"""Whole numbers have 32 bits in dynamic_reconfigure."""
+_ROS_TYPES: Final = {bool: "bool", int: "int", float: "double", str: "str"}
 
 
 @dataclass(eq=False)
 class Parameter:
-    """A configuration or task parameter; its value may change while the resource runs.
+    """A parameter; its value may change while the resource runs.
 
     Args:
         name: A ROS base name.
-        default: Its value before anybody set it; its type is the parameter's.
+        default: Its initial value; its type is the parameter's.
         low: The least value of a number.
         high: The greatest.
-        choices: The only values, if there are only some.
+        choices: The only values, if the parameter is an enumeration.
         unit: For people.
         description: For people.
+        on_change: Called with the parameter, in the thread that changed it; ``None`` while the resource does not run.
     """
 
     name: str
@@ -44,45 +43,62 @@ class Parameter:
     choices: tuple[ParameterValue, ...] = ()
     unit: str = ""
     description: str = ""
-    watch: ParameterWatch | None = field(default=None, repr=False)
+    on_change: Callable[[Parameter], None] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         self._value: Any = self.default
         self.given = False
-        """Whether it was set for this start (``rmpa run --set``), and not what it was before counts."""
+        """Whether it was set for this start (``rmpa run --set``), which overrides the stored value."""
 
     @property
     def value(self) -> Any:
-        """What it is now; whoever sets it, in any thread, is told by a ``ConfigError`` if it cannot be that.
+        """The present value; may be set in any thread.
 
-        From the function of a profile that was given up it cannot be set any more (``LocalProtocolError``).
+        Raises:
+            ConfigError: On setting: an invalid value.
+            LocalProtocolError: On setting: the calling profile function was given up.
         """
         return self._value
 
     @value.setter
     def value(self, value: ParameterValue) -> None:
-        with passage(f"set parameter {self.name}"):
+        with fenced_action(f"set parameter {self.name}"):
             before, self._value = self._value, self.check(value)
-            if self.watch is not None and self._value != before:
-                self.watch.changed(self)
+            if self.on_change is not None and self._value != before:
+                self.on_change(self)
 
     @property
     def type(self) -> str:
-        """``bool``, ``int``, ``double`` or ``str``, as dynamic_reconfigure has it."""
-        kinds = {bool: "bool", int: "int", float: "double", str: "str"}
-        return kinds[type(self.default)]
+        """dynamic_reconfigure's type name: ``bool``, ``int``, ``double`` or ``str``."""
+        return _ROS_TYPES[type(self.default)]
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """The least and the greatest value of a number; whole ones have 32 bits in dynamic_reconfigure."""
-        widest = (INT_MIN, INT_MAX) if isinstance(self.default, int) else (-math.inf, math.inf)
-        return (
-            self.low if self.low is not None else widest[0],
-            self.high if self.high is not None else widest[1],
-        )
+        """The least and the greatest value of a number."""
+        low, high = (INT_MIN, INT_MAX) if isinstance(self.default, int) else (-math.inf, math.inf)
+        return self.low if self.low is not None else low, self.high if self.high is not None else high
+
+    def check_declaration(self, where: str) -> None:
+        """Check the arguments of ``Resource.parameter``.
+
+        Raises:
+            ConfigError: An unknown type, bounds the wrong way round, or a default or choice out of range.
+        """
+        if type(self.default) not in _ROS_TYPES:
+            raise ConfigError(
+                where, f"{self.default!r} is no bool, int, float or str", "give a default of one of these"
+            )
+        if (self.low is not None or self.high is not None) and isinstance(self.default, bool | str):
+            raise ConfigError(where, f"bounds of {self.default!r}, which is no number", "leave low and high out")
+        if self.low is not None and self.high is not None and self.low > self.high:
+            raise ConfigError(
+                where, f"low is {self.low:g} and high {self.high:g}", "the bounds are the wrong way round"
+            )
+        for value in (*self.choices, self.default):
+            self.check(value)
 
     def check(self, value: ParameterValue) -> ParameterValue:
-        """A value as this parameter may have it; whole numbers are numbers with a point too.
+        """Return the value, converted to ``float`` where that is the parameter's type.
 
         Raises:
             ConfigError: It is of another type, out of range, or none of the choices.

@@ -21,10 +21,10 @@ class Profile:
 
     Args:
         name: Unique within the resource.
-        offers: The value of each attribute under it, in the attribute's unit. What it does not offer, and another
-            does, falls short of every request.
-        cost: What it takes, at least 0, in any unit that all profiles share; decides among nearly equal ones.
-        best_effort: Whether this is the one to run when none can serve; at most one of a resource.
+        offers: The offered value of each attribute, in the attribute's unit. An attribute that only other profiles
+            offer falls short of every request.
+        cost: At least 0, in any unit that all profiles share; decides among profiles of nearly equal distance.
+        best_effort: Whether it runs when no profile can serve; at most one of a resource.
         description: For people.
     """
 
@@ -36,11 +36,11 @@ class Profile:
 
 
 def check_profiles(profiles: Iterable[Profile], attributes: Mapping[str, Attribute], resource: str) -> None:
-    """Check what a resource declares.
+    """Check the profiles of a resource.
 
     Raises:
-        ConfigError: A name twice, an attribute that is not declared, a value that is none of it, a cost below 0, two
-            best-effort profiles, or no profile at all.
+        ConfigError: A duplicate name, an undeclared attribute, an invalid value, a cost below 0, two best-effort
+            profiles, or no profile at all.
     """
     seen: set[str] = set()
     best = ""

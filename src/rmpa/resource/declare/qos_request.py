@@ -1,4 +1,4 @@
-"""What is asked of a quality, as a user writes it: ``at_least("20 Hz", hard=True)``."""
+"""QoS requests as a user writes them: ``at_least("20 Hz", hard=True)``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class QoSRequest:
-    """What is asked of one attribute, before it is known which resource it is asked of."""
+    """The requested quality of one attribute, before the attributes of the resource are known."""
 
     at_least: float | str | None = None
     at_most: float | str | None = None
@@ -22,7 +22,7 @@ class QoSRequest:
     hard: bool = False
 
     def __str__(self) -> str:
-        """As ``resource.declare.requirement_text`` reads it: ``>= 20 Hz hard weight=2``."""
+        """The text form that ``resource.declare.requirement_text`` reads: ``>= 20 Hz hard weight=2``."""
         if self.exactly is not None:
             values = self.exactly if isinstance(self.exactly, tuple) else (self.exactly,)
             text = "= " + " | ".join(map(str, values))
@@ -34,10 +34,10 @@ class QoSRequest:
         return text + hard + (f" weight={self.weight:g}" if self.weight != 1 else "")
 
     def bound(self, attribute: Attribute) -> Bound:
-        """Read it as a bound of an attribute.
+        """The request as a bound of an attribute.
 
         Raises:
-            ConfigError: It makes no sense for that one.
+            ConfigError: It makes no sense for that attribute.
         """
         return bound(
             attribute,
@@ -50,21 +50,21 @@ class QoSRequest:
 
 
 def at_least(value: float | str, *, hard: bool = False, weight: float = 1.0) -> QoSRequest:
-    """Ask for this or more: ``at_least("20 Hz")``."""
+    """Request this value or more: ``at_least("20 Hz")``."""
     return QoSRequest(at_least=value, hard=hard, weight=weight)
 
 
 def at_most(value: float | str, *, hard: bool = False, weight: float = 1.0) -> QoSRequest:
-    """Ask for this or less: ``at_most("50 ms")``."""
+    """Request this value or less: ``at_most("50 ms")``."""
     return QoSRequest(at_most=value, hard=hard, weight=weight)
 
 
 def exactly(*values: float | str, hard: bool = False, weight: float = 1.0) -> QoSRequest:
-    """Ask for this value, or for one of these words."""
+    """Request this value, or one of these words."""
     one: Any = values[0] if len(values) == 1 else tuple(map(str, values))
     return QoSRequest(exactly=one, hard=hard, weight=weight)
 
 
 def between(low: float | str, high: float | str, *, hard: bool = False, weight: float = 1.0) -> QoSRequest:
-    """Ask for a value within an interval."""
+    """Request a value within an interval."""
     return QoSRequest(at_least=low, at_most=high, hard=hard, weight=weight)

@@ -1,4 +1,4 @@
-"""Requirements as texts, for any ROS tool can say those: ``rate: ">= 20 Hz hard"``, ``latency: "<= 50 ms weight=2"``.
+"""Requirements as texts, which any ROS tool can publish: ``rate: ">= 20 Hz hard"``, ``latency: "<= 50 ms weight=2"``.
 
 ::
 
@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource import limits
+from rmpa.resource.declare.qos_request import QoSRequest
 from rmpa.resource.declare.requirements import Requirement, find_attribute
-from rmpa.resource.declare.resource import QoSRequest
 from rmpa.resource.declare.units import quantity
 
 if TYPE_CHECKING:
@@ -29,15 +29,15 @@ PRIORITY: Final = "priority"
 EXPIRES: Final = "expires"
 
 
-def parse_wish(text: str, name: str) -> QoSRequest:
-    """Read what is asked of one attribute.
+def parse_request(text: str, name: str) -> QoSRequest:
+    """Read the request for one attribute.
 
     Args:
-        text: As above.
-        name: The attribute's, for errors.
+        text: A ``request`` of the grammar above.
+        name: The attribute's name, for errors.
 
     Raises:
-        ConfigError: It is not written so.
+        ConfigError: A syntax error.
     """
     where = f"requirement of {name}"
     if len(text) > limits.REQUIREMENT_TEXT_MAX:
@@ -82,41 +82,41 @@ def _value(text: str, whole: str, where: str) -> str:
 
 
 def parse_bound(text: str, name: str, attributes: Mapping[str, Attribute], resource: str) -> Bound:
-    """Read what is asked of one attribute of a resource.
+    """Read the request for one attribute of a resource.
 
     Raises:
-        ConfigError: It is not written so, there is no such attribute, or it makes no sense for that one.
+        ConfigError: A syntax error, an unknown attribute, or a request that makes no sense for the attribute.
     """
     attribute = find_attribute(attributes, name, resource)
-    wish = parse_wish(text, name)
-    if wish.at_least is not None and wish.at_most is not None and not attribute.of_words:
-        wish = _share_unit(wish)
-    return wish.bound(attribute)
+    request = parse_request(text, name)
+    if request.at_least is not None and request.at_most is not None and not attribute.has_words:
+        request = _share_unit(request)
+    return request.bound(attribute)
 
 
-def _share_unit(wish: QoSRequest) -> QoSRequest:
-    """``1 .. 3 m`` means metres on both sides."""
-    low, high = str(wish.at_least), str(wish.at_most)
+def _share_unit(request: QoSRequest) -> QoSRequest:
+    """Apply the unit of the upper bound to both: ``1 .. 3 m`` means metres on both sides."""
+    low, high = str(request.at_least), str(request.at_most)
     unit = re.search(r"[^\d.eE+\-\s]\S*$", high)
     if unit and re.fullmatch(r"[-+]?[\d.]+(?:[eE][-+]?\d+)?", low):
         low = f"{low} {unit[0]}"
-    return QoSRequest(at_least=low, at_most=high, weight=wish.weight, hard=wish.hard)
+    return QoSRequest(at_least=low, at_most=high, weight=request.weight, hard=request.hard)
 
 
 def parse_requirement(
     client: str, values: Iterable[tuple[str, str]], attributes: Mapping[str, Attribute], resource: str, now: float
 ) -> Requirement:
-    """Read everything that one client asks.
+    """Read the whole requirement of one client.
 
     Args:
-        client: Who.
+        client: The client's node name.
         values: Attribute and text, and perhaps ``priority`` (a whole number) and ``expires`` (a duration).
-        attributes: The resource's.
+        attributes: The attributes of the resource.
         resource: Its name, for errors.
         now: Monotonic seconds, from which ``expires`` counts.
 
     Raises:
-        ConfigError: The first thing that is wrong; nothing of it counts then.
+        ConfigError: The first error; the whole requirement is invalid then.
     """
     bounds: dict[str, Bound] = {}
     priority, expires = 0, None

@@ -1,7 +1,7 @@
-"""What clients ask of a resource's quality, and what all of them ask together.
+"""Requirements of clients on the quality of a resource, and their merge.
 
-Intervals are intersected in the order of the clients' priorities. A bound that would leave nothing is left out, and
-who asked for it is told: the more important client is not made to pay for the less important one.
+Intervals are intersected in the order of the clients' priorities. A bound that would make the intersection empty is
+left out and reported to its client, so that a client of higher priority never pays for one of lower priority.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError
 from rmpa.resource.declare.attributes import Attribute, Direction
-from rmpa.resource.declare.units import quantity
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -24,13 +23,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """What one client asks of one attribute; ``bound`` makes one from what a user wrote.
+    """The values of one attribute that satisfy one client; made by ``bound`` from a user's request.
 
     Args:
-        low: The least that satisfies, as a place on the attribute's scale; ``-inf``: no bound.
-        high: The most.
-        words: Of a nominal attribute: those that satisfy; else empty.
-        weight: How much a shortfall counts beside other attributes, above 0.
+        low: The least position on the attribute's scale that satisfies; ``-inf``: no bound.
+        high: The greatest.
+        words: The words of a nominal attribute that satisfy; else empty.
+        weight: Weight of a shortfall relative to other attributes, above 0.
         hard: Whether a profile that falls short cannot serve at all.
     """
 
@@ -41,10 +40,14 @@ class Bound:
     hard: bool = False
 
     def met_by(self, attribute: Attribute, value: Value) -> bool:
-        """Whether a value satisfies it."""
+        """Whether a value satisfies the bound."""
         if self.words:
             return value in self.words
-        return self.low <= attribute.place(value) <= self.high
+        return self.low <= attribute.position(value) <= self.high
+
+    def excess(self, position: float) -> float:
+        """Distance by which a position on the scale lies outside of the bound; 0 for words."""
+        return 0.0 if self.words else max(self.low - position, position - self.high, 0.0)
 
 
 def bound(
@@ -56,19 +59,19 @@ def bound(
     weight: float = 1.0,
     hard: bool = False,
 ) -> Bound:
-    """Read what a client asks of an attribute.
+    """Convert a request into a bound of an attribute.
 
     Args:
-        attribute: Which.
+        attribute: The requested attribute.
         at_least: The least value that satisfies: a number, ``"20 Hz"``, or a word.
         at_most: The greatest.
-        exactly: The one that does; of a nominal attribute one or several words.
-        weight: How much a shortfall counts.
-        hard: Whether a shortfall excludes.
+        exactly: The only one; for a nominal attribute one or several words.
+        weight: Weight of a shortfall, above 0.
+        hard: Whether a shortfall excludes a profile.
 
     Raises:
-        ConfigError: The bounds are the wrong way round, the unit or word is unknown, nothing is asked, or what is
-            asked makes no sense for the attribute's direction.
+        ConfigError: The bounds are the wrong way round, the unit or word is unknown, nothing is requested, or the
+            request contradicts the attribute's direction.
     """
     where = f"requirement of {attribute.name}"
     if not (math.isfinite(weight) and weight > 0):
@@ -77,12 +80,12 @@ def bound(
         raise ConfigError(where, "an exact value and bounds", "give one or the other")
     if exactly is None and at_least is None and at_most is None:
         raise ConfigError(where, "nothing is asked of it", "give at_least, at_most or exactly")
-    if isinstance(exactly, tuple) or (attribute.of_words and attribute.direction is Direction.EXACT):
+    if isinstance(exactly, tuple) or (attribute.has_words and attribute.direction is Direction.EXACT):
         return _words(attribute, exactly, where, weight=weight, hard=hard)
     if exactly is not None:
         at_least = at_most = exactly
-    low = -math.inf if at_least is None else _place(attribute, at_least, where)
-    high = math.inf if at_most is None else _place(attribute, at_most, where)
+    low = -math.inf if at_least is None else attribute.position(attribute.parse(at_least, where))
+    high = math.inf if at_most is None else attribute.position(attribute.parse(at_most, where))
     if low > high:
         raise ConfigError(where, f"at least {at_least} and at most {at_most}", "the bounds are the wrong way round")
     if attribute.direction is Direction.MAX:
@@ -95,37 +98,31 @@ def bound(
 
 
 def _check_side(asked: object, other: object, exactly: object, where: str, better: str, key: str) -> None:
-    """Check the side that asks for nothing: an exact value is a bound on the side that counts."""
+    """Refuse a bound on the side that requests nothing; an exact value is a bound on the side that counts."""
     if asked is None or (other is not None and exactly is None):
         raise ConfigError(where, f"{better}, so a bound on the other side asks for nothing", f"give {key} alone")
 
 
 def _words(attribute: Attribute, exactly: object, where: str, *, weight: float, hard: bool) -> Bound:
     words = exactly if isinstance(exactly, tuple) else (exactly,)
-    if exactly is None or not words or not attribute.of_words:
+    if exactly is None or not words or not attribute.has_words:
         raise ConfigError(
-            where, "it takes no such words" if not attribute.of_words else "give exactly, one word or more"
+            where, "it takes no such words" if not attribute.has_words else "give exactly, one word or more"
         )
     for word in words:
         attribute.check(word, where)
     return Bound(words=frozenset(map(str, words)), weight=weight, hard=hard)
 
 
-def _place(attribute: Attribute, value: float | str, where: str) -> float:
-    if attribute.of_words:
-        return attribute.place(attribute.check(value, where))
-    return attribute.place(attribute.check(quantity(value, attribute.unit, where), where))
-
-
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """What one client asks of a resource.
+    """The QoS requests of one client.
 
     Args:
-        client: Who: a node's name, unique among the clients.
+        client: The client's node name, unique among the clients.
         bounds: By attribute.
         priority: The higher one wins a conflict.
-        expires: Monotonic seconds after which it is forgotten; ``None``: never.
+        expires: Monotonic seconds at which it is dropped; ``None``: never.
     """
 
     client: str
@@ -136,12 +133,12 @@ class Requirement:
 
 @dataclass(frozen=True, slots=True)
 class RequirementConflict:
-    """A bound that could not be kept beside those of more important clients.
+    """A bound that contradicts those of clients of higher priority and is left out.
 
     Args:
-        client: Whose.
-        attribute: Of which attribute.
-        against: The clients that it contradicts.
+        client: The client that requested it.
+        attribute: The attribute.
+        against: The clients whose bounds it contradicts.
     """
 
     client: str
@@ -149,52 +146,51 @@ class RequirementConflict:
     against: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Say who gave way to whom."""
+        """The conflict as a sentence."""
         return f"{self.attribute}: what {self.client} asks contradicts {', '.join(self.against)} and is left out"
 
 
 @dataclass(frozen=True, slots=True)
-class Merged:
-    """What all clients ask together.
+class MergedRequirements:
+    """The requirements of all clients, merged.
 
     Args:
-        bounds: By attribute: the intersection; the greatest weight; hard if any of those that count is.
-        conflicts: What was left out.
+        bounds: By attribute: the intersection, with the greatest weight; hard if any of its parts is.
+        conflicts: The bounds that were left out.
     """
 
     bounds: Mapping[str, Bound] = field(default_factory=dict, hash=False)
     conflicts: tuple[RequirementConflict, ...] = ()
 
 
-def merge(requirements: Iterable[Requirement]) -> Merged:
-    """Intersect the clients' intervals, the more important first; of equal ones the earlier."""
-    clients = sorted(requirements, key=_importance)
-    asked: dict[str, list[Bound]] = {}
+def merge(requirements: Iterable[Requirement]) -> MergedRequirements:
+    """Intersect the bounds of all clients by descending priority; among equal priorities the earlier comes first."""
+    clients = sorted(requirements, key=_descending_priority)
+    requested: dict[str, list[Bound]] = {}
     for requirement in clients:
-        for name, ours in requirement.bounds.items():
-            before = asked.get(name)
-            if before is None:
-                asked[name] = [ours]
+        for name, one in requirement.bounds.items():
+            if (known := requested.get(name)) is None:
+                requested[name] = [one]  # faster than setdefault, which makes a list each time
             else:
-                before.append(ours)
+                known.append(one)
     bounds: dict[str, Bound] = {}
     conflicts: list[tuple[int, RequirementConflict]] = []
-    for name, several in asked.items():
-        both = _all(several)
-        bounds[name] = both if both is not None else _in_order(name, clients, conflicts)
+    for name, several in requested.items():
+        common = _intersect_all(several)
+        bounds[name] = common if common is not None else _intersect_by_priority(name, clients, conflicts)
     conflicts.sort(key=itemgetter(0))
-    return Merged(bounds, tuple(conflict for _, conflict in conflicts))
+    return MergedRequirements(bounds, tuple(conflict for _, conflict in conflicts))
 
 
-def _importance(requirement: Requirement) -> int:
+def _descending_priority(requirement: Requirement) -> int:
     return -requirement.priority
 
 
 _low, _high, _weight, _hard, _words_of = (attrgetter(name) for name in ("low", "high", "weight", "hard", "words"))
 
 
-def _all(bounds: list[Bound]) -> Bound | None:
-    """The intersection of bounds without words; ``None`` where it is empty, or words are asked for."""
+def _intersect_all(bounds: list[Bound]) -> Bound | None:
+    """The intersection of intervals; ``None`` if it is empty, or if any bound consists of words."""
     if len(bounds) == 1:
         return bounds[0]
     if any(map(_words_of, bounds)):
@@ -205,25 +201,27 @@ def _all(bounds: list[Bound]) -> Bound | None:
     return Bound(low, high, weight=max(map(_weight, bounds)), hard=any(map(_hard, bounds)))
 
 
-def _in_order(name: str, clients: list[Requirement], conflicts: list[tuple[int, RequirementConflict]]) -> Bound:
-    """The intersection for one attribute, one client after the other; who is left out goes to ``conflicts``."""
+def _intersect_by_priority(
+    name: str, clients: list[Requirement], conflicts: list[tuple[int, RequirementConflict]]
+) -> Bound:
+    """The intersection for one attribute, client by client; bounds that are left out are added to ``conflicts``."""
     found: Bound | None = None
     kept: list[str] = []
-    for place, requirement in enumerate(clients):
-        ours = requirement.bounds.get(name)
-        if ours is None:
+    for rank, requirement in enumerate(clients):
+        one = requirement.bounds.get(name)
+        if one is None:
             continue
-        both = _both(found, ours) if found is not None else ours
-        if both is None:
-            conflicts.append((place, RequirementConflict(requirement.client, name, tuple(kept))))
+        common = _intersect(found, one) if found is not None else one
+        if common is None:
+            conflicts.append((rank, RequirementConflict(requirement.client, name, tuple(kept))))
         else:
-            found = both
+            found = common
             kept.append(requirement.client)
     return found if found is not None else Bound()
 
 
-def _both(one: Bound, other: Bound) -> Bound | None:
-    """The intersection, or ``None`` where it is empty."""
+def _intersect(one: Bound, other: Bound) -> Bound | None:
+    """The intersection of two bounds, or ``None`` if it is empty."""
     low = one.low if one.low >= other.low else other.low  # noqa: FURB136 - max() takes twice as long
     high = one.high if one.high <= other.high else other.high  # noqa: FURB136
     words = one.words
@@ -241,7 +239,7 @@ def _both(one: Bound, other: Bound) -> Bound | None:
 
 
 def find_attribute(attributes: Mapping[str, Attribute], name: str, resource: str) -> Attribute:
-    """An attribute by its name.
+    """Find an attribute by its name.
 
     Raises:
         ConfigError: The resource has none of that name.

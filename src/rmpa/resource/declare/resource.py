@@ -1,4 +1,4 @@
-"""What a user writes: a ``Resource`` and what it consists of. Nothing runs here; ``resource.run`` brings it to life.
+"""``Resource``: the declaration of a Smart Resource. Nothing runs here; ``rmpa.resource.run`` executes it.
 
 ::
 
@@ -13,7 +13,7 @@
     def measure() -> None:
         ranges.publish(range=0.3)
 
-A mistake is found when it is written: each call raises ``ConfigError`` with what is wrong and what to do.
+Each call checks its arguments and raises ``ConfigError`` with the problem and a remedy.
 """
 
 from __future__ import annotations
@@ -26,46 +26,20 @@ from typing import TYPE_CHECKING, Final, TypeVar
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError
 from rmpa.core.names import is_legal_name
-from rmpa.resource.decide.adaptation import AdaptationSettings
+from rmpa.resource.declare.adaptation_settings import AdaptationSettings, read_adaptation
 from rmpa.resource.declare.attributes import MEASURED, Attribute, Category, Direction, Scale
-from rmpa.resource.declare.behaviour import Context, DeclaredProfile, Hook, OnFailure, Task, TaskFunction
+from rmpa.resource.declare.behaviour import Context, DeclaredProfile, Hook, OnFailure, Task
+from rmpa.resource.declare.checks import check_arity, read_contract, read_enum
 from rmpa.resource.declare.connections import DeclaredAttribute, Demand, Input, Output, TopicType
 from rmpa.resource.declare.context_rules import parse_rule
-from rmpa.resource.declare.parameters import INT_MAX, INT_MIN, Parameter, ParameterValue
+from rmpa.resource.declare.parameters import Parameter, ParameterValue
 from rmpa.resource.declare.profiles import Profile, check_profiles
-from rmpa.resource.declare.qos_request import QoSRequest, at_least, at_most, between, exactly
 from rmpa.resource.declare.requirements import find_attribute
 from rmpa.resource.declare.units import quantity
-from rmpa.resource.declare.words import check_takes, read_contract, read_word
 
 if TYPE_CHECKING:
-    from rmpa.resource.declare.attributes import Value
+    from rmpa.resource.declare.qos_request import QoSRequest
 
-__all__ = [
-    "INT_MAX",
-    "INT_MIN",
-    "NOT_ATTRIBUTES",
-    "RESERVED",
-    "Context",
-    "DeclaredAttribute",
-    "DeclaredProfile",
-    "Demand",
-    "Hook",
-    "Input",
-    "OnFailure",
-    "Output",
-    "Parameter",
-    "ParameterValue",
-    "QoSRequest",
-    "Resource",
-    "Role",
-    "Task",
-    "TaskFunction",
-    "at_least",
-    "at_most",
-    "between",
-    "exactly",
-]
 _RATE_MAX: Final = 10_000
 """Hz, of a periodic task."""
 _Function = TypeVar("_Function", bound=Callable[..., object])
@@ -75,13 +49,13 @@ RESERVED: Final = frozenset(
         "profile", "quality", "requirements", "responses", "set_context", "set_parameters", "state",
     }
 )  # fmt: skip
-"""Names below a resource's node that are its own topics and services, and parameters with a meaning of their own."""
+"""Names below a resource's node that are taken by its own topics, services and parameters."""
 NOT_ATTRIBUTES: Final = frozenset({"expires", "priority", "profile", "reaction"})
-"""What stands beside the attributes in a requirement or among the quality."""
+"""Keys beside the attributes in a requirement or a quality report."""
 
 
 class Role(StrEnum):
-    """What a module is to the robot (paper, section 3)."""
+    """The function of a module in the robot (paper, section 3)."""
 
     SENSING = "sensing"
     ACTING = "acting"
@@ -89,7 +63,7 @@ class Role(StrEnum):
 
 
 class Resource:
-    """One Smart Resource, as declared.
+    """The declaration of one Smart Resource.
 
     Args:
         name: A ROS base name; its node is ``/<name>``.
@@ -98,7 +72,7 @@ class Resource:
         description: For people.
 
     Raises:
-        ConfigError: The name or role cannot be.
+        ConfigError: An illegal name, or an unknown role.
     """
 
     def __init__(self, name: str, *, role: str, physical: bool = True, description: str = "") -> None:
@@ -124,9 +98,9 @@ class Resource:
         self.window = 1.0
         """Seconds of one quality window."""
         self.settings = AdaptationSettings()
-        """How patient its loop is."""
+        """Parameters of its control loop."""
 
-    # --- what it offers and needs -------------------------------------------------------------------------------
+    # --- interfaces -------------------------------------------------------------------------------
 
     def output(self, name: str, kind: str, *, latch: bool = False, **contract: object) -> Output:
         """Declare a topic that it publishes.
@@ -134,46 +108,38 @@ class Resource:
         Args:
             name: In its namespace, or global (``/cmd_vel``).
             kind: The message type, ``package/Name``: one that comes with rmpa, or of this machine's ROS packages
-                (``rmpa.ros.types.find``). One of another package is learnt from a publisher of that type, here or in
-                another module, when the resource starts; until there is one, it waits.
+                (``rmpa.ros.types.find``). A type of another package is learnt at the start from a publisher of that
+                type, here or in another module; the resource waits for one.
             latch: Whether a late subscriber gets the last message.
-            contract: The words of a ``[[contract]]``: ``deadline="100 ms"``, ``reliability="reliable"`` …
+            contract: The keys of a ``[[contract]]``: ``deadline="100 ms"``, ``reliability="reliable"`` …
 
         Raises:
-            ConfigError: A name twice, an illegal one, or a word that no contract has.
-            DefinitionError: The type is malformed, or its package is known and has no such type.
+            ConfigError: A duplicate or illegal name, or an unknown key of a contract.
+            DefinitionError: The type's name is malformed, or its package is known and has no such type.
         """
-        self._new("output", name, self.outputs)
-        if name in self.inputs:
-            where = f"output {name} of {self.name}"
-            raise ConfigError(where, "it is an input of the same resource", "a global name (/scan) is another topic")
-        made = Output(name, TopicType(kind), read_contract(f"output {name} of {self.name}", contract), latch)
-        self.outputs[name] = made
+        where = self._check_topic("output", name, self.outputs, self.inputs)
+        made = self.outputs[name] = Output(name, TopicType(kind), read_contract(where, contract), latch)
         return made
 
     def input(self, name: str, kind: str, *, required: bool = True, **contract: object) -> Input:
         """Declare a topic that it needs; arguments and errors as for ``output``.
 
-        A type that is not known here is learnt from the topic's publisher; the resource does not wait for it.
+        A type that is unknown on this machine is learnt from the topic's publisher; the resource starts without it.
         """
-        self._new("input", name, self.inputs)
-        if name in self.outputs:
-            where = f"input {name} of {self.name}"
-            raise ConfigError(where, "it is an output of the same resource", "a global name (/scan) is another topic")
-        made = Input(name, TopicType(kind), read_contract(f"input {name} of {self.name}", contract), required)
-        self.inputs[name] = made
+        where = self._check_topic("input", name, self.inputs, self.outputs)
+        made = self.inputs[name] = Input(name, TopicType(kind), read_contract(where, contract), required)
         return made
 
-    def asks(self, resource: str, *, priority: int = 0, **wishes: QoSRequest) -> Demand:
-        """Declare what it asks of another resource: ``keeper.asks("sonar", accuracy=at_most("5 cm"))``.
+    def asks(self, resource: str, *, priority: int = 0, **requests: QoSRequest) -> Demand:
+        """Declare a requirement on another resource: ``keeper.asks("sonar", accuracy=at_most("5 cm"))``.
 
         Args:
-            resource: The other one's node, as this module's graph has it.
+            resource: The other resource's node in this module's graph.
             priority: The higher one wins a conflict between clients.
-            wishes: By the other one's attributes; a qualified one (``ranges.rate``) is written ``ranges__rate``.
+            requests: By attribute of the other one; a qualified one (``ranges.rate``) is written ``ranges__rate``.
 
         Raises:
-            ConfigError: An illegal name, the same one twice, or its own.
+            ConfigError: An illegal or duplicate name, or the resource's own.
         """
         where = f"what {self.name} asks of {resource}"
         name = resource if resource.startswith("/") else f"/{resource}"
@@ -183,8 +149,7 @@ class Resource:
             raise ConfigError(where, "it asks it already", "say all wishes at once, or change them by .ask()")
         if name == f"/{self.name}":
             raise ConfigError(where, "that is itself", "give its profiles what they need")
-        made = Demand(name, dict(wishes), priority)
-        self.demands[name] = made
+        made = self.demands[name] = Demand(name, dict(requests), priority)
         return made
 
     def parameter(
@@ -201,19 +166,11 @@ class Resource:
         """Declare a parameter; its type is that of its default.
 
         Raises:
-            ConfigError: A name twice or an illegal one, bounds the wrong way round, a default that it cannot have.
+            ConfigError: A duplicate or illegal name, bounds the wrong way round, or a default out of range.
         """
-        self._new("parameter", name, self.parameters)
-        where = f"parameter {name} of {self.name}"
-        if type(default) not in (bool, int, float, str):
-            raise ConfigError(where, f"{default!r} is no bool, int, float or str", "give a default of one of these")
-        if (low is not None or high is not None) and isinstance(default, bool | str):
-            raise ConfigError(where, f"bounds of {default!r}, which is no number", "leave low and high out")
-        if low is not None and high is not None and low > high:
-            raise ConfigError(where, f"low is {low:g} and high {high:g}", "the bounds are the wrong way round")
+        where = self._check_name("parameter", name, self.parameters)
         made = Parameter(name, default, low, high, tuple(choices), unit, description)
-        for value in (*choices, default):
-            made.check(value)
+        made.check_declaration(where)
         self.parameters[name] = made
         return made
 
@@ -228,9 +185,7 @@ class Resource:
         tolerance: float | str | None = None,
         words: Sequence[str] = (),
     ) -> DeclaredAttribute:
-        """Declare a quality of its own.
-
-        Those in ``resource.declare.attributes.MEASURED`` are measured anyway.
+        """Declare a quality attribute of its own, beside ``resource.declare.attributes.MEASURED``.
 
         Args:
             name: ``accuracy``, ``energy`` …
@@ -238,11 +193,11 @@ class Resource:
             unit: See ``resource.declare.units``.
             scale: ``linear``, ``log``, ``ordinal`` or ``nominal``.
             category: ``temporal``, ``spatial``, ``reliability`` or ``performance``.
-            tolerance: A shortfall of this size counts 1; with a unit, or a ratio on a log scale.
-            words: Of ordinal and nominal scales.
+            tolerance: A shortfall of this size counts as 1; with a unit, or a ratio on a log scale.
+            words: The values of ordinal and nominal scales.
 
         Raises:
-            ConfigError: It cannot be.
+            ConfigError: A duplicate or illegal name, or arguments that contradict each other.
         """
         where = f"attribute {name} of {self.name}"
         if name in self.attributes or name in MEASURED:
@@ -251,25 +206,24 @@ class Resource:
             remedy = f"letters, digits and _, a letter first, and none of {', '.join(sorted(NOT_ATTRIBUTES))}"
             raise ConfigError(where, f"{name!r} cannot be the name of one", remedy)
         plain = tolerance if tolerance is None else quantity(tolerance, unit if scale == "linear" else "", where)
-        made = DeclaredAttribute(
+        made = self.declared_attributes[name] = DeclaredAttribute(
             Attribute(
                 name,
-                read_word(Direction, better, where),
+                read_enum(Direction, better, where),
                 unit,
-                read_word(Scale, scale, where),
-                read_word(Category, category, where),
+                read_enum(Scale, scale, where),
+                read_enum(Category, category, where),
                 plain,
                 tuple(words),
             )
         )
-        self.declared_attributes[name] = made
         return made
 
     @property
     def labels(self) -> dict[str, str]:
-        """What the qualities of each output and input are named by, outputs first.
+        """The prefix of each output's and input's measured attributes, outputs first.
 
-        The last part of its name; where that is taken, as many parts as it needs; ``in.scan`` where all are.
+        The last part of its name; where that is taken, as many parts as are unique; ``in.scan`` if none are.
         """
         found: dict[str, str] = {}
         for name in (*self.outputs, *self.inputs):
@@ -281,9 +235,9 @@ class Resource:
 
     @property
     def attributes(self) -> dict[str, Attribute]:
-        """Everything that can be asked for: its own attributes, and what is measured of each output and input.
+        """All attributes that clients may request: its own, and those measured of each output and input.
 
-        ``rate`` means the first output; ``scan.rate`` names the output or input (``labels``).
+        ``rate`` is the first output's; ``scan.rate`` names the output or input (``labels``).
         """
         found: dict[str, Attribute] = {}
         for position, label in enumerate(self.labels.values()):
@@ -293,7 +247,7 @@ class Resource:
                 found[f"{label}.{key}"] = attribute
         return found | {name: declared.attribute for name, declared in self.declared_attributes.items()}
 
-    # --- what it does -------------------------------------------------------------------------------------------
+    # --- behaviour -------------------------------------------------------------------------------------------
 
     def profile(
         self,
@@ -305,41 +259,40 @@ class Resource:
         name: str = "",
         description: str = "",
     ) -> Callable[[_Function], _Function]:
-        """Declare a System Profile; the function that is decorated applies it.
+        """Declare a System Profile; the decorated function applies it.
 
         Args:
-            offers: The quality under it: attribute to value, with a unit (``"40 Hz"``) or in the attribute's own.
-            cost: What it takes, beside the others.
-            best_effort: Whether it runs when none can serve.
-            needs: Its precondition: asked once a window, in a thread of its own, so that it may block. It returns
-                true or ``None`` while the profile can be taken, else false or a text why it cannot.
+            offers: The offered quality: attribute to value, with a unit (``"40 Hz"``) or in the attribute's own.
+            cost: Relative cost; decides among profiles of nearly equal distance.
+            best_effort: Whether it runs when no profile can serve.
+            needs: Its precondition: called once a window in a thread of its own, so it may block. It returns true or
+                ``None`` while the profile may be used, else false or a text with the reason.
             name: By default the function's.
             description: By default the first line of the function's docstring.
 
         Raises:
-            ConfigError: A name twice, an unknown attribute or unit, a second best-effort profile.
+            ConfigError: A duplicate name, an unknown attribute or unit, a second best-effort profile.
         """
 
         def declare(function: _Function) -> _Function:
             title = name or function.__name__
             where = f"profile {title} of {self.name}"
-            check_takes(function, 0, where)
+            check_arity(function, 0, where)
             if needs is not None:
-                check_takes(needs, 0, f"the precondition of {where}")
+                check_arity(needs, 0, f"the precondition of {where}")
                 if inspect.iscoroutinefunction(needs):
                     raise ConfigError(where, "its precondition is a coroutine function", "make it a plain one")
             if title in self.profiles:
                 raise ConfigError(where, "there are two of this name", "name one of them otherwise")
             attributes = self.attributes
-            values: dict[str, Value] = {}
-            for key, value in offers.items():
-                attribute = find_attribute(attributes, key, self.name)
-                said = value if attribute.of_words else quantity(value, attribute.unit, f"{where}, {key}")
-                values[key] = attribute.check(said, f"{where}, {key}")
+            values = {
+                key: find_attribute(attributes, key, self.name).parse(value, f"{where}, {key}")
+                for key, value in offers.items()
+            }
             text = description or (function.__doc__ or "").strip().partition("\n")[0]
             made = Profile(title, values, cost, best_effort, text)
             check_profiles([*(p.profile for p in self.profiles.values()), made], attributes, self.name)
-            self.profiles[title] = DeclaredProfile(made, function, needs)  # type: ignore[arg-type] # as told
+            self.profiles[title] = DeclaredProfile(made, function, needs)  # type: ignore[arg-type] # check_arity
             return function
 
         return declare
@@ -354,11 +307,11 @@ class Resource:
         outputs: Sequence[Output] | None = None,
         enter: Hook | None = None,
     ) -> Context:
-        """Declare a context; behind the profiles and attributes that it names.
+        """Declare a context, after the profiles and attributes that it names (arguments: ``behaviour.Context``).
 
         Raises:
-            ConfigError: A name twice, an unknown profile or attribute, an output of another resource, or a rule that
-                cannot be read.
+            ConfigError: A duplicate name, an unknown profile or attribute, an output of another resource, or a syntax
+                error in the rule.
         """
         where = f"context {name} of {self.name}"
         if name in self.contexts:
@@ -368,15 +321,14 @@ class Resource:
                 near = did_you_mean(profile, self.profiles)
                 remedy = f"did you mean {near}?" if near else "declare the profile before the context"
                 raise ConfigError(where, f"there is no profile {profile}", remedy)
-        for key, wish in (requires or {}).items():
-            wish.bound(find_attribute(self.attributes, key, self.name))
+        for key, request in (requires or {}).items():
+            request.bound(find_attribute(self.attributes, key, self.name))
         if outputs is not None and (strange := [o.name for o in outputs if o not in self.outputs.values()]):
             raise ConfigError(where, f"{strange[0]} is no output of this resource", "name its own outputs")
         if when:
             parse_rule(when, self.parameters, where)
         names = tuple(output.name for output in outputs) if outputs is not None else None
-        made = Context(name, when, dict(requires or {}), tuple(profiles), names, enter)
-        self.contexts[name] = made
+        made = self.contexts[name] = Context(name, when, dict(requires or {}), tuple(profiles), names, enter)
         return made
 
     def task(
@@ -388,17 +340,17 @@ class Resource:
         on_failure: str = "restart",
         stuck_after: float | str | None = None,
     ) -> Callable[[_Function], _Function]:
-        """Declare what it does: periodically at a rate, or with each message of an input.
+        """Declare a task, which runs periodically at a rate or on each message of an input.
 
         Args:
-            rate: Such as ``"10 Hz"``; or a parameter, whose value is the rate (Hz) also when it changes.
+            rate: Such as ``"10 Hz"``; or a parameter, whose present value is the rate in Hz.
             on: The input.
             name: By default the function's.
             on_failure: ``restart``, ``stop`` or ``deactivate``.
-            stuck_after: How long one run may take.
+            stuck_after: A run that takes longer, in seconds or with a unit, counts as stuck.
 
         Raises:
-            ConfigError: Neither or both of ``rate`` and ``on``, a rate that cannot be, an input or a parameter of
+            ConfigError: Neither or both of ``rate`` and ``on``, a rate out of range, an input or a parameter of
                 another resource.
         """
 
@@ -409,10 +361,10 @@ class Resource:
                 raise ConfigError(where, "there are two of this name", "name one of them otherwise")
             if (rate is None) == (on is None):
                 raise ConfigError(where, "it needs either a rate or an input", 'rate="10 Hz", or on=an input')
-            follows, hertz = None, None
+            rate_parameter, hertz = None, None
             if isinstance(rate, Parameter):
                 self._check_rate(rate, where)
-                follows, hertz = rate, float(rate.default)
+                rate_parameter, hertz = rate, float(rate.default)
             elif rate is not None:
                 hertz = quantity(rate, "Hz", where)
             if hertz is not None and not 0 < hertz <= _RATE_MAX:
@@ -420,11 +372,11 @@ class Resource:
             if on is not None and on not in self.inputs.values():
                 raise ConfigError(where, f"{on.name} is no input of this resource", "declare it there first")
             seconds = quantity(stuck_after, "s", where) if stuck_after is not None else None
-            check_takes(function, 1 if on is not None else 0, where)
+            check_arity(function, 1 if on is not None else 0, where)
             if seconds is not None and seconds <= 0:
                 raise ConfigError(where, f"stuck after {seconds:g} s", "it is above 0")
-            policy = read_word(OnFailure, on_failure, where)
-            self.tasks[title] = Task(title, function, hertz, on, policy, seconds, follows)  # type: ignore[arg-type] # as told
+            policy = read_enum(OnFailure, on_failure, where)
+            self.tasks[title] = Task(title, function, hertz, on, policy, seconds, rate_parameter)  # type: ignore[arg-type] # check_arity
             return function
 
         return declare
@@ -442,58 +394,41 @@ class Resource:
         cool_down_max: float | str = 160.0,
         apply_timeout: float | str = 5.0,
     ) -> None:
-        """Say how quickly it adapts; without this, as the defaults say.
+        """Set the parameters of the control loop: ``AdaptationSettings`` explains them; times may have a unit.
 
         Args:
-            window: Seconds of one quality window.
-            violations: So many violated windows …
-            windows: … of the last so many are a disturbance.
-            improvement: A change without a disturbance must lessen the distance by more than this.
-            dwell: Seconds that a profile runs at least before such a change.
-            settle: Seconds behind a change for which windows are not judged: what the profile before sent is still
-                on its way.
-            cool_down: Seconds that a profile is left out after it failed or disappointed; twice as long each time …
-            cool_down_max: … up to this.
-            apply_timeout: Seconds after which a profile that is being applied counts as hung.
+            window: Length of a quality window.
+            violations: Violated windows …
+            windows: … of the last so many that are a disturbance.
+            improvement: Least improvement for a change without a disturbance.
+            dwell: Least time between such changes.
+            settle: Time after a change in which windows are not judged.
+            cool_down: Exclusion of a profile that failed or was violated …
+            cool_down_max: … at most, if that happens repeatedly.
+            apply_timeout: Time-out of a profile's function.
 
         Raises:
-            ConfigError: A time that cannot be, or more violations than windows.
+            ConfigError: A time out of range, or more violations than windows.
         """
-        where = f"adaptation of {self.name}"
-        if not 1 <= violations <= windows <= 100:
-            raise ConfigError(where, f"{violations} of {windows} windows", "1 <= violations <= windows <= 100")
-        seconds = {
-            name: quantity(value, "s", f"{where}, {name}")
-            for name, value in (
-                ("window", window),
-                ("dwell", dwell),
-                ("settle", settle),
-                ("cool_down", cool_down),
-                ("cool_down_max", cool_down_max),
-                ("apply_timeout", apply_timeout),
-            )
+        times = {
+            "window": window,
+            "dwell": dwell,
+            "settle": settle,
+            "cool_down": cool_down,
+            "cool_down_max": cool_down_max,
+            "apply_timeout": apply_timeout,
         }
-        for name, least in (
-            ("window", 0.05),
-            ("dwell", 0.0),
-            ("settle", 0.0),
-            ("cool_down", 0.0),
-            ("apply_timeout", 0.01),
-        ):
-            if not least <= seconds[name] <= 86400:
-                raise ConfigError(where, f"{name} is {seconds[name]:g} s", f"at least {least:g} s, at most a day")
-        self.window = seconds.pop("window")
-        seconds["cool_down_max"] = max(seconds["cool_down_max"], seconds["cool_down"])
-        self.settings = AdaptationSettings(violations=violations, windows=windows, improvement=improvement, **seconds)
+        where = f"adaptation of {self.name}"
+        self.window, self.settings = read_adaptation(where, violations, windows, improvement, times)
 
     def on(self, event: str) -> Callable[[_Function], _Function]:
-        """Declare what is done at a change of the life cycle.
+        """Declare the callback of a life-cycle transition.
 
         Args:
             event: ``configure``, ``activate``, ``deactivate`` or ``finalize``.
 
         Raises:
-            ConfigError: There is no such change, or it has its function already.
+            ConfigError: An unknown transition, or one that has its function already.
         """
         known = ("configure", "activate", "deactivate", "finalize")
         if event not in known:
@@ -504,8 +439,8 @@ class Resource:
             raise ConfigError(f"resource {self.name}", f"{event} has its function already", "call both from one")
 
         def declare(function: _Function) -> _Function:
-            check_takes(function, 0, f"what {self.name} does at {event}")
-            self.hooks[event] = function  # type: ignore[assignment] # as told
+            check_arity(function, 0, f"what {self.name} does at {event}")
+            self.hooks[event] = function  # type: ignore[assignment] # check_arity
             return function
 
         return declare
@@ -518,13 +453,23 @@ class Resource:
             remedy = f"declare it with low above 0 and high at most {_RATE_MAX:g}"
             raise ConfigError(where, f"{parameter.name} may be what no rate can be", remedy)
 
-    def _new(self, what: str, name: str, known: Mapping[str, object]) -> None:
-        where = f"{what} {name} of {self.name}"
+    def _check_topic(self, kind: str, name: str, same: Mapping[str, object], other: Mapping[str, object]) -> str:
+        where = self._check_name(kind, name, same)
+        if name in other:
+            opposite = "an input" if kind == "output" else "an output"
+            remedy = "a global name (/scan) is another topic"
+            raise ConfigError(where, f"it is {opposite} of the same resource", remedy)
+        return where
+
+    def _check_name(self, kind: str, name: str, known: Mapping[str, object]) -> str:
+        """Check a new name; return its description for errors."""
+        where = f"{kind} {name} of {self.name}"
         if not name or not is_legal_name(name) or name.startswith("~"):
             raise ConfigError(where, f"{name!r} is not a ROS name", "letters, digits, _ and /, a letter or / first")
-        if what == "parameter" and "/" in name:
+        if kind == "parameter" and "/" in name:
             raise ConfigError(where, "a parameter has a base name", "leave the / out")
         if name in known:
             raise ConfigError(where, "there is one of this name already", "name it otherwise")
         if name.removeprefix(f"/{self.name}/") in RESERVED:
             raise ConfigError(where, "that name is the resource's own", f"not one of {', '.join(sorted(RESERVED))}")
+        return where

@@ -1,4 +1,4 @@
-"""Units that quality attributes are said in, and how they convert: ``20 Hz``, ``50 ms``, ``2 MB/s``."""
+"""Units of quality attributes and their conversion: ``20 Hz``, ``50 ms``, ``2 MB/s``."""
 
 from __future__ import annotations
 
@@ -38,19 +38,14 @@ _DIMENSION_OF: Final = {unit: name for name, units in _DIMENSIONS.items() for un
 _QUANTITY: Final = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S*)\s*")
 
 
-def is_unit(unit: str) -> bool:
-    """Whether this unit is known; a resource may declare another, which then converts to nothing."""
-    return unit in _DIMENSION_OF
-
-
 def convert(value: float, unit: str, to: str, where: str) -> float:
-    """A value in another unit of the same dimension.
+    """Convert a value to another unit of the same dimension.
 
     Args:
         value: In ``unit``.
-        unit: Any unit; the same as ``to`` need not be known.
-        to: The unit wanted.
-        where: For the error: what the value was given for.
+        unit: Its unit; a resource may use a unit of its own, which converts to no other.
+        to: The unit of the result.
+        where: For errors: the purpose of the value.
 
     Raises:
         ConfigError: One of them is unknown, or they measure different things.
@@ -69,10 +64,10 @@ def convert(value: float, unit: str, to: str, where: str) -> float:
 
 
 def quantity(text: str | float, to: str, where: str) -> float:
-    """Read ``50 ms`` (or a bare number, which is in ``to``) as a value in ``to``.
+    """Read ``50 ms``, or a bare number in the unit ``to``, as a value in ``to``.
 
     Raises:
-        ConfigError: It is not a number with a unit that fits, or not a number at all (nan).
+        ConfigError: Not a finite number, or a unit of another dimension.
     """
     if isinstance(text, bool):
         raise ConfigError(where, f"{text} is not a number with a unit", f"for example 20 {to}".rstrip())

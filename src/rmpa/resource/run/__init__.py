@@ -1,1 +1,1 @@
-"""TODO room."""
+"""Runs resources: nodes, tasks, control loop, life cycle, store."""

@@ -1,7 +1,7 @@
-"""Makes a resource smart: measures its quality, takes what clients ask, applies profiles, raises alarms.
+"""Drives the control loop of a resource: measurements and requests in, profiles and reports out.
 
-Everything goes by plain topics below the resource's node (``docs/smart-resources.md`` lists them), so that it works
-from any node in any module. ``resource.decide.adaptation`` decides; this drives it.
+All of it goes by plain topics below the resource's node (``docs/smart-resources.md`` lists them), so any node in any
+module can use it. ``resource.decide.adaptation`` decides.
 """
 
 from __future__ import annotations
@@ -9,60 +9,65 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from typing import TYPE_CHECKING, Any, Final
-
-import msgspec
+from typing import TYPE_CHECKING, Final
 
 from rmpa.core.errors import ConfigError
 from rmpa.resource import limits
-from rmpa.resource.decide.adaptation import (
-    Action,
-    Adaptation,
-    AdaptationSettings,
-    Alarm,
-    Apply,
-    Clear,
-    Raise,
-    Reacted,
-)
+from rmpa.resource.decide.actions import Action, Alarm, Apply, Clear, Raise, Reacted
+from rmpa.resource.decide.adaptation import Adaptation
 from rmpa.resource.decide.clients import Clients
 from rmpa.resource.decide.decision import Decider
 from rmpa.resource.decide.measuring import QualityMeasurement
 from rmpa.resource.decide.observed import MissingInputs, ObservedQualities
-from rmpa.resource.decide.reports import ALARM_LEVELS, alarm_values, answer_to, decision_of, health, told
+from rmpa.resource.decide.reports import (
+    ALARM_LEVELS,
+    alarm_values,
+    answer_to,
+    decision_report,
+    describe_alarm,
+    health,
+)
 from rmpa.resource.decide.saved_state import SavedCoolDown, SavedRequirement, SavedState
 from rmpa.resource.declare.requirements import Requirement
 from rmpa.resource.run.applier import Applier
 from rmpa.resource.run.preconditions import Preconditions
 from rmpa.resource.run.runtime import RuntimePart
-from rmpa.ros.types.diagnostic_array import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus, frame_array
+from rmpa.resource.run.status_publisher import StatusPublisher
+from rmpa.ros.types.diagnostic_array import ARRAY_TYPE, DiagnosticLevel, DiagnosticStatus
 from rmpa.ros.types.messages import MessageType
-from rmpa.ros.wire.tcpros import LENGTH, printable
+from rmpa.ros.wire.tcpros import printable
+from rmpa.runtime.machine_timer import MachineTimer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from rmpa.resource.decide.decision import ProfileScore
+    from rmpa.resource.declare.adaptation_settings import AdaptationSettings
     from rmpa.resource.declare.attributes import Value
+    from rmpa.resource.declare.connections import Input, Output
     from rmpa.resource.declare.requirements import Bound
-    from rmpa.resource.declare.resource import Input, Output
     from rmpa.resource.run.runtime import Runtime
     from rmpa.resource.run.tasks import Tasks
-    from rmpa.ros.node.topics import Publisher, Received, Subscriber
+    from rmpa.ros.node.topics import Received, Subscriber
 
 _log = logging.getLogger(__name__)
-_LOOK: Final = 0.25
-"""Seconds between looks whether clients are still connected."""
+_CLIENTS_INTERVAL: Final = 0.25
+"""Seconds between checks whether clients are still connected."""
+_CONTEXT_PRIORITY: Final = 1 << 30
+"""Of the requirement of a context: above that of every client."""
+_CONTEXT_CLIENT: Final = "context "
+"""The beginning of a context's name as a client."""
 
 
 class Adapter(RuntimePart):
-    """The driver of one resource's loop.
+    """The driver of one resource's control loop.
 
     Args:
         runtime: Of the resource.
         tasks: Paused while a profile is applied.
         window: Seconds of one quality window.
-        settings: How patient the loop is.
+        settings: Of the control loop.
+        problems: What is wrong beside the quality: texts of what is missing, and of what does not work.
     """
 
     def __init__(
@@ -72,84 +77,98 @@ class Adapter(RuntimePart):
         *,
         window: float = 1.0,
         settings: AdaptationSettings | None = None,
+        problems: Callable[[], tuple[list[str], list[str]]] = lambda: ([], []),
     ) -> None:
         resource = runtime.resource
         self._runtime = runtime
+        self._name = runtime.node.name
         self._window = window
+        self._problems = problems
         self._attributes = resource.attributes
         profiles = [declared.profile for declared in resource.profiles.values()]
         self.loop = Adaptation(self._attributes, Decider(resource.name, self._attributes, profiles), settings)
         self.clients = Clients(resource.name, self._attributes)
+        self.reports = StatusPublisher(runtime)
+        self.reaction: float | None = None
+        """Seconds that the last reconfiguration took, from its cause to its completion."""
         self._measuring: QualityMeasurement | None = None
         """``None`` before the start."""
         self._measured: dict[str, Value] = {}
-        self._publishers: dict[str, Publisher] = {}
-        self._responded: list[bytes] | None = None
-        self._sequence = 0
-        self._asking: Subscriber | None = None
+        self._requirements: Subscriber | None = None
         self._applier = Applier(
-            runtime, tasks, on_applied=self._applied, on_ended_late=self._ended_late, on_late=self.late
+            runtime,
+            tasks,
+            on_applied=self._applied,
+            on_ended_late=self._ended_late,
+            on_late_action=self.report_late_action,
         )
-        self._preconditions = Preconditions(resource.profiles, self._bar)
-        self._timers: dict[str, asyncio.TimerHandle] = {}
-        self._context_bars: dict[str, str] = {}
-        self._closed = False
-        self.chosen = ""
-        """A profile that was chosen by hand before the start."""
-        self.reaction: float | None = None
-        """Seconds that the last reconfiguration took, from its cause to its completion."""
-        self.listeners: list[Callable[[Action], None]] = []
-        """Called with each action of the loop, for the store and the diagnostics."""
-        self.on_window: list[Callable[[DiagnosticLevel, str, Mapping[str, Value]], None]] = []
-        """Called with each window: how the resource is, in words, and what was measured."""
-        self.on_asked: list[Callable[[], None]] = []
-        """Called when what is asked, chosen or running may be another."""
-        self.recalled = SavedState()
-        """What there was before a restart; set before the start."""
-        self.on_missing: list[Callable[[str, bool], None]] = []
-        """Called when something that is needed is missing (true), and when it is back."""
-        self.on_late: list[Callable[[str], None]] = []
-        """Called when a function that was given up does something, or ends; with the text."""
+        self._preconditions = Preconditions(resource.profiles, self._update_blocked)
+        self._blocked_by_context: dict[str, str] = {}
         self._observed_by = ObservedQualities(
             self._attributes, resource.name, limits.RESOURCE_REPORT_WINDOWS * window
         )
         self._missing = MissingInputs()
-        self.troubles: Callable[[], tuple[list[str], list[str]]] = lambda: ([], [])
-        """What is wrong beside the quality: (what is missing, what does not work), each ready to read."""
+        self._saved = SavedState()
+        self._chosen = ""
+        self._window_end: float | None = None
+        self._clients_check: float | None = None
+        self._timers = (
+            MachineTimer(self.loop.next_timer, self._handle_timer),
+            MachineTimer(lambda: self._window_end, self._end_window),
+            MachineTimer(lambda: self._clients_check, self._check_clients),
+        )
+        self._closed = False
 
-    # --- its life -----------------------------------------------------------------------------------------------
+    # --- start and end ------------------------------------------------------------------------------------------
+
+    def restore(self, saved: SavedState) -> None:
+        """Continue from the state of before a restart; called before ``start``."""
+        self._saved, self._chosen = saved, saved.chosen
+
+    def preset(self, profile: str) -> None:
+        """Choose a profile by hand, or none, before ``start``."""
+        self._chosen = profile
 
     async def start(self) -> None:
-        """Measure from now on, take the first profile, and hear clients."""
+        """Begin to measure, take the first profile, and serve clients."""
         self._loop = asyncio.get_running_loop()
         await self._preconditions.start()
+        self._measuring = QualityMeasurement(self._runtime.resource, self._loop.time())
+        await self.reports.start()
         now = self._loop.time()
+        self._restore(now)
         node = self._runtime.node
-        self._measuring = QualityMeasurement(self._runtime.resource, now)
-        for name, latch in (("quality", False), ("alarms", False), ("responses", True)):
-            topic = f"{node.name}/{name}"
-            self._publishers[name] = await node.advertise(topic, MessageType(ARRAY_TYPE), latch=latch)
-        self._publishers["diagnostics"] = await node.advertise("/diagnostics", MessageType(ARRAY_TYPE))
-        for name in ("profile", "decision"):
-            await self._runtime.say(name, "")
-        self._recall(now := self._loop.time())  # registering has taken a while
-        self._asking = await node.subscribe(f"{node.name}/requirements", MessageType(ARRAY_TYPE), self._asked)
-        await node.subscribe(f"{node.name}/observed", MessageType(ARRAY_TYPE), self._told_of)
-        self._bar()
-        self._act(self.loop.pin(self.chosen, now, anew=False) if self.chosen else self.loop.start(now))
+        self._requirements = await node.subscribe(
+            f"{node.name}/requirements", MessageType(ARRAY_TYPE), self._requirement_received
+        )
+        await node.subscribe(f"{node.name}/observed", MessageType(ARRAY_TYPE), self._observation_received)
+        self._update_blocked()
+        self._act(self.loop.pin(self._chosen, now, restored=True) if self._chosen else self.loop.start(now))
         self._respond()
-        self._next_window(now)
-        self._later("clients", _LOOK, self._look_at_clients)
+        self._window_end, self._clients_check = now + self._window, now + _CLIENTS_INTERVAL
+        self._arm_timers()
 
     async def close(self) -> None:
         """Decide nothing any more; a profile that is being applied may end."""
         self._closed = True
-        for timer in self._timers.values():
-            timer.cancel()
+        for timer in self._timers:
+            timer.close()
+        self.reports.close()
         await self._preconditions.close()
         await self._applier.close()
 
-    # --- measuring ----------------------------------------------------------------------------------------------
+    def _arm_timers(self) -> None:
+        for timer in self._timers:
+            timer.arm()
+
+    def _restore(self, now: float) -> None:
+        now_ns = time.time_ns()
+        requirements = self.clients.restore(self._saved.requirements, now, now_ns)
+        left = {name: one.left(now, now_ns) for name, one in self._saved.cool_downs.items()}
+        cool_downs = {name: one for name, one in left.items() if one is not None}
+        self.loop.restore(requirements, self._saved.last, cool_downs, now)
+
+    # --- measurements -------------------------------------------------------------------------------------------
 
     def published(self, output: Output, raw: bytes, now_ns: int) -> None:
         """Measure an output."""
@@ -164,82 +183,67 @@ class Adapter(RuntimePart):
     def observed(self, attribute: str, value: Value) -> None:
         """Measure an attribute of the user's own."""
         if self._measuring is not None:
-            self._measuring.observed(attribute, value)
+            self._measuring.observe(attribute, value)
 
-    @property
-    def measured(self) -> Mapping[str, Value]:
-        """The last window, by attribute."""
-        return self._measured
-
-    def _next_window(self, began: float) -> None:
-        """By the clock, so that windows do not get longer by how late each ends."""
-        if not self._closed:
-            due = max(began + self._window, self._loop.time())
-            self._timers["window"] = self._loop.call_at(due, self._end_window, due)
-
-    def _restart_windows(self) -> None:
-        """Another profile runs: it is not judged by what was measured under the last one."""
+    def _restart_window(self) -> None:
+        """Begin a new window: a profile is not judged by what was measured under the previous one."""
         now = self._loop.time()
         if self._measuring is not None:
             self._measuring.restart(now)
-        if (timer := self._timers.get("window")) is not None:
-            timer.cancel()
-            self._next_window(now)
+        if self._window_end is not None:
+            self._window_end = now + self._window
+            self._arm_timers()
 
-    def _end_window(self, due: float) -> None:
-        self._next_window(due)
-        now = self._loop.time()
+    def _end_window(self, now: float) -> None:
+        # By the schedule, so that lateness does not add up.
+        self._window_end = max((self._window_end or now) + self._window, now)
         measured = self._measuring.window(now) if self._measuring is not None else {}
-        self._observed_by.judge(measured, self.loop.requirements, now)
-        self._measured = measured
-        for text, gone in self._missing.look(self.troubles()[0]):
-            self._miss(text, gone=gone)
-        self._preconditions.look()
-        self._bar()
-        self._act(self.loop.window(measured, now))
+        self._measured = self._observed_by.worst(measured, self.loop.requirements, now)
+        for text, missing in self._missing.update(self._problems()[0]):
+            self._missing_changed(text, missing=missing)
+        self._preconditions.check()
+        self._update_blocked()
+        self._act(self.loop.window(self._measured, now))
         self._publish_quality()
         self._respond()
 
-    def _told_of(self, message: Received) -> None:
-        """A client says what it observes."""
+    def _observation_received(self, message: Received) -> None:
         values = [(str(pair.key), str(pair.value)) for status in message.message.status for pair in status.values]
         try:
-            self._observed_by.told(message.caller_id, values, self._loop.time())
+            self._observed_by.report(message.caller_id, values, self._loop.time())
         except ConfigError as error:
-            if self.clients.refusal(message.caller_id) != str(error):  # it will say so once a second
+            if self.clients.refusal(message.caller_id) != str(error):  # such reports are periodic
                 self.refuse(message.caller_id, str(error))
 
-    def _miss(self, text: str, *, gone: bool) -> None:
-        if gone:
-            _log.warning("! %s: %s", self._runtime.node.name, text)
+    def _missing_changed(self, text: str, *, missing: bool) -> None:
+        if missing:
+            _log.warning("! %s: %s", self._name, text)
         else:
-            _log.info("= %s: over: %s", self._runtime.node.name, text)
-        level, said = (DiagnosticLevel.STALE, text) if gone else (DiagnosticLevel.OK, f"over: {text}")
-        values = {"cleared": str(not gone).lower()}
-        self._publish("alarms", [self._status(level, self._runtime.resource.name, said, values)])
-        for hear in self.on_missing:
-            hear(text, gone)
+            _log.info("= %s: over: %s", self._name, text)
+        level, message = (DiagnosticLevel.STALE, text) if missing else (DiagnosticLevel.OK, f"over: {text}")
+        self.reports.alarm(level, message, {"cleared": str(not missing).lower()})
+        for part in self._runtime.parts:
+            part.missing_changed(text, missing=missing)
 
     # --- clients ------------------------------------------------------------------------------------------------
 
-    def _asked(self, message: Received) -> None:
-        """A client says what it asks."""
+    def _requirement_received(self, message: Received) -> None:
         client, stamp = message.caller_id, message.message.header.stamp
         mark = next((str(s.hardware_id) for s in message.message.status), "")
-        self.clients.speaks(client, mark, f"{stamp.sec}.{stamp.nanosec:09}" if stamp.sec or stamp.nanosec else "")
+        self.clients.received(client, mark, f"{stamp.sec}.{stamp.nanosec:09}" if stamp.sec or stamp.nanosec else "")
         try:
             values = [(str(pair.key), str(pair.value)) for status in message.message.status for pair in status.values]
             self.require(client, values)
         except ConfigError as error:
-            _log.warning("! %s: %s asks for what cannot be: %s", self._runtime.node.name, printable(client), error)
+            _log.warning("! %s: %s asks for what cannot be: %s", self._name, printable(client), error)
             self.clients.refuse(client, str(error))
             self._respond()
 
     def require(self, client: str, values: list[tuple[str, str]]) -> None:
-        """Take what a client asks, in place of what it asked before; nothing: it asks for nothing any more.
+        """Set a client's requirement, in place of its previous one; without bounds it is released.
 
         Raises:
-            ConfigError: It cannot be; what it asked before stays.
+            ConfigError: It is invalid; the previous one stays in force.
         """
         now = self._loop.time()
         requirement = self.clients.read(client, values, now)
@@ -251,19 +255,12 @@ class Adapter(RuntimePart):
             self._act(self.loop.release(client, now))
         self._respond()
 
-    def asked(self, now_ns: int) -> list[SavedRequirement]:
-        """What each client asks, in its own words, at a time of the wall clock."""
-        return self.clients.asked(self.loop.requirements, self._loop.time(), now_ns)
+    def saved_requirements(self, now_ns: int) -> list[SavedRequirement]:
+        """The requirements as they are stored; ``now_ns``: Unix nanoseconds of the wall clock."""
+        return self.clients.save(self.loop.requirements, self._loop.time(), now_ns)
 
-    def _recall(self, now: float) -> None:
-        """Take up what was asked before a restart; who does not come back within the grace is forgotten."""
-        now_ns = time.time_ns()
-        found = self.clients.recall(self.recalled.asked, now, now_ns)
-        left = {name: one.left(now, now_ns) for name, one in self.recalled.cooling.items()}
-        self.loop.remember(found, self.recalled.last, {name: one for name, one in left.items() if one}, now)
-
-    def cooling(self, now_ns: int) -> dict[str, SavedCoolDown]:
-        """The profiles that are left out for a while, at a time of the wall clock."""
+    def saved_cool_downs(self, now_ns: int) -> dict[str, SavedCoolDown]:
+        """The cool-downs as they are stored; ``now_ns``: Unix nanoseconds of the wall clock."""
         now = self._loop.time()
         return {
             name: SavedCoolDown(
@@ -272,16 +269,22 @@ class Adapter(RuntimePart):
             for name, one in self.loop.cooling(now).items()
         }
 
-    def shift(self, context: str, bounds: Mapping[str, Bound], bars: Mapping[str, str]) -> None:
-        """A context begins: what it requires counts above the clients', and some profiles may not run in it."""
+    def enter_context(self, context: str, bounds: Mapping[str, Bound], blocked: Mapping[str, str]) -> None:
+        """Take the requirement of a context, above those of clients, and the profiles that it does not allow.
+
+        Args:
+            context: Its name; empty: no context.
+            bounds: By attribute.
+            blocked: Reasons by profile.
+        """
         now = self._loop.time()
-        self._context_bars = dict(bars)
-        known = [client for client in self.loop.requirements if client.startswith("context ")]
-        name = f"context {context}"
-        self._bar()
+        self._blocked_by_context = dict(blocked)
+        before = [client for client in self.loop.requirements if client.startswith(_CONTEXT_CLIENT)]
+        name = f"{_CONTEXT_CLIENT}{context}"
+        self._update_blocked()
         if bounds:
-            self._act(self.loop.require(Requirement(name, dict(bounds), priority=1 << 30), now))
-        for client in known:
+            self._act(self.loop.require(Requirement(name, dict(bounds), priority=_CONTEXT_PRIORITY), now))
+        for client in before:
             if client != name or not bounds:
                 self._act(self.loop.release(client, now))
         self._act(self.loop.reconsider(f"context {context}" if context else "no context any more", now))
@@ -297,59 +300,58 @@ class Adapter(RuntimePart):
         self._respond()
 
     def refuse(self, client: str, text: str) -> None:
-        """Tell a client among the responses that what it said cannot be."""
-        _log.warning("! %s: %s: %s", self._runtime.node.name, printable(client), text)
+        """Tell a client among the responses that its message is invalid."""
+        _log.warning("! %s: %s: %s", self._name, printable(client), text)
         self.clients.refuse(client, text)
         self._respond()
 
     def explain(self) -> tuple[ProfileScore, ...]:
-        """How each profile does at this moment."""
+        """The score of each profile at this moment."""
         return self.loop.explain(self._loop.time())
 
     async def settled(self) -> None:
-        """Wait until no profile is being applied; a hanging one is given up in a while."""
+        """Wait until no profile is being applied; one that hangs is given up at its time-out."""
         while self.loop.applying and not self._closed:
             await self._applier.wait()
 
-    def _look_at_clients(self) -> None:
-        """Forget those that are gone: killed, unplugged, or simply over."""
-        self._later("clients", _LOOK, self._look_at_clients)
-        callers = self._asking.callers if self._asking is not None else set()
-        for client in self.clients.gone(callers, self._loop.time()):
+    def _check_clients(self, now: float) -> None:
+        self._clients_check = now + _CLIENTS_INTERVAL
+        connected = self._requirements.callers if self._requirements is not None else set()
+        for client in self.clients.remove_absent(connected, now):
             if client in self.loop.requirements:
-                _log.info("= %s: %s is gone, and what it asked for", self._runtime.node.name, printable(client))
-                self._act(self.loop.release(client, self._loop.time()))
+                _log.info("= %s: %s is gone, and what it asked for", self._name, printable(client))
+                self._act(self.loop.release(client, now))
             self._respond()
 
-    # --- acting -------------------------------------------------------------------------------------------------
+    # --- actions ------------------------------------------------------------------------------------------------
 
-    def _bar(self) -> None:
-        """Leave out the profiles whose preconditions do not hold, and those that the context does not allow."""
-        if not self._closed:
-            barred = self._preconditions.barred() | self._context_bars
-            self._act(self.loop.bar(barred, self._loop.time()))
+    def _update_blocked(self) -> None:
+        """Block the profiles whose preconditions do not hold, and those that the context does not allow."""
+        if self._requirements is not None and not self._closed:  # not before the start
+            blocked = self._preconditions.blocked() | self._blocked_by_context
+            self._act(self.loop.block(blocked, self._loop.time()))
 
     def _act(self, actions: list[Action]) -> None:
         for action in actions:
             match action:
                 case Apply():
-                    _log.info("= %s: profile %s: %s", self._runtime.node.name, action.profile, action.why)
+                    _log.info("= %s: profile %s: %s", self._name, action.profile, action.why)
                     self._applier.begin(action.profile)
                 case Raise():
-                    _log.warning("! %s: %s", self._runtime.node.name, told(action.alarm))
+                    _log.warning("! %s: %s", self._name, describe_alarm(action.alarm))
                     self._publish_alarm(action.alarm, cleared=False)
                 case Clear():
-                    _log.info("= %s: over: %s", self._runtime.node.name, told(action.alarm))
+                    _log.info("= %s: over: %s", self._name, describe_alarm(action.alarm))
                     self._publish_alarm(action.alarm, cleared=True)
                 case Reacted():
                     self.reaction = action.reaction
-                    self._restart_windows()
-                    _log.info("= %s: %s runs, after %.3g s", self._runtime.node.name, action.profile, action.reaction)
-            for listener in self.listeners:
-                listener(action)
+                    self._restart_window()
+                    _log.info("= %s: %s runs, after %.3g s", self._name, action.profile, action.reaction)
+            for part in self._runtime.parts:
+                part.acted(action)
         if actions:
-            self._say()
-        self._arm()
+            self._publish_decision()
+        self._arm_timers()
 
     def _applied(self, profile: str, why: str) -> None:
         self._observed_by.clear()
@@ -358,125 +360,88 @@ class Adapter(RuntimePart):
         self._respond()
 
     def _ended_late(self, profile: str, touched: bool, text: str) -> None:
-        """A function that was given up has ended."""
         again = (self.loop.applying or self.loop.profile) if touched else ""
         if again:
-            self.late(profile, f"{text}; {again} is applied once more")
+            self.report_late_action(profile, f"{text}; {again} is applied once more")
         else:
-            _log.info("= %s: %s", self._runtime.node.name, text)
+            _log.info("= %s: %s", self._name, text)
         self._act(self.loop.ended_late(profile, self._loop.time(), touched=touched))
         self._respond()
 
-    def late(self, before: str, text: str) -> None:
-        """Tell what the function of a profile or a context that was given up did."""
-        _log.warning("! %s: %s", self._runtime.node.name, text)
+    def report_late_action(self, before: str, text: str) -> None:
+        """Report an action of the function of a profile or context that was given up."""
+        _log.warning("! %s: %s", self._name, text)
         values = {"before": before, "after": self.loop.applying or self.loop.profile}
-        self._publish("alarms", [self._status(DiagnosticLevel.WARN, self._runtime.resource.name, text, values)])
-        for hear in self.on_late:
-            hear(text)
+        self.reports.alarm(DiagnosticLevel.WARN, text, values)
+        for part in self._runtime.parts:
+            part.late_action(text)
 
-    def _arm(self) -> None:
-        due = self.loop.next_timer()
-        if (timer := self._timers.pop("loop", None)) is not None:
-            timer.cancel()
-        if due is not None and not self._closed:
-            self._timers["loop"] = self._loop.call_at(due, self._due)
-
-    def _due(self) -> None:
-        now = self._loop.time() + 0.001
+    def _handle_timer(self, now: float) -> None:
         hung = self.loop.applying if self.loop.overdue(now) else ""
         goes_on = self._applier.give_up() if hung else False
         self._act(self.loop.handle_timer(now))
         if hung and not self.loop.applying:
-            self._applier.let_go()
+            self._applier.resume()
         if hung and not goes_on:
             self._act(self.loop.ended_late(hung, now, touched=False))
         self._respond()
 
-    def _later(self, name: str, delay: float, function: Callable[[], None]) -> None:
-        if not self._closed:
-            self._timers[name] = self._loop.call_later(delay, function)
+    # --- reports ------------------------------------------------------------------------------------------------
 
-    # --- telling ------------------------------------------------------------------------------------------------
-
-    def _say(self) -> None:
-        self._runtime.say_again("profile", self.loop.profile)
-        self._runtime.say_again("decision", msgspec.json.encode(self.decision()).decode())
-
-    def decision(self) -> dict[str, Any]:
-        """How each profile does at this moment, with each term of it, for ``rmpa profile explain``."""
-        return decision_of(self.loop, self.explain(), self.reaction)
+    def _publish_decision(self) -> None:
+        self.reports.decision(self.loop.profile, decision_report(self.loop, self.explain(), self.reaction))
 
     def _publish_quality(self) -> None:
-        level, message = self._health()
-        values = self._measuring.shown(self._measured) if self._measuring is not None else {}
+        level, message = self.health()
+        values = self._measuring.format(self._measured) if self._measuring is not None else {}
         values["profile"] = self.loop.profile
         if self.reaction is not None:
             values["reaction"] = f"{self.reaction:.6g} s"
-        for hear in self.on_window:
-            hear(level, message, self._measured)
-        status = self._status(level, self._runtime.resource.name, message, values)
-        self._publish("quality", [status])
-        self._publish("diagnostics", [status])
+        for part in self._runtime.parts:
+            part.window_ended(level, message, self._measured)
+        self.reports.quality(level, message, values)
 
-    def _health(self) -> tuple[DiagnosticLevel, str]:
-        missing, broken = self.troubles()
+    def health(self) -> tuple[DiagnosticLevel, str]:
+        """Level and message of the resource's ``quality`` at this moment."""
+        missing, broken = self._problems()
         broken += [f"the function of profile {name} hangs; it was given up" for name in self._applier.hanging]
         return health(self.loop, missing, broken)
 
     def _publish_alarm(self, alarm: Alarm, *, cleared: bool) -> None:
         values = alarm_values(alarm, self._attributes, cleared=cleared, reaction=self.reaction)
         level = DiagnosticLevel.OK if cleared else ALARM_LEVELS[alarm.kind]
-        text = f"over: {told(alarm)}" if cleared else told(alarm)
-        self._publish("alarms", [self._status(level, self._runtime.resource.name, text, values)])
+        self.reports.alarm(level, f"over: {describe_alarm(alarm)}" if cleared else describe_alarm(alarm), values)
 
     def _respond(self) -> None:
-        """Tell each client what it asked and what it is given, and everybody how the profiles do now."""
-        self._say()
-        for hear in self.on_asked:
-            hear()
+        """Publish the response to each client, and the decision."""
+        self._publish_decision()
+        for part in self._runtime.parts:
+            part.requirements_changed()
         statuses = []
         for client, requirement in self.loop.requirements.items():
-            level, message, values = answer_to(requirement, self.loop, self._attributes, self._given(requirement))
+            level, message, values = answer_to(requirement, self.loop, self._attributes, self._offered(requirement))
             if refusal := self.clients.refusal(client):
                 level, message = DiagnosticLevel.ERROR, f"{refusal}; what was asked before stays"
-            statuses.append(self._answer(level, client, message, values))
+            statuses.append(self._response(level, client, message, values))
         statuses += [
-            self._answer(DiagnosticLevel.ERROR, client, self.clients.refusal(client), {})
+            self._response(DiagnosticLevel.ERROR, client, self.clients.refusal(client), {})
             for client in self.clients.refused
             if client not in self.loop.requirements
         ]
-        if (publisher := self._publishers.get("responses")) is not None and not self._closed:
-            known = [status.serialize() for status in statuses]
-            if known != self._responded:
-                self._responded = known
-                publisher.publish_raw(self._frame(statuses))
+        self.reports.responses(statuses)
 
-    def _given(self, requirement: Requirement) -> dict[str, Value]:
-        """What a client is given of what it asks for: what it observes, or else what is measured here."""
+    def _offered(self, requirement: Requirement) -> dict[str, Value]:
+        """The requested attributes as the client observes them, or else as they are measured here."""
         found = {}
         for name in requirement.bounds:
-            seen = self._observed_by.given(requirement.client, name)
-            if (value := seen if seen is not None else self._measured.get(name)) is not None:
+            observed = self._observed_by.observed(requirement.client, name)
+            if (value := observed if observed is not None else self._measured.get(name)) is not None:
                 found[name] = value
         return found
 
-    def _answer(
+    def _response(
         self, level: DiagnosticLevel, client: str, message: str, values: Mapping[str, str]
     ) -> DiagnosticStatus:
-        """A client's status; the mark on its request comes back, so that it knows which one it is about."""
-        return DiagnosticStatus(
-            level, client, message, self.clients.mark(client) or self._runtime.resource.name, values
-        )
-
-    def _status(self, level: DiagnosticLevel, name: str, message: str, values: Mapping[str, str]) -> DiagnosticStatus:
-        return DiagnosticStatus(level, name, message, self._runtime.resource.name, values)
-
-    def _publish(self, topic: str, statuses: list[DiagnosticStatus]) -> None:
-        publisher = self._publishers.get(topic)
-        if publisher is not None and not self._closed:
-            publisher.publish_raw(self._frame(statuses))
-
-    def _frame(self, statuses: list[DiagnosticStatus]) -> bytes:
-        self._sequence += 1
-        return frame_array(self._sequence, time.time_ns(), [s.serialize() for s in statuses])[LENGTH.size :]
+        """The status for a client; it repeats the mark of the request, by which the client recognises it."""
+        mark = self.clients.mark(client) or self._runtime.resource.name
+        return DiagnosticStatus(level, client, message, mark, values)

@@ -1,17 +1,18 @@
-"""Applies profiles: each between two runs of the tasks, and one that hangs without harm to the next one.
+"""Applies profiles, each between two runs of the tasks, and isolates functions that hang.
 
-A plain function that hangs cannot be ended. It is given up: what it does later through the resource has no effect
-(``resource.declare.fence``), and when it ends the profile that runs is applied once more, for it may have touched
-the device itself. Until then its own profile is left out, since two calls of one function would mix.
+A plain function that hangs in a thread cannot be stopped. It is given up: its later actions through the resource have
+no effect (``resource.declare.fence``). When it ends, the profile that runs is applied once more, because the function
+may have changed the device itself. Until then its own profile is excluded: calls of one function must not overlap.
 """
 
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 from typing import TYPE_CHECKING, Final
 
-from rmpa.resource.run.fenced_call import Call
+from rmpa.resource.run.fenced_call import FencedCall
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,20 +21,22 @@ if TYPE_CHECKING:
     from rmpa.resource.run.tasks import Tasks
 
 _log = logging.getLogger(__name__)
-_LOOK: Final = 0.25
-_SOON: Final = 0.02
+_WAIT: Final = 0.25
+"""Seconds that ``wait`` waits at most."""
+_WAIT_IDLE: Final = 0.02
+"""The same if the task of the profile has died; the profile is given up at its time-out."""
 
 
 class Applier:
-    """Of one resource; what it calls it calls in the loop.
+    """Applies the profiles of one resource; all callbacks are called in the event loop.
 
     Args:
-        runtime: Keeps what is published meanwhile.
+        runtime: Queues messages meanwhile.
         tasks: Paused meanwhile.
-        on_applied: ``(profile, why)``: its function has ended; ``why`` says what was wrong, or nothing.
-        on_ended_late: ``(profile, touched, text)``: a function that was given up has ended, and may have touched the
-            device since the present profile's function began.
-        on_late: ``(profile, text)``: one that was given up did something, without effect.
+        on_applied: ``(profile, error)``: its function has ended, with an error or with an empty text.
+        on_ended_late: ``(profile, touched, text)``: a function that was given up has ended; ``touched``: after the
+            present profile's function began, so it may have changed the device since.
+        on_late_action: ``(profile, text)``: a function that was given up has attempted an action, without effect.
     """
 
     def __init__(
@@ -43,17 +46,17 @@ class Applier:
         *,
         on_applied: Callable[[str, str], None],
         on_ended_late: Callable[[str, bool, str], None],
-        on_late: Callable[[str, str], None],
+        on_late_action: Callable[[str, str], None],
     ) -> None:
         self._runtime = runtime
         self._tasks = tasks
         self._on_applied = on_applied
         self._on_ended_late = on_ended_late
-        self._on_late = on_late
-        self._call: Call | None = None
+        self._on_late_action = functools.partial(runtime.call_in_loop, on_late_action)
+        self._call: FencedCall | None = None
         self._task: asyncio.Task[None] | None = None
         self._running: set[asyncio.Task[None]] = set()
-        self._hanging: dict[Call, None] = {}
+        self._hanging: dict[FencedCall, None] = {}
         self._closed = False
 
     @property
@@ -62,17 +65,17 @@ class Applier:
         return [call.name for call in self._hanging]
 
     def begin(self, profile: str) -> None:
-        """Apply a profile; none is being applied, or it was given up."""
-        self._call = call = Call("profile", profile, self._stopped)
+        """Apply a profile; the previous one is complete or was given up."""
+        self._call = call = FencedCall("profile", profile, self._on_late_action)
         self._task = task = asyncio.get_running_loop().create_task(self._apply(call), name=f"apply {profile}")
         self._running.add(task)
         task.add_done_callback(self._running.discard)
 
     def give_up(self) -> bool:
-        """Do not wait for the function that runs any longer; its messages are dropped.
+        """Give up the function that runs; its messages are dropped.
 
         Returns:
-            Whether it goes on; ``on_ended_late`` tells when it ends.
+            Whether it still runs; ``on_ended_late`` is called when it ends.
         """
         call, task = self._call, self._task
         if call is None or task is None:
@@ -87,20 +90,20 @@ class Applier:
             task.cancel()
         return True
 
-    def let_go(self) -> None:
-        """Nothing is applied any more after one was given up: let the tasks and the messages go on."""
+    def resume(self) -> None:
+        """Resume tasks and messages after a profile was given up and no other one is applied."""
         self._runtime.release()
         self._tasks.resume()
 
     async def wait(self) -> None:
-        """Wait until the profile that is being applied is, or for a moment."""
+        """Wait until the profile has been applied, or for a moment."""
         if self._task is None or self._task.done():
-            await asyncio.sleep(_SOON)  # it died; it is given up at its time-out
+            await asyncio.sleep(_WAIT_IDLE)
         else:
-            await asyncio.wait([self._task], timeout=_LOOK)
+            await asyncio.wait([self._task], timeout=_WAIT)
 
     async def close(self) -> None:
-        """Apply nothing any more; what hangs in a thread is left behind."""
+        """Apply nothing any more; functions that hang in threads are left behind."""
         self._closed = True
         if self._call is not None:
             self._call.give_up()
@@ -110,7 +113,7 @@ class Applier:
 
     # --- inside -------------------------------------------------------------------------------------------------
 
-    async def _apply(self, call: Call) -> None:
+    async def _apply(self, call: FencedCall) -> None:
         why = ""
         try:
             await self._tasks.pause()
@@ -127,25 +130,16 @@ class Applier:
             self._ended_late(call)
             return
         if why:
-            call.give_up()  # what it has begun may go on: coroutines, threads
+            call.give_up()  # coroutines and threads that it has started may still run
         self._runtime.release(drop=bool(why))
         self._tasks.resume()
         self._on_applied(call.name, why)
 
-    def _ended_late(self, call: Call) -> None:
-        """The device may be as this function left it, and not as is said."""
+    def _ended_late(self, call: FencedCall) -> None:
+        """Report whether the device may be in another state than that of the present profile."""
         self._hanging.pop(call, None)
         present = self._call
         touched = bool(call.began and present is not None and present is not call and present.began)
         took = asyncio.get_running_loop().time() - call.began if call.began else 0.0
         text = f"the function of profile {call.name}, which was given up, has ended after {took:.3g} s"
         self._on_ended_late(call.name, touched, text)
-
-    def _stopped(self, call: Call, what: str) -> None:
-        """In any thread."""
-        self._runtime.call_in_loop(self._say_stopped, call, what)
-
-    def _say_stopped(self, call: Call, what: str) -> None:
-        if what not in call.said:
-            call.said.add(what)
-            self._on_late(call.name, f"the function of profile {call.name} was given up; it has no effect: {what}")

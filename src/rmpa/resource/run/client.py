@@ -1,4 +1,4 @@
-"""Asks a resource for a quality, and hears what it gives: here or in any other module.
+"""A client of a resource, in any module: requests a quality and receives the answers.
 
 ::
 
@@ -27,24 +27,24 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
     from types import TracebackType
 
-    from rmpa.resource.declare.resource import QoSRequest
+    from rmpa.resource.declare.qos_request import QoSRequest
     from rmpa.ros.node.node import Node
     from rmpa.ros.node.topics import Publisher, Received, Subscriber
 
 
 class ResourceClient:
-    """One client of one resource; what it asked is forgotten when it ends.
+    """One client of one resource; its requirement is released when it ends.
 
     Args:
-        node: Registered; one client of a resource a node.
-        resource: The resource's node, as this module's graph has it: ``sonar``, ``/robot1/sonar``.
+        node: Registered; each node may have one client of a resource.
+        resource: The resource's node in this module's graph: ``sonar``, ``/robot1/sonar``.
     """
 
     def __init__(self, node: Node, resource: str) -> None:
         self._node = node
         self.resource = resource if resource.startswith("/") else f"/{resource}"
-        self._asking: Publisher | None = None
-        self._observing: Publisher | None = None
+        self._requirements: Publisher | None = None
+        self._observed: Publisher | None = None
         self._responses: Subscriber | None = None
         self._answer: RequirementAnswer | None = None
         self._mark = "none yet"
@@ -58,9 +58,9 @@ class ResourceClient:
             UnreachableError: The master does not answer.
         """
         self._responses = await self._node.subscribe(
-            f"{self.resource}/responses", MessageType(ARRAY_TYPE), self._heard
+            f"{self.resource}/responses", MessageType(ARRAY_TYPE), self._response_received
         )
-        self._asking = await self._node.advertise(
+        self._requirements = await self._node.advertise(
             f"{self.resource}/requirements", MessageType(ARRAY_TYPE), latch=True
         )
         return self
@@ -68,7 +68,7 @@ class ResourceClient:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for topic in (self._asking, self._observing, self._responses):
+        for topic in (self._requirements, self._observed, self._responses):
             if topic is not None:
                 await topic.close()
 
@@ -78,21 +78,21 @@ class ResourceClient:
         priority: int = 0,
         expires: str = "",
         timeout: float = limits.RESOURCE_ANSWER_TIMEOUT,  # noqa: ASYNC109 - the message names it
-        **wishes: QoSRequest,
+        **requests: QoSRequest,
     ) -> RequirementAnswer:
-        """Ask for a quality, in place of what was asked before; wait for what the resource says to it.
+        """Request a quality, in place of the previous request, and wait for the answer.
 
         Args:
             priority: The higher one wins a conflict between clients.
-            expires: ``"60 s"``: forgotten after that; empty: when this client ends.
+            expires: ``"60 s"``: dropped after that; empty: when this client ends.
             timeout: Seconds to wait.
-            wishes: By attribute; a qualified one (``ranges.rate``) is written ``ranges__rate``.
+            requests: By attribute; a qualified one (``ranges.rate``) is written ``ranges__rate``.
 
         Raises:
-            PeerRefused: The request cannot be; what was asked before stays.
+            PeerRefused: The request is invalid; the previous one stays in force.
             UnreachableError: No such resource answers.
         """
-        self.ask(priority=priority, expires=expires, **wishes)
+        self.ask(priority=priority, expires=expires, **requests)
         try:
             async with asyncio.timeout(timeout):
                 while self._answer is None:
@@ -105,25 +105,25 @@ class ResourceClient:
             raise PeerRefused(f"resource {self.resource}", self._answer.message)
         return self._answer
 
-    def ask(self, *, priority: int = 0, expires: str = "", **wishes: QoSRequest) -> None:
-        """Ask as ``require`` does, without waiting: ``answers`` tells."""
-        values = {name.replace("__", "."): str(wish) for name, wish in wishes.items()}
+    def ask(self, *, priority: int = 0, expires: str = "", **requests: QoSRequest) -> None:
+        """Request as ``require`` does, without waiting; ``answers`` yields the answer."""
+        values = {name.replace("__", "."): str(request) for name, request in requests.items()}
         if priority:
             values[PRIORITY] = str(priority)
         if expires:
             values[EXPIRES] = expires
-        self._say(values)
+        self._publish(values)
 
     @property
-    def there(self) -> bool:
-        """Whether such a resource is connected."""
+    def connected(self) -> bool:
+        """Whether the resource is connected."""
         return self._responses is not None and self._responses.publishers > 0
 
     async def observe(self, **values: float | str) -> None:
-        """Say what this client observes of what it is given: ``await sonar.observe(rate="12 Hz")``, again and again.
+        """Report the quality that this client observes: ``await sonar.observe(rate="12 Hz")``, periodically.
 
-        The resource measures what it sends; what comes here may be less, and that is what it is to adapt to. It
-        counts beside a requirement of the same client, for three of the resource's quality windows.
+        The resource measures what it sends; less may arrive here, and it has to adapt to that. A report counts for
+        three of the resource's quality windows, if this client has a requirement.
 
         Args:
             values: By attribute, as in ``require``; a number is in the attribute's unit.
@@ -131,34 +131,34 @@ class ResourceClient:
         Raises:
             UnreachableError: The master does not answer.
         """
-        if self._observing is None:
-            self._observing = await self._node.advertise(f"{self.resource}/observed", MessageType(ARRAY_TYPE))
+        if self._observed is None:
+            self._observed = await self._node.advertise(f"{self.resource}/observed", MessageType(ARRAY_TYPE))
         if values:
             self.report(**values)
 
     def report(self, **values: float | str) -> None:
-        """As ``observe``, behind a first one.
+        """Report as ``observe`` does, which must have been called once.
 
         Raises:
-            UnreachableError: There was no first one.
+            UnreachableError: It was not.
         """
-        if self._observing is None:
+        if self._observed is None:
             raise UnreachableError("resource", self.resource, "await observe() once before")
         pairs: Any = [{"key": key.replace("__", "."), "value": str(value)} for key, value in values.items()]
         status: Any = [{"name": self._node.name, "values": pairs}]
-        self._observing.publish(self._observing.make({"header": {"stamp": time.time()}, "status": status}))
+        self._observed.publish(self._observed.make({"header": {"stamp": time.time()}, "status": status}))
 
     def release(self) -> None:
-        """Ask for nothing any more."""
-        self._say({})
+        """Release the requirement."""
+        self._publish({})
 
     @property
     def answer(self) -> RequirementAnswer | None:
-        """The last one."""
+        """The last answer."""
         return self._answer
 
     async def answers(self) -> AsyncIterator[RequirementAnswer]:
-        """The present answer, if there is one, and each from now on, as it changes."""
+        """The present answer, if there is one, and each change from now on."""
         seen = 0
         while True:
             while self._version == seen:
@@ -170,19 +170,19 @@ class ResourceClient:
 
     # --- inside -------------------------------------------------------------------------------------------------
 
-    def _say(self, values: Mapping[str, str]) -> None:
-        if self._asking is None:
+    def _publish(self, values: Mapping[str, str]) -> None:
+        if self._requirements is None:
             raise UnreachableError("resource", self.resource, "enter the client first: async with ResourceClient(…)")
         pairs: Any = [{"key": key, "value": value} for key, value in values.items()]
         self._mark = secrets.token_hex(8)
         self._answer = None
         status: Any = [{"name": self._node.name, "hardware_id": self._mark, "values": pairs}]
-        # By its stamp a latched request that comes again is known, and its expiry does not begin anew.
-        self._asking.publish(self._asking.make({"header": {"stamp": time.time()}, "status": status}))
+        # The stamp identifies a latched request that arrives again, so that its expiry does not begin anew.
+        self._requirements.publish(self._requirements.make({"header": {"stamp": time.time()}, "status": status}))
 
-    def _heard(self, received: Received) -> None:
+    def _response_received(self, received: Received) -> None:
         for status in received.message.status:
-            # The resource's graph may know us by another name (a proxy's); the mark is ours alone.
+            # In the resource's graph this client may have another name (its proxy's); the mark is unique.
             if status.hardware_id == self._mark:
                 values = {str(pair.key): str(pair.value) for pair in status.values}
                 answer = RequirementAnswer(DiagnosticLevel(int(status.level)), str(status.message), values)

@@ -1,30 +1,34 @@
-"""Brings a resource into its contexts: chosen by hand (a topic, the configuration), or by their rules.
+"""Switches a resource between its contexts: by hand (a topic, the configuration), or by their rules.
 
-A switch is atomic. No task runs and nothing leaves from the moment at which it begins until the context's function
-has ended, its outputs flow, its requirements count, and the profile that follows from them is applied.
+A switch is atomic: no task runs and no message is sent until the context's function has ended, its outputs and
+requirements are in force, and the resulting profile has been applied.
 """
 
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
 from rmpa.resource import limits
-from rmpa.resource.declare.context_rules import Chooser, parse_rule
+from rmpa.resource.declare.context_rules import ContextSelector, parse_rule
 from rmpa.resource.run.descriptor import topic_of
-from rmpa.resource.run.fenced_call import Call
+from rmpa.resource.run.fenced_call import FencedCall
 from rmpa.resource.run.runtime import RuntimePart
 from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
+from rmpa.runtime.machine_timer import MachineTimer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
+    from collections.abc import Coroutine
 
+    from rmpa.resource.declare.behaviour import Context
+    from rmpa.resource.declare.connections import Input, Output
     from rmpa.resource.declare.context_rules import Reference, Scalar
-    from rmpa.resource.declare.resource import Context, Input, Output, Parameter
+    from rmpa.resource.declare.parameters import Parameter
     from rmpa.resource.run.adapter import Adapter
     from rmpa.resource.run.runtime import Runtime
     from rmpa.resource.run.tasks import Tasks
@@ -32,20 +36,20 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 TOPIC: Final = "context"
-_WHO: Final = "context"
-_SOON: Final = 0.02
-"""Seconds from a message until the rules look at it: those that come meanwhile cost nothing."""
-_LOOK: Final = 0.25
-"""Seconds between looks at rules without news: a dwell time is over, a publisher is gone."""
+_HOLDER: Final = "context"
+_DEBOUNCE: Final = 0.02
+"""Seconds from a change of a value until the rules are evaluated; further changes meanwhile cost nothing."""
+_INTERVAL: Final = 0.25
+"""Seconds between evaluations without a change: a dwell time may be over, a publisher gone."""
 
 
 class Contexts(RuntimePart):
-    """The contexts of one resource; to be started behind the adapter.
+    """The contexts of one resource; started after the adapter.
 
     Args:
         runtime: Of the resource.
         tasks: Paused during a switch.
-        adapter: Takes what a context requires.
+        adapter: Takes the requirements of contexts.
     """
 
     def __init__(self, runtime: Runtime, tasks: Tasks, adapter: Adapter) -> None:
@@ -59,9 +63,9 @@ class Contexts(RuntimePart):
             for name, context in self._known.items()
             if context.when
         }
-        self._chooser = Chooser(rules)
-        self._sources = {
-            reference.text: _Source(reference)
+        self._selector = ContextSelector(rules)
+        self._topic_fields = {
+            reference.text: _TopicField(reference)
             for rule in rules.values()
             for reference in rule.references
             if not reference.parameter
@@ -69,18 +73,17 @@ class Contexts(RuntimePart):
         self._parameters = {r.text: r.parameter for rule in rules.values() for r in rule.references if r.parameter}
         self._subscribers: dict[str, Subscriber] = {}
         self._taps: dict[str, str] = {}
-        """By input or output: its topic, if a rule names it."""
+        """Topics by the inputs and outputs that rules refer to."""
         self._latest: dict[str, tuple[MessageType, bytes]] = {}
         self._current = ""
         self._retry = 0.0
-        self._one = asyncio.Lock()
+        self._switch_lock = asyncio.Lock()
         self._work: set[asyncio.Task[None]] = set()
         self._switching: asyncio.Task[None] | None = None
-        self._timers: dict[str, asyncio.TimerHandle] = {}
+        self._next_evaluation: float | None = None
+        self._timer = MachineTimer(lambda: self._next_evaluation, self._evaluate)
         self._closed = True
         """Before the start, and after the end."""
-        self.listeners: list[Callable[[], None]] = []
-        """Called when there is another context, or another choice by hand."""
 
     @property
     def current(self) -> str:
@@ -89,45 +92,45 @@ class Contexts(RuntimePart):
 
     @property
     def chosen(self) -> str:
-        """The one chosen by hand; empty: the rules decide. May be set before the start."""
-        return self._chooser.chosen
+        """The one chosen by hand; empty: the rules decide."""
+        return self._selector.chosen
 
-    @chosen.setter
-    def chosen(self, name: str) -> None:
-        self._chooser.chosen = name
+    def preset(self, name: str) -> None:
+        """Choose a context by hand, or none, before ``start``."""
+        self._selector.chosen = name
 
     @property
     def problems(self) -> list[str]:
-        """What is wrong with the fields that rules name."""
-        return [source.problem for source in self._sources.values() if source.problem]
+        """Problems with the fields that rules refer to."""
+        return [field.problem for field in self._topic_fields.values() if field.problem]
 
     async def start(self) -> None:
-        """Hear what is chosen, and look at the rules."""
+        """Enter the chosen context, and evaluate the rules from now on."""
         self._loop, self._closed = asyncio.get_running_loop(), False
-        await self._runtime.say(TOPIC, "")
+        await self._runtime.advertise_text(TOPIC, "")
         node = self._runtime.node
         if self.chosen and self.chosen not in self._known:
             _log.warning("! %s: there is no context %s any more", node.name, printable(self.chosen))
-            self.chosen = ""
+            self.preset("")
         if not self._known:
             return
-        await node.subscribe(f"{node.name}/set_context", MessageType("std_msgs/String"), self._heard)
+        await node.subscribe(f"{node.name}/set_context", MessageType("std_msgs/String"), self._choice_received)
         if self.chosen:
             try:
                 await self._switch(self.chosen)
             except RmpaError as error:
                 _log.warning("! %s: %s", node.name, error)
-                self.chosen = ""
-        if self._sources:
-            self._do(self._find(), "find topics of rules")
-        if self._chooser.rules:
-            self._look()
+                self.preset("")
+        if self._topic_fields:
+            self._spawn(self._find_topics(), "find topics of rules")
+        if self._selector.rules:
+            self._evaluate(self._loop.time())
+            self._timer.arm()
 
     async def close(self) -> None:
-        """Stay as it is."""
+        """Stay in the present context."""
         self._closed = True
-        for timer in self._timers.values():
-            timer.cancel()
+        self._timer.close()
         for task in self._work:
             task.cancel()
         await asyncio.gather(*self._work, return_exceptions=True)
@@ -143,66 +146,66 @@ class Contexts(RuntimePart):
             near = did_you_mean(name, self._known)
             remedy = f"did you mean {near}?" if near else f"it is one of {', '.join(self._known) or 'none'}"
             raise ConfigError(f"resource {self._runtime.resource.name}", f"no context {name[:80]!r}", remedy)
-        before, self._chooser.chosen = self._chooser.chosen, name
+        before, self._selector.chosen = self._selector.chosen, name
         try:
             if name:
                 await self._switch(name)
         except RmpaError:
-            self._chooser.chosen = before
+            self._selector.chosen = before
             raise
         if not name:
-            self._chooser.since = self._retry = 0.0
-            wanted = self._chooser.choose(self._current, self._values(), self._loop.time())
+            self._selector.since = self._retry = 0.0
+            wanted = self._selector.select(self._current, self._values(), self._loop.time())
             await self._switch(wanted)
-        self._told()
+        self._publish()
 
-    # --- what rules look at -------------------------------------------------------------------------------------
+    # --- values of rules ----------------------------------------------------------------------------------------
 
     def received(self, item: Input, message: Received) -> None:
-        """An input's topic may be a rule's too."""
+        """Take the value of an input whose topic a rule refers to."""
         if item.name in self._taps:
-            self._take(self._taps[item.name], message.kind, message.raw)
+            self._update(self._taps[item.name], message.kind, message.raw)
 
-    def published(self, output: Output, raw: bytes, now_ns: int) -> None:  # noqa: ARG002 - as the others have it
-        """An output's likewise."""
+    def published(self, output: Output, raw: bytes, now_ns: int) -> None:  # noqa: ARG002
+        """Take the value of an output whose topic a rule refers to."""
         if output.name in self._taps:
-            self._take(self._taps[output.name], output.type, raw)
+            self._update(self._taps[output.name], output.type, raw)
 
     def parameter_changed(self, parameter: Parameter) -> None:
-        """A parameter's value may be a rule's."""
+        """Evaluate the rules that refer to the parameter."""
         if parameter.name in self._parameters.values():
-            self._soon()
+            self._evaluate_soon()
 
-    def _take(self, topic: str, kind: MessageType, raw: bytes) -> None:
+    def _update(self, topic: str, kind: MessageType, raw: bytes) -> None:
         self._latest[topic] = kind, raw
-        self._soon()
+        self._evaluate_soon()
 
     def _values(self) -> dict[str, Scalar]:
         parameters = self._runtime.resource.parameters
         found: dict[str, Scalar] = {text: parameters[name].value for text, name in self._parameters.items()}
-        for text, source in self._sources.items():
-            if (subscriber := self._subscribers.get(source.topic)) is not None and not subscriber.publishers:
-                self._latest.pop(source.topic, None)  # nobody says so any more
-            if (latest := self._latest.get(source.topic)) is not None and (value := source.read(*latest)) is not None:
+        for text, item in self._topic_fields.items():
+            if (subscriber := self._subscribers.get(item.topic)) is not None and not subscriber.publishers:
+                self._latest.pop(item.topic, None)  # unknown without a publisher
+            if (latest := self._latest.get(item.topic)) is not None and (value := item.read(*latest)) is not None:
                 found[text] = value
         return found
 
-    async def _find(self) -> None:
-        """Find out which topics rules mean, until all are found."""
+    async def _find_topics(self) -> None:
+        """Find the topics that rules refer to, until all are known."""
         node = self._runtime.node
         delay = limits.CONTEXT_LOOK
-        while missing := [source for source in self._sources.values() if not source.topic]:
+        while missing := [item for item in self._topic_fields.values() if not item.topic]:
             try:
                 published = {topic for topic, _ in await node.get_published_topics()}
-                for source in missing:
-                    if source.find(published):
-                        await self._listen(source.topic)
+                for item in missing:
+                    if item.find(published):
+                        await self._subscribe(item.topic)
             except RmpaError as error:
                 _log.debug("! %s: topics of rules: %s", node.name, error)
             await asyncio.sleep(delay)
             delay = min(2 * delay, limits.CONTEXT_RETRY)
 
-    async def _listen(self, topic: str) -> None:
+    async def _subscribe(self, topic: str) -> None:
         runtime = self._runtime
         own = [
             n
@@ -211,147 +214,133 @@ class Contexts(RuntimePart):
         ]
         self._taps.update(dict.fromkeys(own, topic))
         if own or topic in self._subscribers:
-            return  # it comes to us anyway
+            return  # subscribed already
 
-        def heard(message: Received) -> None:
-            self._take(topic, message.kind, message.raw)
+        def update(message: Received) -> None:
+            self._update(topic, message.kind, message.raw)
 
-        self._subscribers[topic] = await runtime.node.subscribe(topic, callback=heard)
+        self._subscribers[topic] = await runtime.node.subscribe(topic, callback=update)
 
-    # --- deciding -----------------------------------------------------------------------------------------------
+    # --- decision -----------------------------------------------------------------------------------------------
 
-    def _soon(self) -> None:
-        if "soon" not in self._timers and not self._closed:
-            self._timers["soon"] = self._loop.call_later(_SOON, self._now)
+    def _evaluate_soon(self) -> None:
+        if self._next_evaluation is not None:
+            self._next_evaluation = min(self._next_evaluation, self._loop.time() + _DEBOUNCE)
+            self._timer.arm()
 
-    def _now(self) -> None:
-        self._timers.pop("soon", None)
-        self._evaluate()
-
-    def _look(self) -> None:
-        if not self._closed:
-            self._timers["look"] = self._loop.call_later(_LOOK, self._look)
-            self._evaluate()
-
-    def _evaluate(self) -> None:
-        """Begin a switch if the rules want one."""
-        now = self._loop.time()
-        if self._one.locked() or now < self._retry or (self._switching and not self._switching.done()):
+    def _evaluate(self, now: float) -> None:
+        """Begin a switch if the rules select another context."""
+        self._next_evaluation = now + _INTERVAL
+        if self._switch_lock.locked() or now < self._retry or (self._switching and not self._switching.done()):
             return
-        wanted = self._chooser.choose(self._current, self._values(), now)
+        wanted = self._selector.select(self._current, self._values(), now)
         if wanted != self._current:
-            self._switching = self._do(self._by_rule(wanted), "switch context")
+            self._switching = self._spawn(self._switch_by_rule(wanted), "switch context")
 
-    async def _by_rule(self, name: str) -> None:
+    async def _switch_by_rule(self, name: str) -> None:
         try:
             await self._switch(name)
         except RmpaError as error:
             _log.warning("! %s: %s", self._runtime.node.name, error)
             self._retry = self._loop.time() + limits.CONTEXT_RETRY
 
-    def _heard(self, message: Received) -> None:
-        """Somebody chooses a context by the topic."""
-        self._do(self._by_topic(str(message.message.data), message.caller_id), "choose context")
+    def _choice_received(self, message: Received) -> None:
+        self._spawn(self._choose_by_topic(str(message.message.data), message.caller_id), "choose context")
 
-    async def _by_topic(self, name: str, client: str) -> None:
+    async def _choose_by_topic(self, name: str, client: str) -> None:
         try:
             await self.choose(name)
         except RmpaError as error:
             self._adapter.refuse(client, printable(str(error)))
 
-    # --- switching ----------------------------------------------------------------------------------------------
+    # --- switch -------------------------------------------------------------------------------------------------
 
     async def _switch(self, name: str) -> None:
-        """Bring the resource into a context.
+        """Switch to a context.
 
         Raises:
             PeerRefused: Its function failed; the resource stays as it was.
         """
-        async with self._one:
+        async with self._switch_lock:
             if name == self._current or self._closed:
                 return
             runtime, context = self._runtime, self._known.get(name)
-            await self._tasks.pause(_WHO)
-            runtime.hold(_WHO)
+            await self._tasks.pause(_HOLDER)
+            runtime.hold(_HOLDER)
             try:
                 if context is not None:
                     await self._enter(context)
                 outputs = context.outputs if context is not None else None
-                runtime.flowing = frozenset(outputs) if outputs is not None else None
-                self._shift(name, context)
+                runtime.context_outputs = frozenset(outputs) if outputs is not None else None
+                self._apply(name, context)
                 self._current = name
-                self._chooser.since = self._loop.time()
+                self._selector.since = self._loop.time()
                 await self._adapter.settled()
             finally:
-                runtime.release(_WHO)
-                self._tasks.resume(_WHO)
+                runtime.release(_HOLDER)
+                self._tasks.resume(_HOLDER)
             _log.info("= %s: %s", runtime.node.name, f"context {name}" if name else "no context any more")
-        self._told()
+        self._publish()
 
     async def _enter(self, context: Context) -> None:
         """Call a context's function."""
         if context.enter is None:
             return
-        timeout, call = limits.CONTEXT_ENTER_TIMEOUT, Call("context", context.name, self._stopped)
+        timeout = limits.CONTEXT_ENTER_TIMEOUT
+        report = functools.partial(self._runtime.call_in_loop, self._adapter.report_late_action)
+        call = FencedCall("context", context.name, report)
         limit = asyncio.timeout(timeout)
         try:
             async with limit:
                 await call.run(context.enter)
         except Exception as error:
-            call.give_up()  # also where it has raised: a coroutine that it began may go on
+            call.give_up()  # also after an error: a coroutine that it has started may still run
             why = f"{type(error).__name__}: {error}"
             if isinstance(error, TimeoutError) and limit.expired():
                 why = f"its function has not ended after {timeout:g} s"
             raise PeerRefused(f"context {context.name}", why) from error
 
-    def _stopped(self, call: Call, what: str) -> None:
-        """A function that was given up wanted to do something; called in any thread."""
-        if what not in call.said:
-            call.said.add(what)
-            text = f"the function of context {call.name} was given up; it has no effect: {what}"
-            self._runtime.call_in_loop(self._adapter.late, call.name, text)
-
-    def _shift(self, name: str, context: Context | None) -> None:
+    def _apply(self, name: str, context: Context | None) -> None:
         resource = self._runtime.resource
         if context is None:
-            self._adapter.shift("", {}, {})
+            self._adapter.enter_context("", {}, {})
             return
         attributes = resource.attributes
-        bounds = {key: wish.bound(attributes[key]) for key, wish in context.requires.items()}
-        bars = {
+        bounds = {key: request.bound(attributes[key]) for key, request in context.requires.items()}
+        blocked = {
             p: f"not in context {name}" for p in resource.profiles if context.profiles and p not in context.profiles
         }
-        self._adapter.shift(name, bounds, bars)
+        self._adapter.enter_context(name, bounds, blocked)
 
-    def _told(self) -> None:
+    def _publish(self) -> None:
         if not self._closed:
-            self._runtime.say_again(TOPIC, self._current)
-            for listener in self.listeners:
-                listener()
+            self._runtime.publish_text(TOPIC, self._current)
+            for part in self._runtime.parts:
+                part.context_changed()
 
-    def _do(self, work: Coroutine[Any, Any, None], name: str) -> asyncio.Task[None]:
+    def _spawn(self, work: Coroutine[Any, Any, None], name: str) -> asyncio.Task[None]:
         task = self._loop.create_task(work, name=name)
         self._work.add(task)
         task.add_done_callback(self._work.discard)
         return task
 
 
-class _Source:
-    """Where a field of a topic comes from."""
+class _TopicField:
+    """A field of a topic that rules refer to."""
 
     def __init__(self, reference: Reference) -> None:
         self._reference = reference
         self._fields: tuple[str, ...] = ()
         self._raw: bytes | None = None
         self._value: Scalar | None = None
-        """Of the message that was read last: rules are looked at more often than some topics speak."""
+        """Of the last message, which may serve several evaluations."""
         self.topic = ""
-        """Empty until it is found."""
+        """Empty until it is known."""
         self.problem = ""
         """Why the topic's messages have no such value, or empty."""
 
     def find(self, published: set[str]) -> bool:
-        """See which topic is meant."""
+        """Find the topic among the published ones."""
         for topic, fields in self._reference.candidates():
             if topic in published:
                 self.topic, self._fields = topic, fields
@@ -359,7 +348,7 @@ class _Source:
         return False
 
     def read(self, kind: MessageType, raw: bytes) -> Scalar | None:
-        """The field of a message; ``None`` if it has none that a rule can look at."""
+        """The field of a message; ``None`` if it does not exist or is no scalar."""
         if raw is not self._raw:
             self._raw, self._value = raw, self._read(kind, raw)
         return self._value
@@ -374,17 +363,17 @@ class _Source:
                 value = getattr(value, name)
         except AttributeError:
             has = ", ".join(field.name for field in kind.fields)
-            return self._without(f"{kind.name} has no {'.'.join(fields)}; it has {has}")
+            return self._fail(f"{kind.name} has no {'.'.join(fields)}; it has {has}")
         except RmpaError as error:
-            return self._without(str(error))
+            return self._fail(str(error))
         if hasattr(value, "nanosec"):
             return float(value.sec + value.nanosec / 1e9)
         if isinstance(value, bool | int | float | str):
             self.problem = ""
             return value
-        return self._without("it is no number, text or truth; name a field of it")
+        return self._fail("it is no number, text or truth; name a field of it")
 
-    def _without(self, why: str) -> Scalar | None:
+    def _fail(self, why: str) -> Scalar | None:
         problem = f"{self._reference.text}: {why}"
         if problem != self.problem:
             _log.warning("! rule over %s", problem)

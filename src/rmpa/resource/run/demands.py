@@ -1,9 +1,10 @@
-"""Carries what a resource asks of others, and hears what they say to it."""
+"""The requirements of a resource on other resources: requests, answers, and reports of the observed quality."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import logging
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +17,10 @@ from rmpa.ros.types.messages import MessageType
 from rmpa.ros.wire.tcpros import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
     from rmpa.resource.declare.attributes import Value
-    from rmpa.resource.declare.resource import Demand
+    from rmpa.resource.declare.connections import Demand
     from rmpa.resource.run.runtime import Runtime
     from rmpa.ros.node.topics import Received, Subscriber
 
@@ -27,7 +28,7 @@ _log = logging.getLogger(__name__)
 
 
 class Demands(RuntimePart):
-    """All that one resource asks.
+    """All requirements of one resource on others.
 
     Args:
         runtime: Of the resource.
@@ -37,84 +38,78 @@ class Demands(RuntimePart):
         self._runtime = runtime
         self._clients: dict[str, ResourceClient] = {}
         self._first: dict[str, str] = {}
-        """By resource that something is heard from: its first output."""
+        """The first output of each resource whose descriptor has been received."""
         self._undo = contextlib.AsyncExitStack()
-        self.listening: dict[str, Subscriber] = {}
-        """By topic: the descriptors that are listened to here."""
-        self.on_descriptor: list[Callable[[str, Received], None]] = []
-        """Called with what such a resource says: its name, and the message."""
+        self.descriptors: dict[str, Subscriber] = {}
+        """Subscriptions to descriptors, by topic."""
 
     async def start(self) -> None:
-        """Ask."""
+        """Send the requests."""
         async with contextlib.AsyncExitStack() as undo:
             for demand in self._runtime.resource.demands.values():
                 client = await undo.enter_async_context(ResourceClient(self._runtime.node, demand.resource))
                 self._clients[demand.resource] = client
-                demand.asker = self
-                undo.callback(setattr, demand, "asker", None)
+                demand.on_change = functools.partial(self._runtime.call_in_loop, self._request)
+                undo.callback(setattr, demand, "on_change", None)
                 following = asyncio.get_running_loop().create_task(
                     self._follow(demand, client), name=f"follow {demand.resource}"
                 )
                 undo.push_async_callback(_ended, following)
-                if demand.wishes:
-                    self._ask(demand)
+                if demand.requests:
+                    self._request(demand)
                 if any(name.startswith(f"{demand.resource}/") for name in self._runtime.resource.inputs):
-                    await self._watch(demand.resource, client)
+                    await self._observe(demand.resource, client)
             self._undo = undo.pop_all()
 
     async def close(self) -> None:
-        """Ask for nothing any more."""
+        """Release all requirements."""
         await self._undo.aclose()
         self._clients.clear()
 
-    def asked(self, demand: Demand) -> None:
-        """It asks for something else; called in any thread."""
-        self._runtime.call_in_loop(self._ask, demand)
-
-    def troubles(self) -> tuple[list[str], list[str]]:
-        """Who is not there, and who does not give what was asked; each ready to read."""
+    def problems(self) -> tuple[list[str], list[str]]:
+        """Texts: resources that are not connected, and those that do not serve the requirement."""
         missing, short = [], []
         for name, client in self._clients.items():
             demand = self._runtime.resource.demands[name]
-            if not demand.wishes:
+            if not demand.requests:
                 continue
-            if not client.there:
+            if not client.connected:
                 missing.append(f"there is no resource {name}")
             elif client.answer is not None and client.answer.level is not DiagnosticLevel.OK:
                 short.append(f"{name}: {printable(client.answer.message)}")
         return missing, short
 
-    def window(self, _level: DiagnosticLevel, _message: str, measured: Mapping[str, Value]) -> None:
-        """Tell those that are asked what arrives here of what they send, as far as it is asked for."""
+    def window_ended(self, level: DiagnosticLevel, message: str, measured: Mapping[str, Value]) -> None:  # noqa: ARG002
+        """Report the requested attributes of inputs to the resources that send them."""
         resource = self._runtime.resource
         labels = resource.labels
         for name, client in self._clients.items():
             found: dict[str, Any] = {}
-            for wish in resource.demands[name].wishes if name in self._first else ():
-                output, _, attribute = wish.replace("__", ".").rpartition(".")
+            for request in resource.demands[name].requests if name in self._first else ():
+                output, _, attribute = request.replace("__", ".").rpartition(".")
                 item = f"{name}/{output or self._first[name]}"
                 value = measured.get(f"{labels[item]}.{attribute}") if item in resource.inputs else None
                 if value is not None:
-                    found[wish] = value
-            if found and client.there:
+                    found[request] = value
+            if found and client.connected:
                 client.report(**found)
 
     # --- inside -------------------------------------------------------------------------------------------------
 
-    def _ask(self, demand: Demand) -> None:
+    def _request(self, demand: Demand) -> None:
         client = self._clients.get(demand.resource)
         if client is not None:
             demand.answer = None
-            wishes: dict[str, Any] = dict(demand.wishes)
-            client.ask(priority=demand.priority if wishes else 0, **wishes)
-            self._runtime.describe_again()
+            requests: dict[str, Any] = dict(demand.requests)
+            client.ask(priority=demand.priority if requests else 0, **requests)
+            self._runtime.publish_descriptor()
 
-    async def _watch(self, name: str, client: ResourceClient) -> None:
-        """Learn which of its outputs is the first: ``rate`` alone is that one's."""
+    async def _observe(self, name: str, client: ResourceClient) -> None:
+        """Begin to report to a resource; its descriptor tells its first output, to which ``rate`` alone refers."""
 
-        def heard(received: Received) -> None:
-            for hear in self.on_descriptor:
-                hear(name, received)
+        def descriptor_received(received: Received) -> None:
+            for part in self._runtime.parts:
+                part.descriptor_received(name, received)
             try:
                 outputs = Descriptor.parse(str(received.message.data)).outputs
             except RmpaError as error:
@@ -124,13 +119,15 @@ class Demands(RuntimePart):
 
         await client.observe()
         topic = f"{name}/{TOPIC}"
-        self.listening[topic] = await self._runtime.node.subscribe(topic, MessageType("std_msgs/String"), heard)
+        self.descriptors[topic] = await self._runtime.node.subscribe(
+            topic, MessageType("std_msgs/String"), descriptor_received
+        )
 
     async def _follow(self, demand: Demand, client: ResourceClient) -> None:
-        said: tuple[DiagnosticLevel, str] | None = None
+        last: tuple[DiagnosticLevel, str] | None = None
         async for answer in client.answers():
             demand.answer = answer
-            if said != (said := (answer.level, answer.message)):
+            if last != (last := (answer.level, answer.message)):
                 level = logging.INFO if answer.level is DiagnosticLevel.OK else logging.WARNING
                 mark = "=" if answer.level is DiagnosticLevel.OK else "!"
                 name = self._runtime.node.name

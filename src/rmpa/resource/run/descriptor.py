@@ -1,11 +1,12 @@
-"""A resource's descriptor: its metadata as one JSON text, on the latched topic ``<resource>/descriptor``.
+"""The descriptor of a resource: its metadata as JSON on the latched topic ``<resource>/descriptor``.
 
-It crosses the mesh as any topic does, so every module can see what every resource offers and needs.
+It crosses the mesh like any topic, so every module sees what each resource offers and needs. The names of the fields
+are part of the wire format.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import msgspec
 
@@ -15,11 +16,13 @@ from rmpa.resource import limits
 
 if TYPE_CHECKING:
     from rmpa.resource.declare.attributes import Attribute
-    from rmpa.resource.declare.resource import Input, Output, Resource
+    from rmpa.resource.declare.connections import Input, Output
+    from rmpa.resource.declare.resource import Resource
 
 VERSION: Final = 1
 TOPIC: Final = "descriptor"
 _DEFAULT: Final = Contract()
+_Kind = TypeVar("_Kind", bound=msgspec.Struct)
 
 
 class TopicDescriptor(msgspec.Struct, frozen=True, kw_only=True):
@@ -29,7 +32,7 @@ class TopicDescriptor(msgspec.Struct, frozen=True, kw_only=True):
         name: As declared.
         topic: Its global name in the module.
         type: Message type.
-        contract: What is not the default, by key.
+        contract: The values that differ from the default, by key.
         required: Inputs only: whether the resource is stale without it.
     """
 
@@ -41,7 +44,7 @@ class TopicDescriptor(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ParameterDescriptor(msgspec.Struct, frozen=True, kw_only=True):
-    """A parameter; ``type`` is dynamic_reconfigure's word."""
+    """A parameter; ``type`` is dynamic_reconfigure's name of it."""
 
     name: str
     type: str
@@ -54,7 +57,7 @@ class ParameterDescriptor(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AttributeDescriptor(msgspec.Struct, frozen=True, kw_only=True):
-    """A quality that can be asked for."""
+    """A quality attribute that clients may request."""
 
     name: str
     better: str
@@ -76,7 +79,7 @@ class ProfileDescriptor(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ContextDescriptor(msgspec.Struct, frozen=True, kw_only=True):
-    """A context; an empty ``profiles`` allows any, ``outputs`` that is ``None`` lets all flow."""
+    """A context; empty ``profiles`` allow any, ``outputs`` of ``None`` publish all."""
 
     name: str
     when: str = ""
@@ -86,7 +89,7 @@ class ContextDescriptor(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TaskDescriptor(msgspec.Struct, frozen=True, kw_only=True):
-    """A task: periodic at a rate in Hz, which may follow a parameter, or on an input."""
+    """A task: periodic at ``rate`` Hz, perhaps the value of the parameter ``follows``, or on an input."""
 
     name: str
     rate: float | None = None
@@ -95,11 +98,11 @@ class TaskDescriptor(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class DemandDescriptor(msgspec.Struct, frozen=True, kw_only=True):
-    """What it asks of another resource at present.
+    """The present requirement on another resource.
 
     Attributes:
-        resource: The other one's node, as this resource's module has it.
-        wishes: By the other one's attribute, as a requirement says it: ``>= 20 Hz hard``; empty: nothing.
+        resource: The other resource's node in this module's graph.
+        wishes: Requests as texts (``>= 20 Hz hard``) by attribute of the other resource.
         priority: The higher one wins a conflict between clients.
     """
 
@@ -112,13 +115,13 @@ class Descriptor(msgspec.Struct, frozen=True, kw_only=True):
     """A whole resource.
 
     Attributes:
-        version: Of this form.
+        version: Of this format.
         name: Its node's base name.
         node: Its node's global name, in its own module.
         role: ``sensing``, ``acting`` or ``controlling``.
         physical: Whether there is a device; else it is simulated.
         description: For people.
-        outputs: In order of declaration, as everything else.
+        outputs: In order of declaration, as all others.
     """
 
     version: int = VERSION
@@ -142,11 +145,11 @@ class Descriptor(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def parse(cls, text: str | bytes) -> Descriptor:
-        """Read what a resource says of itself.
+        """Read the descriptor of a resource.
 
         Raises:
             LimitExceeded: It is longer than ``limits.DESCRIPTOR_MAX``.
-            RemoteProtocolError: It is no descriptor of this version.
+            RemoteProtocolError: It is not a descriptor of this version.
         """
         if len(text) > limits.DESCRIPTOR_MAX:
             raise LimitExceeded("descriptor of a resource", len(text), limits.DESCRIPTOR_MAX)
@@ -160,7 +163,7 @@ class Descriptor(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def describe(resource: Resource, node: str) -> Descriptor:
-    """What a declared resource says of itself.
+    """Make the descriptor of a declared resource.
 
     Args:
         resource: Declared completely.
@@ -174,35 +177,14 @@ def describe(resource: Resource, node: str) -> Descriptor:
         description=resource.description,
         outputs=tuple(_topic(output, node) for output in resource.outputs.values()),
         inputs=tuple(_topic(item, node, required=item.required) for item in resource.inputs.values()),
-        parameters=tuple(
-            ParameterDescriptor(
-                name=p.name,
-                type=p.type,
-                default=p.default,
-                low=p.low,
-                high=p.high,
-                choices=p.choices,
-                unit=p.unit,
-                description=p.description,
-            )
-            for p in resource.parameters.values()
-        ),
+        parameters=tuple(_convert(p, ParameterDescriptor) for p in resource.parameters.values()),
         attributes=tuple(_attribute(name, attribute) for name, attribute in resource.attributes.items()),
-        profiles=tuple(
-            ProfileDescriptor(
-                name=p.name,
-                offers=dict(p.offers),
-                cost=p.cost,
-                best_effort=p.best_effort,
-                description=p.description,
-            )
-            for p in (declared.profile for declared in resource.profiles.values())
-        ),
+        profiles=tuple(_convert(p.profile, ProfileDescriptor) for p in resource.profiles.values()),
         contexts=tuple(
             ContextDescriptor(
                 name=c.name,
                 when=c.when,
-                requires={key: str(wish) for key, wish in c.requires.items()},
+                requires={key: str(request) for key, request in c.requires.items()},
                 profiles=c.profiles,
                 outputs=c.outputs,
             )
@@ -213,14 +195,14 @@ def describe(resource: Resource, node: str) -> Descriptor:
                 name=t.name,
                 rate=t.rate,
                 on=t.on.name if t.on is not None else "",
-                follows=t.follows.name if t.follows is not None else "",
+                follows=t.rate_parameter.name if t.rate_parameter is not None else "",
             )
             for t in resource.tasks.values()
         ),
         asks=tuple(
             DemandDescriptor(
                 resource=d.resource,
-                wishes={key.replace("__", "."): str(wish) for key, wish in d.wishes.items()},
+                wishes={key.replace("__", "."): str(request) for key, request in d.requests.items()},
                 priority=d.priority,
             )
             for d in resource.demands.values()
@@ -228,14 +210,19 @@ def describe(resource: Resource, node: str) -> Descriptor:
     )
 
 
+def _convert(declared: object, kind: type[_Kind]) -> _Kind:
+    """A descriptor from the attributes of a declaration that have the same names."""
+    return msgspec.convert(declared, kind, from_attributes=True)
+
+
 def topic_of(name: str, node: str) -> str:
-    """The global name of an output or input: relative ones lie in the resource's own namespace."""
+    """The global name of an output or input; relative names are in the resource's own namespace."""
     return name if name.startswith("/") else f"{node}/{name}"
 
 
 def _topic(topic: Output | Input, node: str, *, required: bool = True) -> TopicDescriptor:
-    said = {key: getattr(topic.contract, key) for key in KEYS}
-    contract = {key: value for key, value in said.items() if value != getattr(_DEFAULT, key)}
+    values = {key: getattr(topic.contract, key) for key in KEYS}
+    contract = {key: value for key, value in values.items() if value != getattr(_DEFAULT, key)}
     return TopicDescriptor(
         name=topic.name, topic=topic_of(topic.name, node), type=topic.kind.name, contract=contract, required=required
     )

@@ -1,7 +1,7 @@
-"""A resource's configuration as dynamic_reconfigure has it (wiki.ros.org/dynamic_reconfigure), for its tools to work.
+"""Converts a resource's configuration to dynamic_reconfigure's messages and back (wiki.ros.org/dynamic_reconfigure).
 
-Pure: parameters in, plain values of ``dynamic_reconfigure/Config`` and ``ConfigDescription`` out, and back. As its
-servers do, a number out of range is clipped; everything else that cannot be is refused, and nothing is changed then.
+Pure: parameters in, plain values of ``dynamic_reconfigure/Config`` and ``ConfigDescription`` out, and back. As in its
+servers, a number out of range is clipped; any other invalid value is refused, and nothing is changed then.
 
 Two parameters are not declared by the user: ``profile`` (empty: the resource decides) and, where there are contexts,
 ``context`` (empty: the rules decide).
@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rmpa.config.values import did_you_mean
 from rmpa.core.errors import ConfigError
-from rmpa.resource.declare.resource import INT_MAX, INT_MIN, Parameter
+from rmpa.resource.declare.parameters import INT_MAX, INT_MIN, Parameter
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from rmpa.resource.declare.resource import ParameterValue, Resource
+    from rmpa.resource.declare.parameters import ParameterValue
+    from rmpa.resource.declare.resource import Resource
     from rmpa.ros.types.messages import Plain
 
 CONFIG_TYPE: Final = "dynamic_reconfigure/Config"
@@ -29,7 +30,7 @@ SERVICE_TYPE: Final = "dynamic_reconfigure/Reconfigure"
 PROFILE: Final = "profile"
 CONTEXT: Final = "context"
 AUTOMATIC: Final = "automatic"
-"""How an empty ``profile`` or ``context`` is called in lists to choose from."""
+"""The name of an empty ``profile`` or ``context`` in enumerations."""
 _LISTS: Final = {"bool": "bools", "int": "ints", "str": "strs", "double": "doubles"}
 _GROUP: Final[dict[str, Plain]] = {"name": "Default", "id": 0, "parent": 0}
 """All parameters are in the one group that every server has."""
@@ -37,7 +38,7 @@ _GROUP: Final[dict[str, Plain]] = {"name": "Default", "id": 0, "parent": 0}
 
 @dataclass(frozen=True, slots=True)
 class EnumChoice:
-    """One value that a parameter may have, with its name in lists."""
+    """One value of an enumeration, with its name."""
 
     name: str
     value: ParameterValue
@@ -46,16 +47,16 @@ class EnumChoice:
 
 @dataclass(frozen=True, slots=True)
 class ReconfigureEntry:
-    """One parameter as tools see it.
+    """One parameter as dynamic_reconfigure's tools see it.
 
     Args:
         name: A ROS base name.
         kind: ``bool``, ``int``, ``double`` or ``str``.
         default: Its default value.
-        low: The least value of a number; infinite or the least of 32 bits for none.
+        low: The least value of a number; without a bound infinite, or the least of 32 bits.
         high: The greatest.
         description: For people, with the unit.
-        choices: The only values, if there are only some.
+        choices: The values of an enumeration, else empty.
     """
 
     name: str
@@ -68,7 +69,7 @@ class ReconfigureEntry:
 
 
 def entries(resource: Resource) -> dict[str, ReconfigureEntry]:
-    """All parameters of a resource, the declared ones in order, then ``profile`` and ``context``."""
+    """All parameters of a resource: the declared ones in order, then ``profile`` and ``context``."""
     found = {name: _entry(parameter) for name, parameter in resource.parameters.items()}
     profiles = [EnumChoice(p.profile.name, p.profile.name, p.profile.description) for p in resource.profiles.values()]
     found[PROFILE] = _pseudo(PROFILE, "the profile to run; empty: the resource decides", profiles)
@@ -101,7 +102,7 @@ def config(values: Mapping[str, ParameterValue], known: Mapping[str, Reconfigure
 
     Args:
         values: By parameter.
-        known: What they are.
+        known: The entries of the parameters.
     """
     made: dict[str, Any] = {key: [] for key in _LISTS.values()}
     for name, value in values.items():
@@ -138,12 +139,12 @@ def _bound(entry: ReconfigureEntry, *, low: bool) -> ParameterValue:
     value = entry.low if low else entry.high
     if entry.kind == "double":
         return float(value)
-    # Within the bound, whatever stands behind its point.
+    # The nearest whole number within the bound.
     return max(INT_MIN, min(INT_MAX, math.ceil(value) if low else math.floor(value)))
 
 
 def _edit_method(entry: ReconfigureEntry) -> str:
-    """What to choose from: the clients evaluate it as a Python expression, so it is made of ``repr`` alone."""
+    """The enumeration; clients evaluate it as a Python expression, so it consists of ``repr`` alone."""
     if not entry.choices:
         return ""
     enum = [
@@ -163,10 +164,10 @@ def _edit_method(entry: ReconfigureEntry) -> str:
 
 
 def read_config(message: Any) -> dict[str, ParameterValue]:
-    """What a ``Config`` says, by parameter; groups are not looked at, there is but one.
+    """The values of a ``Config`` message by parameter; groups are ignored, since there is only one.
 
     Raises:
-        ConfigError: A parameter is in it twice.
+        ConfigError: A duplicate parameter.
     """
     found: dict[str, ParameterValue] = {}
     kinds = {"bools": bool, "ints": int, "strs": str, "doubles": float}
@@ -182,10 +183,10 @@ def read_config(message: Any) -> dict[str, ParameterValue]:
 def checked(
     values: Mapping[str, ParameterValue], known: Mapping[str, ReconfigureEntry], parameters: Mapping[str, Parameter]
 ) -> dict[str, ParameterValue]:
-    """What parameters become when a client asks for values.
+    """Check and clip the values that a client sets.
 
     Raises:
-        ConfigError: The first thing that cannot be; nothing is changed then.
+        ConfigError: The first invalid value.
     """
     return {name: _checked(name, value, known, parameters) for name, value in values.items()}
 
@@ -206,7 +207,7 @@ def _checked(
 
 
 def choose(value: str, entry: ReconfigureEntry) -> str:
-    """The value of ``profile`` or ``context`` by its value or name.
+    """Find a ``profile`` or ``context`` by its value or name.
 
     Raises:
         ConfigError: There is none.
@@ -226,7 +227,7 @@ def _named(entry: ReconfigureEntry) -> str:
 def _clipped(value: ParameterValue, entry: ReconfigureEntry) -> ParameterValue:
     if isinstance(value, bool | str) or entry.kind not in ("int", "double") or entry.choices:
         return value
-    # With the bounds' own type: a float bound of a whole number is not one of its values.
+    # The bounds have the parameter's type: a float is not a value of an int parameter.
     low, high = _bound(entry, low=True), _bound(entry, low=False)
     if value < float(low):
         return low
@@ -236,11 +237,11 @@ def _clipped(value: ParameterValue, entry: ReconfigureEntry) -> ParameterValue:
 def from_server(
     found: Mapping[str, Any], known: Mapping[str, ReconfigureEntry], parameters: Mapping[str, Parameter]
 ) -> tuple[dict[str, ParameterValue], list[str]]:
-    """What the parameter server holds for a resource that starts, and what of it cannot be.
+    """The valid values of the parameter server at the start of a resource, and errors about the others.
 
     Args:
-        found: The members of the resource's namespace; others than parameters are none of its business.
-        known: What the parameters are.
+        found: The members of the resource's namespace; those that are not parameters are ignored.
+        known: The entries of the parameters.
         parameters: The declared ones.
     """
     taken: dict[str, ParameterValue] = {}

@@ -1,4 +1,4 @@
-"""Calls a function of the user's that may hang, within a fence that is closed when it is given up."""
+"""Calls of user functions that may hang, inside a fence that is closed when the call is given up."""
 
 from __future__ import annotations
 
@@ -9,36 +9,36 @@ import threading
 from typing import TYPE_CHECKING
 
 from rmpa.core.errors import LocalProtocolError
-from rmpa.resource.declare.fence import within
+from rmpa.resource.declare.fence import inside
 from rmpa.runtime.threads import in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rmpa.resource.declare.resource import Hook
+    from rmpa.resource.declare.behaviour import Hook
 
 
-class Call:
+class FencedCall:
     """One call of a function that applies a profile, or that enters a context.
 
     Args:
-        who: ``profile`` or ``context``.
-        name: Which one.
-        on_stopped: ``(call, what)``: it wanted to do something after it was given up; called in any thread.
+        kind: ``profile`` or ``context``.
+        name: Its name.
+        on_late_action: ``(name, text)``: called in any thread, once for each kind of action that the function
+            attempts after the call was given up.
     """
 
-    def __init__(self, who: str, name: str, on_stopped: Callable[[Call, str], None]) -> None:
-        self.who = who
+    def __init__(self, kind: str, name: str, on_late_action: Callable[[str, str], None]) -> None:
+        self.kind = kind
         self.name = name
         self.began = 0.0
-        """When the function was called, by the loop's clock; 0: not yet."""
+        """When the function was called, seconds of the loop's clock; 0: not yet."""
         self.in_thread = False
-        """Whether it is in a thread now, where nothing can end it from outside."""
-        self.said: set[str] = set()
-        """What it did without effect."""
-        self._on_stopped = on_stopped
+        """Whether it runs in a thread now, which cannot be stopped from outside."""
+        self._reported: set[str] = set()
+        self._on_late_action = on_late_action
         self._closed = False
-        # Whoever closes it waits until what is under way has happened: one parameter is set, one message handed on.
+        # Giving up waits for the action under way: one parameter is set, one message handed on.
         self._lock = threading.RLock()
 
     @property
@@ -47,38 +47,41 @@ class Call:
         return self._closed
 
     def give_up(self) -> None:
-        """Nothing that it does from now on has an effect."""
+        """Close the fence: later actions of the function have no effect."""
         with self._lock:
             self._closed = True
 
     @contextlib.contextmanager
-    def passage(self, what: str) -> Iterator[None]:
+    def action(self, what: str) -> Iterator[None]:
         """See ``rmpa.resource.declare.fence.Fence``."""
         with self._lock:
             if not self._closed:
                 yield
                 return
-        self.stopped(what)
-        raise LocalProtocolError(f"{what}: {self.who} {self.name} was given up meanwhile; it has no effect any more")
+        self.report_blocked(what)
+        raise LocalProtocolError(f"{what}: {self.kind} {self.name} was given up meanwhile; it has no effect any more")
 
-    def stopped(self, what: str) -> None:
-        """Report something that came too late."""
-        self._on_stopped(self, what)
+    def report_blocked(self, what: str) -> None:
+        """Report an action that came too late."""
+        if what not in self._reported:
+            self._reported.add(what)
+            text = f"the function of {self.kind} {self.name} was given up; it has no effect: {what}"
+            self._on_late_action(self.name, text)
 
     async def run(self, function: Hook) -> None:
-        """Call the function: a coroutine function here, a plain one in a thread of its own.
+        """Call the function: a coroutine function in the event loop, a plain one in a thread of its own.
 
         Raises:
-            Exception: What the function raises.
+            Exception: As raised by the function.
         """
         self.began = asyncio.get_running_loop().time()
-        with within(self):
+        with inside(self):
             if inspect.iscoroutinefunction(function):
                 await function()
                 return
             self.in_thread = True
             try:
-                outcome = await in_thread(function, f"{self.who} {self.name}")
+                outcome = await in_thread(function, f"{self.kind} {self.name}")
             finally:
                 self.in_thread = False
             if outcome is not None:

@@ -1,4 +1,4 @@
-"""What a resource remembers: takes it from its store at the start, and tells the store what changes."""
+"""Keeps the state and the history of a resource in its store, and restores the state at the start."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 import msgspec
 
-from rmpa.resource.decide.adaptation import Action, AlarmKind, Apply, Clear, Raise, Reacted
-from rmpa.resource.decide.reports import told
+from rmpa.resource.decide.actions import Action, Apply, Clear, Raise, Reacted
+from rmpa.resource.decide.reports import ALARM_LEVELS, describe_alarm
 from rmpa.resource.decide.saved_state import (
     CHOSEN,
     CONTEXT,
@@ -19,7 +19,8 @@ from rmpa.resource.decide.saved_state import (
     REQUIREMENT,
     SavedCoolDown,
     SavedRequirement,
-    recall,
+    SavedState,
+    read_saved_state,
 )
 from rmpa.resource.run.runtime import RuntimePart
 from rmpa.ros.types.diagnostic_array import DiagnosticLevel
@@ -27,10 +28,10 @@ from rmpa.ros.types.diagnostic_array import DiagnosticLevel
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.resource.decide.adaptation import Alarm
+    from rmpa.resource.decide.actions import Alarm
     from rmpa.resource.decide.saved_state import Key
     from rmpa.resource.declare.attributes import Value
-    from rmpa.resource.declare.resource import Parameter
+    from rmpa.resource.declare.parameters import Parameter
     from rmpa.resource.run.adapter import Adapter
     from rmpa.resource.run.contexts import Contexts
     from rmpa.resource.run.runtime import Runtime
@@ -42,12 +43,12 @@ _Row = TypeVar("_Row", SavedRequirement, SavedCoolDown)
 
 
 class Persistence(RuntimePart):
-    """The memory of one resource.
+    """The persistence of one resource.
 
     Args:
         runtime: Of the resource.
-        adapter: Takes what clients asked before, and tells what changes.
-        contexts: Take the one that was chosen by hand.
+        adapter: Its state is kept.
+        contexts: Likewise.
         store: Not yet open; closed with the resource.
     """
 
@@ -56,127 +57,122 @@ class Persistence(RuntimePart):
         self._adapter = adapter
         self._contexts = contexts
         self._store = store
-        self._said: dict[Key, str] = {}
+        self._stored: dict[Key, str] = {}
 
     @property
     def problem(self) -> str:
-        """Why nothing is kept at present, or empty."""
+        """Why nothing can be stored at present, or empty."""
         return f"nothing is kept: {self._store.problem}" if self._store.problem else ""
 
-    async def recall(self) -> None:
-        """Take what was before, to be called before the node is registered and any other part starts."""
+    async def restore(self) -> SavedState:
+        """Open the store, restore the parameters and return the rest; called before the other parts start."""
         rows = await self._store.open()
         resource = self._runtime.resource
-        found = recall(rows, resource, time.time_ns())
+        found = read_saved_state(rows, resource, time.time_ns())
         for lost in found.lost:
             _log.warning("! %s: not remembered: %s", self._runtime.node.name, lost)
         for name, value in found.parameters.items():
             parameter = resource.parameters[name]
             if not parameter.given:
                 parameter.value = value
-        self._adapter.recalled = found
-        self._adapter.chosen = found.chosen
-        self._contexts.chosen = found.context
-        self._said = dict(rows)
-        if found.parameters or found.chosen or found.asked:
+        self._stored = dict(rows)
+        if found.parameters or found.chosen or found.requirements:
             chosen = f", profile {found.chosen} chosen by hand" if found.chosen else ""
             _log.info(
                 "= %s: remembered: %d parameters, %d clients%s",
                 self._runtime.node.name,
                 len(found.parameters),
-                len(found.asked),
+                len(found.requirements),
                 chosen,
             )
-
-        self._adapter.listeners.append(self._acted)
-        self._adapter.on_window.append(self._window)
-        self._adapter.on_asked.append(self._asked)
-        self._adapter.on_missing.append(self._missing)
-        self._adapter.on_late.append(lambda text: self._event("late", DiagnosticLevel.WARN, text, {}))
-        self._contexts.listeners.append(self._asked)
+        return found
 
     async def start(self) -> None:
-        """Remember what there is now."""
+        """Store the descriptor and the present state."""
         descriptor = self._runtime.descriptor
         self._store.descriptor(descriptor.node, descriptor.serialize(), time.time_ns())
         for name, parameter in self._runtime.resource.parameters.items():
             if parameter.value != parameter.default:
                 self._put((PARAMETER, name), _json(parameter.value))
-        self._asked()
+        self.requirements_changed()
 
     async def close(self) -> None:
-        """Write what is not written yet."""
+        """Write everything and close the store."""
         await self._store.close()
 
     def parameter_changed(self, parameter: Parameter) -> None:
-        """Remember it."""
+        """Store a parameter."""
         self._put((PARAMETER, parameter.name), _json(parameter.value))
 
     # --- inside -------------------------------------------------------------------------------------------------
 
     def _put(self, key: Key, value: str | None) -> None:
         if value is None:
-            if self._said.pop(key, None) is not None:
+            if self._stored.pop(key, None) is not None:
                 self._store.put(key, None)
-        elif self._said.get(key) != value:
-            self._said[key] = value
+        elif self._stored.get(key) != value:
+            self._stored[key] = value
             self._store.put(key, value)
 
-    def _asked(self) -> None:
-        """Something that was asked, or chosen by hand, may be another."""
+    def requirements_changed(self) -> None:
+        """Store the requirements, cool-downs and choices by hand that have changed."""
         now_ns = time.time_ns()
-        asked = {one.client: one for one in self._adapter.asked(now_ns)}
-        for client, one in asked.items():
+        requirements = {one.client: one for one in self._adapter.saved_requirements(now_ns)}
+        for client, one in requirements.items():
             key = (REQUIREMENT, client)
-            before = self._said.get(key)
-            if before is None or not _same(before, one):
+            before = self._stored.get(key)
+            if before is None or not _same_requirement(before, one):
                 self._put(key, one.serialize())
-        for kind, name in [key for key in self._said if key[0] == REQUIREMENT and key[1] not in asked]:
+        for kind, name in [key for key in self._stored if key[0] == REQUIREMENT and key[1] not in requirements]:
             self._put((kind, name), None)
-        self._cooling(now_ns)
+        self._store_cool_downs(now_ns)
         loop = self._adapter.loop
         self._put(CHOSEN, _json(loop.pinned))
         self._put(CONTEXT, _json(self._contexts.chosen))
         if loop.profile:
             self._put(LAST, _json(loop.profile))
 
-    def _cooling(self, now_ns: int) -> None:
-        """Profiles may be left out, or no longer."""
-        cooling = self._adapter.cooling(now_ns)
-        for name, one in cooling.items():
+    def context_changed(self) -> None:
+        """Store the context that was chosen by hand."""
+        self.requirements_changed()
+
+    def _store_cool_downs(self, now_ns: int) -> None:
+        cool_downs = self._adapter.saved_cool_downs(now_ns)
+        for name, one in cool_downs.items():
             key = (COOL_DOWN, name)
-            known = _decoded(self._said.get(key), SavedCoolDown)
-            if known is None or not _alike(known, one):
+            known = _decoded(self._stored.get(key), SavedCoolDown)
+            if known is None or not _same_cool_down(known, one):
                 self._put(key, one.serialize())
-        for key in [key for key in self._said if key[0] == COOL_DOWN and key[1] not in cooling]:
+        for key in [key for key in self._stored if key[0] == COOL_DOWN and key[1] not in cool_downs]:
             self._put(key, None)
 
-    def _window(self, level: DiagnosticLevel, message: str, measured: Mapping[str, Value]) -> None:
+    def window_ended(self, level: DiagnosticLevel, message: str, measured: Mapping[str, Value]) -> None:
+        """Add the window to the history."""
         text = _json({key: round(v, 9) if isinstance(v, float) else v for key, v in measured.items()})
         self._store.window(time.time_ns(), self._adapter.loop.profile, int(level), message, text)
 
-    def _acted(self, action: Action) -> None:
+    def acted(self, action: Action) -> None:
+        """Add the action to the history."""
         match action:
             case Apply():
                 self._event("apply", DiagnosticLevel.OK, action.why, {"profile": action.profile})
             case Raise():
-                level = (
-                    DiagnosticLevel.ERROR if action.alarm.kind is AlarmKind.NON_ADAPTABLE else DiagnosticLevel.WARN
-                )
-                self._event("alarm", level, told(action.alarm), _details(action.alarm))
+                level, text = ALARM_LEVELS[action.alarm.kind], describe_alarm(action.alarm)
+                self._event("alarm", level, text, _details(action.alarm))
             case Clear():
-                self._event("over", DiagnosticLevel.OK, told(action.alarm), _details(action.alarm))
+                self._event("over", DiagnosticLevel.OK, describe_alarm(action.alarm), _details(action.alarm))
             case Reacted():
                 details = {"profile": action.profile, "reaction": round(action.reaction, 6)}
                 self._event("reacted", DiagnosticLevel.OK, f"{action.profile} runs", details)
 
-    def _missing(self, text: str, gone: bool) -> None:
-        self._event(
-            "alarm" if gone else "over",
-            DiagnosticLevel.STALE if gone else DiagnosticLevel.OK,
-            text,
-            {"kind": "missing"},
-        )
+    def missing_changed(self, text: str, *, missing: bool) -> None:
+        """Add a missing input, or its return, to the history."""
+        event, level = ("alarm", DiagnosticLevel.STALE) if missing else ("over", DiagnosticLevel.OK)
+        self._event(event, level, text, {"kind": "missing"})
+
+    def late_action(self, text: str) -> None:
+        """Add an action of a function that was given up to the history."""
+        self._event("late", DiagnosticLevel.WARN, text, {})
 
     def _event(self, event: str, level: DiagnosticLevel, message: str, details: object) -> None:
         self._store.event(time.time_ns(), event, int(level), message, _json(details))
@@ -187,15 +183,15 @@ def _json(value: object) -> str:
 
 
 def _decoded(text: str | None, kind: type[_Row]) -> _Row | None:
-    """What a row says, if there is one and it can be read."""
+    """The content of a row, or ``None`` if there is none or it is damaged."""
     try:
         return msgspec.json.decode(text, type=kind) if text is not None else None
     except msgspec.DecodeError:
         return None
 
 
-def _same(before: str, one: SavedRequirement) -> bool:
-    """Whether a row says the same; its expiry by the wall clock is never the same to the nanosecond."""
+def _same_requirement(before: str, one: SavedRequirement) -> bool:
+    """Whether a row is up to date; the expiry by the wall clock is never equal to the nanosecond."""
     known = _decoded(before, SavedRequirement)
     if known is None:
         return False
@@ -206,8 +202,8 @@ def _same(before: str, one: SavedRequirement) -> bool:
     return abs(known.expires_ns - one.expires_ns) < _SECOND
 
 
-def _alike(known: SavedCoolDown, one: SavedCoolDown) -> bool:
-    """Whether a row says the same of a profile that is left out; it does not when the wall clock was set."""
+def _same_cool_down(known: SavedCoolDown, one: SavedCoolDown) -> bool:
+    """Whether a row is up to date; it is not when the wall clock was set."""
     if (known.cool_down, known.why) != (one.cool_down, one.why):
         return False
     return abs(known.until_ns - one.until_ns) < _SECOND

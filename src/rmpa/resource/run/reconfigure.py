@@ -1,7 +1,7 @@
 """Serves a resource's configuration as dynamic_reconfigure does: ``set_parameters`` and its two latched topics.
 
-Its values are mirrored at the parameter server below the resource's node, and taken from there at the start, so that
-a launch file's or ``rmpa param set``'s count.
+The values are mirrored at the parameter server below the resource's node and loaded from there at the start, so that
+values of a launch file or ``rmpa param set`` take effect.
 """
 
 from __future__ import annotations
@@ -31,28 +31,28 @@ from rmpa.ros.types.service_types import ServiceType
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from rmpa.resource.decide.adaptation import Action
-    from rmpa.resource.declare.resource import Parameter, ParameterValue
+    from rmpa.resource.decide.actions import Action
+    from rmpa.resource.declare.parameters import Parameter, ParameterValue
     from rmpa.resource.run.adapter import Adapter
     from rmpa.resource.run.contexts import Contexts
     from rmpa.resource.run.runtime import Runtime
     from rmpa.resource.run.tasks import Tasks
     from rmpa.ros.node.topics import Publisher
 
-_WHO: Final = "configuration"
+_HOLDER: Final = "configuration"
 _log = logging.getLogger(__name__)
-_MIRROR = 1.0
+_MIRROR_TIMEOUT: Final = 1.0
 """Seconds that an ending resource waits for the parameter server."""
 
 
 class Reconfigure(RuntimePart):
-    """The configuration of one resource; to be started behind the other parts, and ``before`` in front of them.
+    """The configuration of one resource; ``load`` comes before the start of the other parts, ``start`` after it.
 
     Args:
         runtime: Of the resource.
         tasks: Paused while several parameters are set.
         adapter: Takes a profile that is chosen by hand.
-        contexts: Take a context that is.
+        contexts: Take a context that is chosen by hand.
     """
 
     def __init__(self, runtime: Runtime, tasks: Tasks, adapter: Adapter, contexts: Contexts) -> None:
@@ -60,50 +60,43 @@ class Reconfigure(RuntimePart):
         self._tasks = tasks
         self._adapter = adapter
         self._contexts = contexts
-        self._known = entries(runtime.resource)
+        self._entries = entries(runtime.resource)
         self._updates: Publisher | None = None
-        self._said: Mapping[str, ParameterValue] = {}
+        self._published: Mapping[str, ParameterValue] = {}
         self._mirrored: dict[str, ParameterValue] = {}
         self._mirror: asyncio.Task[None] | None = None
         self._quiet = False
-        self._one = asyncio.Lock()
-
-    @property
-    def before(self) -> RuntimePart:
-        """The part that takes what the parameter server holds, before anything runs."""
-        return _FromServer(self)
+        self._lock = asyncio.Lock()
 
     async def start(self) -> None:
-        """Serve."""
+        """Advertise the topics and the service."""
         node = self._runtime.node
         described = await node.advertise(
             f"{node.name}/parameter_descriptions", MessageType(DESCRIPTION_TYPE), latch=True
         )
-        described.publish(described.make(description(self._known)))
+        described.publish(described.make(description(self._entries)))
         self._updates = await node.advertise(f"{node.name}/parameter_updates", MessageType(CONFIG_TYPE), latch=True)
-        self._adapter.listeners.append(self._acted)
-        self._contexts.listeners.append(self.say)
-        self.say()
+        self.publish()
         kind = await asyncio.to_thread(ServiceType, SERVICE_TYPE)  # reads our file of definitions
-        await node.advertise_service(f"{node.name}/set_parameters", kind, self._asked)
+        await node.advertise_service(f"{node.name}/set_parameters", kind, self._serve)
 
     async def close(self) -> None:
-        """Change nothing any more."""
+        """Publish nothing any more, and finish writing to the parameter server."""
         self._updates = None
         if self._mirror is not None:
-            # Who starts next on this core takes what stands there.
-            await asyncio.wait([self._mirror], timeout=_MIRROR)
+            # The next start on this core loads these values.
+            await asyncio.wait([self._mirror], timeout=_MIRROR_TIMEOUT)
             self._mirror.cancel()
             await asyncio.wait([self._mirror])
 
     @property
     def values(self) -> dict[str, ParameterValue]:
-        """What each parameter is at present."""
+        """The present value of each parameter."""
         found: dict[str, Any] = {
             name: parameter.value for name, parameter in self._runtime.resource.parameters.items()
         }
         found[PROFILE] = self._adapter.loop.pinned
-        if CONTEXT in self._known:
+        if CONTEXT in self._entries:
             found[CONTEXT] = self._contexts.chosen
         return found
 
@@ -111,60 +104,68 @@ class Reconfigure(RuntimePart):
         """Set parameters together.
 
         Raises:
-            ConfigError: One of them cannot be, or the profile not be applied; nothing is changed then.
-            PeerRefused: The context could not begin; likewise.
+            ConfigError: An invalid value, or a profile that cannot be applied; nothing is changed then.
+            PeerRefused: The context cannot be entered; nothing is changed then.
         """
-        wanted = checked(values, self._known, self._runtime.resource.parameters)
-        async with self._one:
+        wanted = checked(values, self._entries, self._runtime.resource.parameters)
+        async with self._lock:
             if self._updates is None:
                 raise LocalProtocolError(f"resource {self._runtime.resource.name} ends")
-            self._quiet = True  # what is set together is said together
+            self._quiet = True  # published together at the end
             try:
                 before = self._contexts.chosen
                 if wanted.get(CONTEXT, before) != before:
                     await self._contexts.choose(str(wanted[CONTEXT]))
                 try:
-                    await self._choose(str(wanted.get(PROFILE, self._adapter.loop.pinned)))
+                    await self._choose_profile(str(wanted.get(PROFILE, self._adapter.loop.pinned)))
                 except RmpaError:
                     await self._contexts.choose(before)
                     raise
                 await self._set_parameters({n: v for n, v in wanted.items() if n not in (PROFILE, CONTEXT)})
             finally:
                 self._quiet = False
-                self.say()
+                self.publish()
 
-    def parameter_changed(self, parameter: Parameter) -> None:  # noqa: ARG002 - all are said together
-        """Say it, whoever changed it."""
-        self.say()
+    def parameter_changed(self, parameter: Parameter) -> None:  # noqa: ARG002
+        """Publish the configuration."""
+        self.publish()
 
-    def say(self) -> None:
-        """Publish the configuration if it is another one, and mirror it at the parameter server."""
+    def acted(self, action: Action) -> None:  # noqa: ARG002
+        """Publish the configuration: another profile may be chosen by hand."""
+        self.publish()
+
+    def context_changed(self) -> None:
+        """Publish the configuration."""
+        self.publish()
+
+    def publish(self) -> None:
+        """Publish the configuration if it has changed, and mirror it at the parameter server."""
         values = self.values
-        if self._updates is None or self._quiet or values == self._said:
+        if self._updates is None or self._quiet or values == self._published:
             return
-        self._said = values
-        self._updates.publish(self._updates.make(config(values, self._known)))
+        self._published = values
+        self._updates.publish(self._updates.make(config(values, self._entries)))
         if self._mirror is None or self._mirror.done():
             self._mirror = asyncio.get_running_loop().create_task(self._to_server(), name="mirror parameters")
 
     # --- inside -------------------------------------------------------------------------------------------------
 
-    async def _asked(self, request: Any) -> dict[str, object]:
+    async def _serve(self, request: Any) -> dict[str, object]:
         await self.set(read_config(request.config))
-        return {"config": config(self.values, self._known)}
+        return {"config": config(self.values, self._entries)}
 
     async def _set_parameters(self, values: Mapping[str, ParameterValue]) -> None:
-        """Set declared parameters; several of them between two runs of the tasks, so that none sees half of them."""
+        """Set declared parameters; several ones between two runs of the tasks, so that no run sees a part of them."""
         if len(values) > 1:
-            await self._tasks.pause(_WHO)
+            await self._tasks.pause(_HOLDER)
         try:
             for name, value in values.items():
-                self._runtime.set_parameter(name, value)
+                self._runtime.resource.parameters[name].value = value
         finally:
             if len(values) > 1:
-                self._tasks.resume(_WHO)
+                self._tasks.resume(_HOLDER)
 
-    async def _choose(self, profile: str) -> None:
+    async def _choose_profile(self, profile: str) -> None:
         loop, before = self._adapter.loop, self._adapter.loop.pinned
         if profile == before and (not profile or profile == loop.profile):
             return
@@ -176,16 +177,13 @@ class Reconfigure(RuntimePart):
         self._adapter.pin(before)
         raise ConfigError(f"profile {profile}", f"it could not be applied: {why}", "what was chosen before stays")
 
-    def _acted(self, _action: Action) -> None:
-        self.say()
-
     async def _to_server(self) -> None:
-        """Write what has changed, until nothing has."""
+        """Write changed values until all are written."""
         node = self._runtime.node
         try:
             while True:
-                todo = {name: v for name, v in self._said.items() if self._mirrored.get(name) != v}
-                todo |= {name: v for name, v in self._said.items() if name not in self._mirrored}
+                todo = {name: v for name, v in self._published.items() if self._mirrored.get(name) != v}
+                todo |= {name: v for name, v in self._published.items() if name not in self._mirrored}
                 if not todo:
                     return
                 for name, value in todo.items():
@@ -195,29 +193,18 @@ class Reconfigure(RuntimePart):
             _log.debug("! %s: the parameter server: %s", node.name, error)
 
     async def load(self) -> None:
-        """Take what the parameter server holds."""
+        """Load the values that the parameter server holds."""
         node, resource = self._runtime.node, self._runtime.resource
         found = await node.get_param(node.name, default={})
         if not isinstance(found, dict):
             return
-        taken, problems = from_server(found, self._known, resource.parameters)
+        taken, problems = from_server(found, self._entries, resource.parameters)
         for problem in problems:
             _log.warning("! %s: the parameter server: %s; it is left out", node.name, problem)
         for name, value in taken.items():
             if name == PROFILE:
-                self._adapter.chosen = str(value)
+                self._adapter.preset(str(value))
             elif name == CONTEXT:
-                self._contexts.chosen = str(value)
+                self._contexts.preset(str(value))
             elif not resource.parameters[name].given:
-                self._runtime.set_parameter(name, value)
-
-
-class _FromServer(RuntimePart):
-    """Takes the values of the parameter server at the start."""
-
-    def __init__(self, whole: Reconfigure) -> None:
-        self._whole = whole
-
-    async def start(self) -> None:
-        """Do it."""
-        await self._whole.load()
+                resource.parameters[name].value = value

@@ -1,4 +1,4 @@
-"""Writes down which resources this module's graph shows, here and in other modules, for when they are gone."""
+"""Records which resources this module's graph has shown, here and in other modules."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 FILE: Final = "_known.sqlite"
-"""Beside the resources' own files; no resource has a name that begins so."""
+"""Beside the resources' own files; no resource has a name that begins with ``_``."""
 _ENDING: Final = f"/{TOPIC}"
 
 
 class RegistryWriter(RuntimePart):
-    """For all resources of one process: a part of one of them, which has its node.
+    """The registry of a process; a part of one of its resources, whose node it uses.
 
     Args:
-        runtime: Of that one.
-        demands: Of that one: they listen to some descriptors too, and a node listens to a topic once.
+        runtime: Of that resource.
+        demands: Of that resource: they subscribe to some descriptors already, and a node subscribes to a topic once.
         store: Not yet open; closed with the resource.
     """
 
@@ -41,38 +41,37 @@ class RegistryWriter(RuntimePart):
         self._runtime = runtime
         self._demands = demands
         self._store = store
-        self._sightings: ResourceRegistry | None = None
-        """``None`` before the store has said what there was."""
+        self.registry: ResourceRegistry | None = None
+        """``None`` until the store has been read."""
         self._early: list[tuple[str, Received]] = []
         self._subscribers: dict[str, Subscriber] = {}
-        self._looking: asyncio.Task[None] | None = None
-        demands.on_descriptor.append(self._heard)
+        self._scanning: asyncio.Task[None] | None = None
 
     @property
     def problem(self) -> str:
-        """Why nothing is kept at present, or empty."""
+        """Why nothing can be stored at present, or empty."""
         return f"other resources are not kept: {self._store.problem}" if self._store.problem else ""
 
     async def start(self) -> None:
-        """Begin with what there was before."""
-        self._sightings = ResourceRegistry(await self._store.open())
-        for path, message in self._early:
-            self._heard(path, message)
-        self._looking = asyncio.get_running_loop().create_task(self._look(), name="look for resources")
+        """Read the registry of before, and scan the graph from now on."""
+        self.registry = ResourceRegistry(await self._store.open())
+        for resource, message in self._early:
+            self.descriptor_received(resource, message)
+        self._scanning = asyncio.get_running_loop().create_task(self._scan(), name="look for resources")
 
     async def close(self) -> None:
-        """Write what was seen last."""
-        if self._looking is not None:
-            self._looking.cancel()
-            await asyncio.wait([self._looking])
-        if self._sightings is not None:
-            self._put(self._sightings.look(self._here(), time.time_ns()))
-            self._put(self._sightings.end())
+        """Write the last times."""
+        if self._scanning is not None:
+            self._scanning.cancel()
+            await asyncio.wait([self._scanning])
+        if self.registry is not None:
+            self._put(self.registry.update(self._present(), time.time_ns()))
+            self._put(self.registry.flush())
         await self._store.close()
 
     # --- inside -------------------------------------------------------------------------------------------------
 
-    async def _look(self) -> None:
+    async def _scan(self) -> None:
         node = self._runtime.node
         while True:
             try:
@@ -80,45 +79,48 @@ class RegistryWriter(RuntimePart):
                 await self._follow({topic for topic in topics if topic.endswith(_ENDING)})
             except RmpaError as error:
                 _log.debug("! %s: looking for resources: %s", node.name, error)
-            if self._sightings is not None:
-                self._put(self._sightings.look(self._here(), time.time_ns()))
+            if self.registry is not None:
+                self._put(self.registry.update(self._present(), time.time_ns()))
             await asyncio.sleep(limits.KNOWN_LOOK)
 
     async def _follow(self, topics: set[str]) -> None:
-        """Listen to what is new, and no longer to what is gone."""
+        """Subscribe to new descriptors, and no longer to those that are gone."""
         node = self._runtime.node
         own = f"{node.name}{_ENDING}"
-        self._take(node.name, node.name, self._runtime.descriptor.serialize())
+        self._record(node.name, node.name, self._runtime.descriptor.serialize())
         for topic in self._subscribers.keys() - topics:
             await self._subscribers.pop(topic).close()
-        for topic in sorted(topics - self._subscribers.keys() - self._demands.listening.keys() - {own}):
+        for topic in sorted(topics - self._subscribers.keys() - self._demands.descriptors.keys() - {own}):
             if len(self._subscribers) >= limits.KNOWN_MAX:
                 break
-            heard = functools.partial(self._heard, topic.removesuffix(_ENDING))
+            callback = functools.partial(self.descriptor_received, topic.removesuffix(_ENDING))
             try:
-                self._subscribers[topic] = await node.subscribe(topic, MessageType("std_msgs/String"), heard)
-            except ValueError:  # an input, or a context's rule, has it
+                self._subscribers[topic] = await node.subscribe(topic, MessageType("std_msgs/String"), callback)
+            except ValueError:  # an input or a rule of a context has subscribed
                 _log.debug("= %s: listens to %s already", node.name, topic)
 
-    def _heard(self, path: str, message: Received) -> None:
-        if self._sightings is None:
-            self._early.append((path, message))
+    def descriptor_received(self, resource: str, message: Received) -> None:
+        """Record a resource."""
+        if self.registry is None:
+            self._early.append((resource, message))
         else:
-            self._take(path, message.caller_id, str(message.message.data))
+            self._record(resource, message.caller_id, str(message.message.data))
 
-    def _take(self, path: str, caller: str, text: str) -> None:
-        if self._sightings is None:
+    def _record(self, path: str, caller: str, text: str) -> None:
+        if self.registry is None:
             return
         try:
-            self._put(self._sightings.heard(path, caller, text, time.time_ns()))
+            self._put(self.registry.record(path, caller, text, time.time_ns()))
         except RmpaError as error:
-            _log.debug("! %s: %s: %s", self._runtime.node.name, path, error)  # somebody else's topic of that name
+            _log.debug(
+                "! %s: %s: %s", self._runtime.node.name, path, error
+            )  # a topic of that name that is no descriptor
 
-    def _here(self) -> set[Place]:
+    def _present(self) -> set[Place]:
         name = self._runtime.node.name
         return {(name, name)} | {
             (topic.removesuffix(_ENDING), caller)
-            for topic, subscriber in (*self._subscribers.items(), *self._demands.listening.items())
+            for topic, subscriber in (*self._subscribers.items(), *self._demands.descriptors.items())
             for caller in subscriber.callers
         }
 

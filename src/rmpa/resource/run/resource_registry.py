@@ -1,7 +1,7 @@
-"""Which resources were seen in this module's graph, and when: what others said of themselves outlives them.
+"""The resources that this module's graph has shown, and when.
 
-Kept as rows of a store, two for each resource: its descriptor as it came, and when it was seen first and last (which
-changes often, and is short). Bounded: the one that was not seen for longest gives way.
+Kept as rows of a store, two for each resource: its last descriptor, and the times when it was seen first and last
+(short, because they change often). Bounded: the resource that was seen least recently is removed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Rows = dict["Key", str | None]
 
 
 class _Times(msgspec.Struct, frozen=True):
-    """By the wall clock, Unix nanoseconds."""
+    """Unix nanoseconds of the wall clock."""
 
     first_ns: int
     last_ns: int
@@ -36,14 +36,14 @@ class _Times(msgspec.Struct, frozen=True):
 
 @dataclass(slots=True)
 class RegistryEntry:
-    """One resource that was seen.
+    """One resource.
 
     Args:
         path: Its name in this module's graph.
         caller: The node that published for it: itself, or its proxy.
-        text: Its descriptor as it came last.
+        text: Its last descriptor, JSON.
         first_ns: When it was seen first, Unix nanoseconds.
-        last_ns: And last.
+        last_ns: When it was seen last.
     """
 
     path: str
@@ -54,25 +54,25 @@ class RegistryEntry:
 
     @property
     def descriptor(self) -> Descriptor:
-        """What it said of itself.
+        """The parsed descriptor.
 
         Raises:
-            RmpaError: It cannot be read, which ``ResourceRegistry`` has looked at.
+            RmpaError: It is invalid, which ``ResourceRegistry`` rules out.
         """
         return Descriptor.parse(self.text)
 
 
 class ResourceRegistry:
-    """All that were seen.
+    """All resources that were seen. Its methods return the rows to write to the store.
 
     Args:
-        rows: Of a store, of any content: a store is a file. What cannot be read is left out.
+        rows: Of the store; untrusted: invalid ones are left out.
     """
 
     def __init__(self, rows: Mapping[Key, str] | None = None) -> None:
         self._known: dict[Place, RegistryEntry] = {}
         self._written: dict[Place, int] = {}
-        self._here: set[Place] = set()
+        self._present: set[Place] = set()
         for (kind, name), text in (rows or {}).items():
             path, _, caller = name.partition(" ")
             times = (rows or {}).get((SEEN, name), "")
@@ -88,47 +88,47 @@ class ResourceRegistry:
 
     @property
     def all(self) -> list[RegistryEntry]:
-        """Those that were seen last first."""
+        """All entries, the most recently seen first."""
         return sorted(self._known.values(), key=lambda each: (-each.last_ns, each.path, each.caller))
 
-    def heard(self, path: str, caller: str, text: str, now_ns: int) -> Rows:
-        """A resource says what it is; return the rows to write.
+    def record(self, path: str, caller: str, text: str, now_ns: int) -> Rows:
+        """Record a descriptor.
 
         Raises:
-            RmpaError: That is no descriptor.
+            RmpaError: It is invalid.
         """
         Descriptor.parse(text)
         place = path, caller
         before = self._known.get(place)
         first_ns = before.first_ns if before is not None else now_ns
         self._known[place] = RegistryEntry(path, caller, text, first_ns, now_ns)
-        rows = self._times(place) if place not in self._here or self._is_due(place, now_ns) else {}
-        self._here.add(place)
+        rows = self._times(place) if place not in self._present or self._is_due(place, now_ns) else {}
+        self._present.add(place)
         if before is None or before.text != text:
             rows[DESCRIPTOR, _name(place)] = text
         return rows | self._bound()
 
-    def look(self, here: Collection[Place], now_ns: int) -> Rows:
-        """Take which of them are here now; return the rows to write: not each time, for flash memory's sake."""
+    def update(self, present: Collection[Place], now_ns: int) -> Rows:
+        """Record which resources are present now; few times are written, to spare flash memory."""
         rows: Rows = {}
-        for place in self._known.keys() & set(here):
+        for place in self._known.keys() & set(present):
             self._known[place].last_ns = now_ns
             if self._is_due(place, now_ns):
                 rows |= self._times(place)
-        for place in self._here - set(here):
+        for place in self._present - set(present):
             rows |= self._times(place)
-        self._here = {place for place in here if place in self._known}
+        self._present = {place for place in present if place in self._known}
         return rows
 
-    def end(self) -> Rows:
-        """Return what is to be written at the end."""
+    def flush(self) -> Rows:
+        """The times of all resources that are present."""
         rows: Rows = {}
-        for place in self._here:
+        for place in self._present:
             rows |= self._times(place)
         return rows
 
     def _is_due(self, place: Place, now_ns: int) -> bool:
-        """Whether its time is to be written again; at once where the clock was set, by either sign."""
+        """Whether its times are due to be written; at once if the clock was set back or forth."""
         return abs(now_ns - self._written.get(place, 0)) >= limits.KNOWN_WRITE * 1e9
 
     def _times(self, place: Place) -> Rows:
@@ -147,7 +147,7 @@ class ResourceRegistry:
             place = each.path, each.caller
             del self._known[place]
             self._written.pop(place, None)
-            self._here.discard(place)
+            self._present.discard(place)
             size -= len(each.text)
             rows |= {(DESCRIPTOR, _name(place)): None, (SEEN, _name(place)): None}
         return rows

@@ -1,4 +1,4 @@
-"""When a task is due, what is measured of it, and how long a failed one waits; all without a clock of its own."""
+"""Schedules and statistics of tasks, and back-off times after failures; pure, the time is an argument."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from dataclasses import dataclass
 from typing import Final
 
 RESTART_FIRST: Final = 0.1
-"""Seconds before a task goes on that failed for the first time."""
+"""Seconds of the back-off after a task's first failure."""
 RESTART_MAX: Final = 5.0
-"""The same at most, when it fails again and again."""
+"""The longest back-off."""
 STUCK_PERIODS: Final = 10
-"""A run that takes so many periods is stuck, unless the task says otherwise."""
+"""A run that takes so many periods is stuck, unless declared otherwise."""
 STUCK_LEAST: Final = 5.0
-"""No run is stuck sooner than after so many seconds, unless the task says otherwise."""
+"""The least time in seconds after which a run is stuck, unless declared otherwise."""
 _EARLY: Final = 1e-9
 
 
 class Schedule:
-    """The times at which a periodic task is due: start, start + period, start + 2 periods and so on.
+    """The due times of a periodic task: start, start + period, start + 2 periods and so on.
 
-    Absolute, so that no lateness adds up. A time that is a whole period past is left out.
+    Absolute, so that lateness does not add up. A due time that is a whole period past is skipped.
 
     Args:
         period: Seconds, above 0.
@@ -30,12 +30,12 @@ class Schedule:
     def __init__(self, period: float, start: float) -> None:
         self.period = period
         self.missed = 0
-        """Times that were left out."""
+        """Number of skipped due times."""
         self._start = start
         self._tick = -1
 
     def next_due(self, now: float) -> float:
-        """Go on to the next time; return when that is."""
+        """Advance to the next due time and return it."""
         self._tick += 1
         late = math.floor((now - self._start) / self.period + _EARLY) - self._tick
         if late > 0:
@@ -46,17 +46,17 @@ class Schedule:
 
 @dataclass(frozen=True, slots=True)
 class TaskReport:
-    """What was measured of a task over one window; a figure that nothing was measured of is ``None``.
+    """Statistics of a task over one window; values that were not measured are ``None``.
 
     Args:
-        runs: How often it ran.
-        failures: How often it raised.
+        runs: Number of runs.
+        failures: Runs that raised.
         overruns: Runs that took more than a period.
-        missed: Times that were left out because of that.
-        dropped: Messages of its input that it was too slow for.
-        lateness: Mean of the seconds from when it was due to when it began.
+        missed: Due times that were skipped because of overruns.
+        dropped: Messages of its input that were dropped because it was too slow.
+        lateness: Mean seconds from the due time to the beginning of a run.
         lateness_max: The greatest of them.
-        period_sd: Standard deviation of the time from one beginning to the next, seconds.
+        period_sd: Standard deviation of the time between two beginnings, seconds.
         busy: Share of the window in which it ran.
     """
 
@@ -72,14 +72,14 @@ class TaskReport:
 
 
 def too_slow(report: TaskReport, period: float | None) -> str:
-    """How a task was too slow over one window, for people; empty if it was not.
+    """The reason why a task was too slow in a window, for people; empty if it was not.
 
-    More than a tenth of its runs took longer than its period, or messages of its input gave way. A single late run
-    is the machine's business.
+    It was if more than a tenth of its runs took longer than its period, or if messages of its input were dropped. A
+    single late run may be due to load of the machine.
 
     Args:
         report: Of the window.
-        period: Seconds, of a periodic one, else ``None``.
+        period: Seconds, of a periodic task, else ``None``.
     """
     if report.dropped:
         return f"{report.dropped} messages of its input gave way to newer ones, {report.runs} were taken"
@@ -90,10 +90,10 @@ def too_slow(report: TaskReport, period: float | None) -> str:
 
 
 class TaskFigures:
-    """Measures one task; told by the thread that runs it, asked by the loop. Sums only.
+    """Measures one task: updated by the thread that runs it, read by the event loop. Keeps sums only.
 
     Args:
-        period: Of a periodic one, else ``None``.
+        period: Seconds, of a periodic task, else ``None``.
         now: Monotonic seconds.
     """
 
@@ -104,9 +104,9 @@ class TaskFigures:
         self._began: float | None = None
         self._last: float | None = None
         self.in_a_row = 0
-        """Failures since the last run that ended well."""
+        """Failures since the last run that succeeded."""
         self.error = ""
-        """What the last failure said; empty once a run ended well."""
+        """The error of the last run; empty if it succeeded."""
         self._clear()
 
     def _clear(self) -> None:
@@ -117,14 +117,14 @@ class TaskFigures:
 
     @property
     def running_since(self) -> float | None:
-        """When the present run began, or ``None`` between two."""
+        """When the present run began, or ``None`` between two runs."""
         return self._began
 
     def begun(self, due: float, now: float) -> None:
-        """A run begins that was due at a time."""
-        self._due, self._began = due, now  # the rest is reckoned behind the run
+        """A run begins that was due at ``due``."""
+        self._due, self._began = due, now  # evaluated after the run, to begin it sooner
 
-    def _reckon(self, now: float) -> None:
+    def _add_beginning(self, now: float) -> None:
         late = max(0.0, now - self._due)
         self._late += late
         self._late_max = max(self._late_max, late)
@@ -137,10 +137,10 @@ class TaskFigures:
         self._last = now
 
     def ended(self, now: float, error: str = "") -> None:
-        """The run has ended, well or with an error."""
+        """The run has ended, perhaps with an error."""
         took = 0.0
         if self._began is not None:
-            self._reckon(self._began)
+            self._add_beginning(self._began)
             took = now - self._began
         self._began = None
         self._runs += 1
@@ -155,24 +155,24 @@ class TaskFigures:
             self.in_a_row = 0
 
     def interrupted(self) -> None:
-        """The times between two runs are no period any more: it waited for another reason."""
+        """The time to the next run is not a period: the task waited for another reason."""
         self._last = None
 
     def retimed(self, period: float) -> None:
-        """It has another period from now on."""
+        """The task has another period from now on."""
         self._period = period
         self._last = None
 
     def missed(self, count: int) -> None:
-        """So many times were left out."""
+        """Count skipped due times."""
         self._missed += count
 
     def dropped(self) -> None:
-        """A message was, for the task was too slow."""
+        """Count a dropped message."""
         self._dropped += 1
 
     def window(self, now: float) -> TaskReport:
-        """What was measured since the last window; a new one begins."""
+        """End the window and return its statistics."""
         mean = self._sum / self._periods if self._periods else 0.0
         report = TaskReport(
             runs=self._runs,
@@ -191,12 +191,12 @@ class TaskFigures:
 
 
 def restart_delay(in_a_row: int) -> float:
-    """Seconds before a task goes on that has failed so often in a row."""
+    """The back-off in seconds after so many consecutive failures."""
     return min(RESTART_FIRST * 2.0 ** min(max(0, in_a_row - 1), 16), RESTART_MAX)
 
 
-def stuck_after(period: float | None, said: float | None) -> float:
-    """Seconds that one run may take before it counts as stuck."""
-    if said is not None:
-        return said
+def stuck_after(period: float | None, declared: float | None) -> float:
+    """Seconds after which a run counts as stuck; ``declared``: by the task, or ``None``."""
+    if declared is not None:
+        return declared
     return max(STUCK_LEAST, STUCK_PERIODS * period) if period is not None else STUCK_LEAST

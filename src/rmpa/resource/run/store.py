@@ -1,10 +1,10 @@
-"""A resource's file: what it remembers over a restart, and a bounded history. SQLite in a thread of its own.
+"""A resource's file: its state over a restart, and a bounded history. SQLite in a thread of its own.
 
-Nothing here blocks the loop, and no disk can stop a resource: one that is full, read-only or gone is said once
-(``ResourceStore.problem``) and tried again; a file that is damaged is set aside under ``.damaged`` and begun anew,
-with everything that is known at that moment. Tables, for ``sqlite3 FILE``::
+Nothing here blocks the event loop, and no disk can stop a resource: if it is full, read-only or gone, that is logged
+once (``ResourceStore.problem``) and writing is tried again. A damaged file is renamed to ``.damaged`` and begun anew
+with everything that is known at that moment. ``rmpa.resource.run.history`` reads the last three tables::
 
-    state(kind, name, value, at_ns)                      value: JSON; see resource.remembered
+    state(kind, name, value, at_ns)                      value: JSON; see resource.decide.saved_state
     windows(at_ns, profile, level, message, quality)     quality: JSON, attribute -> value in the attribute's unit
     events(at_ns, event, level, message, details)        event: apply, alarm, over, reacted, late; details: JSON
     descriptors(node, text, first_ns, last_ns)
@@ -26,14 +26,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from rmpa.resource import limits
-from rmpa.runtime.state_dir import module_dir, state_dir
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from rmpa.resource.decide.saved_state import Key
-
-__all__ = ["DamagedStore", "ResourceStore", "module_dir", "read_state", "state_dir"]
 
 _log = logging.getLogger(__name__)
 _VERSION: Final = 1
@@ -62,32 +60,47 @@ _KEPT: Final = {
     "descriptors": limits.STORE_DESCRIPTORS_MAX,
 }
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
-_LOCK_LOOK: Final = 0.02
+_LOCK_RETRY: Final = 0.02
+"""Seconds between attempts to take the lock."""
 
 
-def read_state(path: Path) -> dict[Key, str]:
-    """What a store's ``state`` holds; nobody need run, and who does is not disturbed.
+@contextlib.contextmanager
+def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
+    """Open a store for reading, whether its resource runs or not, without disturbing it.
 
     Raises:
         OSError: It cannot be read.
     """
     try:
-        with contextlib.closing(
-            sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=1.0)
-        ) as found:
-            rows = found.execute("SELECT kind, name, value FROM state ORDER BY kind, name")
-            return {(str(kind), str(name)): str(value) for kind, name, value in rows}
+        uri = f"{path.resolve().as_uri()}?mode=ro"
+        with contextlib.closing(sqlite3.connect(uri, uri=True, timeout=1.0)) as connection:
+            yield connection
     except sqlite3.Error as error:
         raise OSError(f"{path}: {error}") from error
 
 
-class DamagedStore(Exception):  # noqa: N818 - reads as what happened; never leaves this file
-    """The file is no store of ours."""
+def read_state(path: Path) -> dict[Key, str]:
+    """The ``state`` of a store.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    with open_read_only(path) as connection:
+        return _state(connection)
+
+
+def _state(connection: sqlite3.Connection) -> dict[Key, str]:
+    rows = connection.execute("SELECT kind, name, value FROM state ORDER BY kind, name")
+    return {(str(kind), str(name)): str(value) for kind, name, value in rows}
+
+
+class _DamagedError(Exception):
+    """The file is not a store, or not a readable one."""
 
 
 @dataclass
 class _Pending:
-    """What is to be written."""
+    """Changes to write."""
 
     state: dict[Key, str | None] = field(default_factory=dict)
     rows: deque[tuple[str, tuple[object, ...]]] = field(
@@ -99,12 +112,12 @@ class _Pending:
 
 
 class ResourceStore:
-    """One file. Its methods may be called from the loop: none waits for the disk.
+    """One file. No method waits for the disk.
 
     Args:
-        path: Made if it is not there, with its folders.
+        path: Created if it does not exist, with its folders.
         interval: Seconds between writes of the history.
-        bytes_max: Of the file.
+        bytes_max: Bound of the file's size.
     """
 
     def __init__(
@@ -112,7 +125,7 @@ class ResourceStore:
     ) -> None:
         self.path = path
         self.problem = ""
-        """Why nothing is kept at present, or empty."""
+        """Why nothing can be stored at present, or empty."""
         self._interval = interval
         self._pages = bytes_max // _PAGE
         self._change = threading.Condition()
@@ -120,7 +133,7 @@ class ResourceStore:
         self._urgent = False
         self._closing = False
         self._known: dict[Key, str] = {}
-        """Everything in ``state``, so that a new file can take the place of a damaged one."""
+        """The content of ``state``, for a new file in place of a damaged one."""
         self._connection: sqlite3.Connection | None = None
         self._inode = 0
         self._lock: int | None = None
@@ -128,7 +141,7 @@ class ResourceStore:
         self._thread = threading.Thread(target=self._run, name=f"store {path.stem}", daemon=True)
 
     async def open(self) -> dict[Key, str]:
-        """Begin, and return what is there; nothing if it cannot be read, which is said."""
+        """Open the file and return its ``state``; empty if it cannot be read, which is logged."""
         self._thread.start()
         try:
             async with asyncio.timeout(limits.STORE_OPEN_TIMEOUT):
@@ -138,7 +151,7 @@ class ResourceStore:
             return {}
 
     def put(self, key: Key, value: str | None) -> None:
-        """Remember a JSON text, or nothing any more; written at once."""
+        """Set a row of ``state`` to a JSON text, or delete it; written at once."""
         with self._change:
             self._pending.state[key] = value
             self._urgent = True
@@ -149,15 +162,15 @@ class ResourceStore:
         self._add("windows", (at_ns, profile, level, message, quality))
 
     def event(self, at_ns: int, event: str, level: int, message: str, details: str) -> None:
-        """Add an alarm or a change to it."""
+        """Add an event to the history."""
         self._add("events", (at_ns, event, level, message, details))
 
     def descriptor(self, node: str, text: str, at_ns: int) -> None:
-        """Add a descriptor as it was seen; the same one again only moves its ``last_ns``."""
+        """Add a descriptor; the same one again only updates its ``last_ns``."""
         self._add("descriptors", (node, text, at_ns, at_ns))
 
     async def close(self) -> None:
-        """Write everything and end; a disk that hangs is left behind."""
+        """Write everything and end the thread, which is left behind if the disk hangs."""
         with self._change:
             self._closing = True
             self._change.notify()
@@ -197,18 +210,18 @@ class ResourceStore:
             self._pending.rows = deque(rows, maxlen=limits.STORE_PENDING_MAX)
 
     def _attempt(self, work: _Pending) -> bool:
-        """Write; a damaged file is replaced and written again."""
+        """Write; replace a damaged file and write again. False: it failed."""
         try:
             try:
                 self._write(work)
-            except DamagedStore as error:
+            except _DamagedError as error:
                 self._set_aside(str(error))
                 self._write(work)
-        except (OSError, sqlite3.Error, DamagedStore) as error:
+        except (OSError, sqlite3.Error, _DamagedError) as error:
             self._disconnect()
-            self._say(f"{type(error).__name__}: {error}" if not str(error) else str(error))
+            self._set_problem(f"{type(error).__name__}: {error}" if not str(error) else str(error))
             return False
-        self._say("")
+        self._set_problem("")
         return True
 
     def _write(self, work: _Pending) -> None:
@@ -218,7 +231,7 @@ class ResourceStore:
                 self._insert(connection, work)
         except sqlite3.DatabaseError as error:
             if getattr(error, "sqlite_errorcode", 0) & 0xFF in _DAMAGED:
-                raise DamagedStore(str(error)) from error
+                raise _DamagedError(str(error)) from error
             raise
         for key, value in work.state.items():
             if value is None:
@@ -253,23 +266,22 @@ class ResourceStore:
         self._connection = connection
         connection.execute(f"PRAGMA max_page_count = {self._pages}")
         if (version := connection.execute("PRAGMA user_version").fetchone()[0]) > _VERSION:
-            raise DamagedStore(f"it is of version {version}; this release reads {_VERSION}")
+            raise _DamagedError(f"it is of version {version}; this release reads {_VERSION}")
         if (found := connection.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
-            raise DamagedStore(found)
+            raise _DamagedError(found)
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = FULL")
         connection.executescript(_SCHEMA)
         self._inode = self.path.stat().st_ino
         if not self._known:
-            rows = connection.execute("SELECT kind, name, value FROM state ORDER BY kind, name")
-            self._known = {(str(kind), str(name)): str(value) for kind, name, value in rows}
+            self._known = _state(connection)
         else:
             with connection:
                 self._insert(connection, _Pending(dict(self._known)))
         return connection
 
     def _take_lock(self) -> None:
-        """Two resources of one name in two modules of one name on one machine must not mix."""
+        """Exclude a second process: a resource and a module of the same names on this machine."""
         if self._lock is not None:
             return
         number = os.open(self.path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -281,7 +293,7 @@ class ResourceStore:
                 if time.monotonic() > deadline:
                     os.close(number)
                     raise OSError("another process uses it; name this module otherwise, or set --state") from None
-                time.sleep(_LOCK_LOOK)
+                time.sleep(_LOCK_RETRY)
             except OSError:
                 os.close(number)
                 raise
@@ -303,8 +315,8 @@ class ResourceStore:
             with contextlib.suppress(sqlite3.Error):
                 connection.close()
 
-    def _say(self, problem: str) -> None:
-        """Log it when it begins and when it is over."""
+    def _set_problem(self, problem: str) -> None:
+        """Log a problem when it begins and when it is over."""
         if problem and not self.problem:
             _log.warning("! %s: nothing is kept: %s", self.path, problem)
         elif self.problem and not problem:

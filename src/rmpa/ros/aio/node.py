@@ -8,4 +8,4 @@ from rmpa.ros.node.node import Node, Publisher, Received, Service, ServiceClient
 
 __all__ = ["Node", "Publisher", "Received", "Service", "ServiceClient", "Subscriber"]
 
-warnings.warn("rmpa.ros.aio.node has moved: use `from rmpa.ros import Node`", DeprecationWarning, stacklevel=2)
+warnings.warn("rmpa.ros.aio.node is deprecated: use `from rmpa.ros import Node`", DeprecationWarning, stacklevel=2)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import msgspec
 
+from rmpa.core.sizes import INT32_MAX, INT32_MIN
 from rmpa.ros import limits
 from rmpa.ros.master.effects import RegistrationKind
 from rmpa.ros.master.unverified import NodeRecord
@@ -226,7 +227,7 @@ def _value(value: bytes) -> Any:
                 pass
             case str(text):
                 _check_text(text)
-            case int(number) if -(1 << 31) <= number < 1 << 31:
+            case int(number) if INT32_MIN <= number <= INT32_MAX:
                 pass
             case list() as parts:
                 waiting += parts

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
+from rmpa.core.sizes import UINT32_MAX
 from rmpa.ros.types.std_header import HEADER_PART
 
 if TYPE_CHECKING:
@@ -50,7 +51,6 @@ ARRAY_DEFINITION: Final = (
 _LENGTH: Final = struct.Struct("<I")
 _HEADER: Final = struct.Struct("<III")
 _SECOND: Final = 1_000_000_000
-_WORD: Final = 0xFFFFFFFF
 
 
 class DiagnosticLevel(IntEnum):
@@ -99,7 +99,7 @@ def frame_array(sequence: int, stamp_ns: int, statuses: Iterable[bytes]) -> byte
     """
     elements = tuple(statuses)
     seconds, nanoseconds = divmod(stamp_ns, _SECOND)
-    header = _HEADER.pack(sequence & _WORD, seconds & _WORD, nanoseconds) + _text("")
+    header = _HEADER.pack(sequence & UINT32_MAX, seconds & UINT32_MAX, nanoseconds) + _text("")
     body = b"".join((header, _LENGTH.pack(len(elements)), *elements))
     return _LENGTH.pack(len(body)) + body
 

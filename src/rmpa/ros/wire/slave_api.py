@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final, Protocol
 
 from rmpa.core.names import is_global_name, is_legal_name
+from rmpa.core.sizes import INT32_MAX
 from rmpa.ros.wire.xmlrpc import RosReply
 
 if TYPE_CHECKING:
@@ -23,7 +24,6 @@ OUTBOUND: Final = "o"
 _ERROR: Final = -1
 _FAILURE: Final = 0
 _SUCCESS: Final = 1
-_INT_MAX: Final = (1 << 31) - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,10 +122,10 @@ class SlaveApi:
         subscribed: dict[str, list[XmlRpcValue]] = {topic: [] for topic, _type in self._node.subscriptions()}
         sent: dict[str, int] = {}
         for c in self._node.connections():
-            size, messages = min(c.bytes, _INT_MAX), min(c.messages, _INT_MAX)
+            size, messages = min(c.bytes, INT32_MAX), min(c.messages, INT32_MAX)
             if c.direction == OUTBOUND:
                 published.setdefault(c.topic, []).append([c.number, size, messages, c.connected])
-                sent[c.topic] = min(sent.get(c.topic, 0) + c.bytes, _INT_MAX)
+                sent[c.topic] = min(sent.get(c.topic, 0) + c.bytes, INT32_MAX)
             else:
                 subscribed.setdefault(c.topic, []).append([c.number, size, messages, -1, c.connected])
         value: list[XmlRpcValue] = [

@@ -18,6 +18,7 @@ from defusedxml.common import DefusedXmlException
 from defusedxml.xmlrpc import DefusedExpatParser
 
 from rmpa.core.errors import LimitExceeded, RemoteProtocolError, RmpaError
+from rmpa.core.sizes import INT32_MAX, INT32_MIN
 from rmpa.ros import limits
 from rmpa.ros.wire.xmlrpc_writer import legal_text, pieces
 
@@ -27,8 +28,6 @@ XmlRpcValue: TypeAlias = Union[  # noqa: UP007 - | does not take the forward ref
 """A value of XML-RPC. Parsed values are made of lists and dicts; ``None`` is read, never written."""
 
 _T = TypeVar("_T")
-_MAX_INT: Final = (1 << 31) - 1
-_MIN_INT: Final = -(1 << 31)
 _DECLARATION: Final = "<?xml version='1.0'?>\n"
 
 
@@ -80,7 +79,7 @@ def brief(value: object, limit: int = 120) -> str:
 
 def _end_int(unmarshaller: Unmarshaller, data: str) -> None:
     number = int(data)
-    if not _MIN_INT <= number <= _MAX_INT:
+    if not INT32_MIN <= number <= INT32_MAX:
         raise RemoteProtocolError(
             f"integer {data.strip()[:40]} does not fit XML-RPC's 32 bits; send it as a double or a string"
         )
@@ -174,7 +173,7 @@ class DocumentReader(ABC, Generic[_T]):
         with self._errors():
             self._give()
             self._parser.close()
-            params = cast(tuple[XmlRpcValue, ...], self._unmarshaller.close())
+            params = cast("tuple[XmlRpcValue, ...]", self._unmarshaller.close())
         return self._unmarshaller.getmethodname(), params
 
     def _give(self) -> None:

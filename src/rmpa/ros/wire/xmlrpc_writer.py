@@ -13,13 +13,12 @@ from itertools import chain
 from typing import TYPE_CHECKING, Final, cast
 
 from rmpa.core.errors import LocalProtocolError
+from rmpa.core.sizes import INT32_MAX, INT32_MIN
 from rmpa.ros import limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-_MAX_INT: Final = (1 << 31) - 1
-_MIN_INT: Final = -(1 << 31)
 # XML 1.0, section 2.2: characters that a document cannot hold, not even escaped.
 _ILLEGAL: Final = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 _PIECE: Final = 128
@@ -128,7 +127,7 @@ def _base64(value: bytes) -> Iterable[str]:
 
 
 def _int(value: int) -> Iterable[str]:
-    if not _MIN_INT <= value <= _MAX_INT:
+    if not INT32_MIN <= value <= INT32_MAX:
         raise _NotXmlRpcError(f"cannot be said in XML-RPC: {str(value)[:40]} does not fit 32 bits")
     return (f"<value><int>{value}</int></value>\n",)
 

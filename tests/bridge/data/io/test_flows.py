@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rmpa.bridge.data.io.flows import ExportFlow, ImportFlow
+from rmpa.bridge.data.io.export_flow import ExportFlow
+from rmpa.bridge.data.io.import_flow import ImportFlow
 from rmpa.bridge.data.io.link_time import LinkTime
 from rmpa.bridge.data.qos_events import QosEventKind
 from rmpa.core.contract import Contract, Durability, Priority, Reliability

@@ -495,7 +495,7 @@ def test_it_is_wanted_whole_and_changes_its_lane_behind_a_fence() -> None:
     assert link.numbers == [1], "an acknowledgement opens the window, not the fence"
     answer(link, leg)
     assert link.sent == [("express", 1, SMALL), ("bulk", 2, bytes(BIG)), ("bulk", 3, SMALL)]
-    assert leg.sender.under_way == 2
+    assert leg.sender.in_flight == 2
 
 
 @pytest.mark.usefixtures("clock")

@@ -23,7 +23,7 @@ from tests.bridge.io.virtual import VirtualLoop, run
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
-    from rmpa.bridge.data.io.flows import ImportFlow
+    from rmpa.bridge.data.io.import_flow import ImportFlow
     from rmpa.bridge.data.qos_events import QosEvent
     from rmpa.ros.core.embedded import RosCore
     from rmpa.ros.node.publication import Publication

@@ -21,7 +21,7 @@ LO = next(interface for interface in list_interfaces() if interface.name == "lo"
 GROUP = config_limits.MULTICAST_GROUP
 
 
-def test_what_is_sent_on_an_interface_is_heard_there() -> None:
+def test_a_packet_is_received_on_its_interface() -> None:
     with GroupReceiver(GROUP, PORT) as receiver, GroupSender(GROUP, PORT) as sender:
         assert receiver.join([LO]) == {}
         assert sender.send(LO, b"hello") == ""
@@ -32,13 +32,13 @@ def test_what_is_sent_on_an_interface_is_heard_there() -> None:
         assert receiver.wait(0.0) is None
 
 
-def test_who_has_not_joined_hears_nothing() -> None:
+def test_without_joining_nothing_is_received() -> None:
     with GroupReceiver(GROUP, PORT) as receiver, GroupSender(GROUP, PORT) as sender:
         sender.send(LO, b"hello")
         assert receiver.wait(0.2) is None
 
 
-def test_doctor_hears_itself_and_says_on_which_interface_not() -> None:
+def test_doctor_receives_its_own_packets() -> None:
     gone = Interface("gone0", 9999, LO.addresses, up=True, multicast=True, loopback=False)
     lo, other = hear_ourselves([LO, gone], GROUP, PORT)
     assert lo.after is not None
@@ -47,7 +47,7 @@ def test_doctor_hears_itself_and_says_on_which_interface_not() -> None:
     assert "No such device" in other.problem
 
 
-def test_what_comes_in_elsewhere_says_nothing_of_an_interface(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_packet_on_another_interface_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
     wait = GroupReceiver.wait
 
     def elsewhere(self: GroupReceiver, timeout: float | None = None) -> object:
@@ -59,7 +59,7 @@ def test_what_comes_in_elsewhere_says_nothing_of_an_interface(monkeypatch: pytes
     assert [heard.after for heard in hear_ourselves([LO], GROUP, PORT)] == [None]
 
 
-def test_an_agent_passes_the_doctors_packet_over(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_agents_ignore_the_doctors_packet(monkeypatch: pytest.MonkeyPatch) -> None:
     counters = Counters()
     intake = PacketFilter(0, counters)
     heard: list[bytes] = []
@@ -85,7 +85,7 @@ def test_a_port_that_is_not_shared() -> None:
 
 
 @pytest.mark.parametrize("group", ["10.0.0.1", "239.1", "x", "240.0.0.1"])
-def test_what_is_no_group(group: str) -> None:
+def test_addresses_that_are_no_group(group: str) -> None:
     with pytest.raises(ConfigError, match="not an IPv4 multicast group"):
         GroupSender(group, PORT)
     with pytest.raises(ConfigError):

@@ -1,17 +1,19 @@
-"""One source's way to one peer: lane, bounds, down-sampling, and the memory of what the peer has not yet.
+"""One route from here to a peer: the lane of its messages, queue bounds, down-sampling, and what is kept for replay.
 
-A leg is called for each message from the publisher's read callback; it takes no detour when nothing is in the way.
+A route sender is called for each message from the publisher's read callback. ``RouteSender.message`` has a short path
+for the usual case: a small message on the express lane, without down-sampling.
 """
 
 from __future__ import annotations
 
 import asyncio
 from collections import deque
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from rmpa.bridge.data.downsampling import Downsampler
 from rmpa.bridge.data.lane_switch import EXPRESS, LaneSwitch
 from rmpa.core.contract import Contract, History, Reliability
+from rmpa.core.serial_number import SERIAL_MASK, is_earlier
 from rmpa.mesh import limits as mesh_limits
 from rmpa.mesh.reliable import ReliableSender
 from rmpa.runtime import limits as runtime_limits
@@ -22,9 +24,6 @@ if TYPE_CHECKING:
     from rmpa.core.outbox import QueuedMessage
     from rmpa.runtime.stream import Buffer
 
-_SEQUENCE_MASK: Final = (1 << 32) - 1
-_HALF: Final = 1 << 31
-
 
 class DataLane(Protocol):
     """What the data path needs of one lane of a link."""
@@ -34,11 +33,11 @@ class DataLane(Protocol):
         ...
 
     def open(self, route: int, size: int, sequence: int, stamp_ns: int) -> QueuedMessage:
-        """Begin a message whose bytes follow."""
+        """Begin a message whose bytes follow by ``extend``."""
         ...
 
     def extend(self, parcel: QueuedMessage, data: Buffer) -> int:
-        """Send further bytes of it."""
+        """Send further bytes of it; return how many older messages were dropped for it."""
         ...
 
     def abandon(self, parcel: QueuedMessage) -> None:
@@ -50,11 +49,11 @@ class DataLane(Protocol):
         ...
 
     def set_terms(self, route: int, depth: int, max_age: float | None, *, strict: bool) -> None:
-        """Bound what may wait of a route."""
+        """Bound what may wait of a route: ``depth`` messages, each for ``max_age`` seconds."""
         ...
 
     def discard(self, route: int) -> None:
-        """Let go of what waits of a route, and of its terms."""
+        """Drop what waits of a route, and its bounds."""
         ...
 
 
@@ -63,20 +62,20 @@ class DataLink(Protocol):
 
     @property
     def express(self) -> DataLane:
-        """Small and urgent messages."""
+        """The lane for small and urgent messages."""
         ...
 
     @property
     def bulk(self) -> DataLane:
-        """Large ones."""
+        """The lane for large messages."""
         ...
 
 
 class RouteSender:
-    """One route, best effort.
+    """Sends the messages of one best-effort route.
 
     Args:
-        link: The peer's.
+        link: The link to the peer.
         route: The route's id.
         contract: What holds for it.
         large: Whether the source is known to have large messages.
@@ -91,83 +90,86 @@ class RouteSender:
         self._depth = mesh_limits.KEEP_ALL_MESSAGES if contract.history is History.KEEP_ALL else contract.depth
         self.sequence = 0
         self.dropped = 0
-        """Messages that gave way because a bound of ours was reached."""
+        """Messages dropped here because a bound was reached; those dropped by the lane are counted there."""
         self._loop = asyncio.get_running_loop()
         self._lane: DataLane = link.express
         self._switch = LaneSwitch(contract, large=large)
         self._small = mesh_limits.EXPRESS_MESSAGE_MAX
         self._held: deque[tuple[int, int, bytes]] = deque()
+        """Sequence, stamp and bytes of messages that wait until the lane has changed."""
         self._held_bytes = 0
-        self._parcel: QueuedMessage | None = None
-        self._throttle = Downsampler(contract.max_rate) if contract.max_rate is not None else None
+        self._open_message: QueuedMessage | None = None
+        self._downsampler = Downsampler(contract.max_rate) if contract.max_rate is not None else None
         self._newest: tuple[int, bytes] | None = None
+        """Stamp and bytes of the message that down-sampling sends next."""
         self._timer: asyncio.TimerHandle | None = None
         self._direct = False
-        self._set_terms()
-        self._settle()
+        """Whether a small message needs no further look: see ``message``."""
+        self._set_bounds()
+        self._use_lane()
 
     @property
     def lane(self) -> str:
-        """``express`` or ``bulk``."""
+        """``express`` or ``bulk``, for people."""
         return self._switch.lane.name.lower()
 
     @property
     def large(self) -> bool:
-        """Whether its messages go, or are about to go, by the bulk lane."""
+        """Whether its messages use, or are about to use, the bulk lane."""
         return self._switch.target is not EXPRESS
 
     @property
     def skipped(self) -> int:
         """Messages left out to keep to the contract's rate."""
-        return self._throttle.skipped if self._throttle is not None else 0
+        return self._downsampler.skipped if self._downsampler is not None else 0
 
     def message(self, stamp_ns: int, framed: Buffer) -> int:
         """Send one message; return how many older ones were dropped for it."""
         if self._direct and len(framed) <= self._small:
-            self.sequence = sequence = self.sequence + 1 & _SEQUENCE_MASK
+            self.sequence = sequence = self.sequence + 1 & SERIAL_MASK
             return self._lane.send(self.route, sequence, stamp_ns, framed)
-        if self._throttle is not None and not self._throttle.admit(self._loop.time()):
-            self._wait_for_turn(self._throttle, stamp_ns, framed)
+        if self._downsampler is not None and not self._downsampler.admit(self._loop.time()):
+            self._keep_newest(self._downsampler, stamp_ns, framed)
             return 0
-        if self._throttle is not None and self._newest is not None:
-            self._throttle.skipped += 1
+        if self._downsampler is not None and self._newest is not None:
+            self._downsampler.skipped += 1
             self._newest = None
         return self._send(stamp_ns, framed)
 
     def begin(self, stamp_ns: int, size: int) -> bool:
-        """Begin a message of ``size`` bytes; whether its parts can go as they come, else give it whole."""
-        if self._throttle is not None or not self._lane_for(size):
+        """Begin a message of ``size`` bytes; return whether its parts can be sent as they come, or only whole."""
+        if self._downsampler is not None or not self._lane_for(size):
             return False
-        self.sequence = self.sequence + 1 & _SEQUENCE_MASK
-        self._parcel = self._lane.open(self.route, size, self.sequence, stamp_ns)
+        self.sequence = self.sequence + 1 & SERIAL_MASK
+        self._open_message = self._lane.open(self.route, size, self.sequence, stamp_ns)
         return True
 
     def part(self, part: Buffer) -> int:
         """Send a part of a message that was begun; return how many older messages were dropped for it."""
-        return self._lane.extend(self._parcel, part) if self._parcel is not None else 0
+        return self._lane.extend(self._open_message, part) if self._open_message is not None else 0
 
     def abort(self) -> None:
         """The rest of the message that was begun will never come."""
-        if self._parcel is not None:
-            self._lane.abandon(self._parcel)
-            self._parcel = None
+        if self._open_message is not None:
+            self._lane.abandon(self._open_message)
+            self._open_message = None
 
     def fenced(self, number: int) -> None:
         """The peer has answered a fence."""
         if self._switch.fenced(number):
-            self._go_on()
+            self._resume_lane()
 
     def acknowledged(self, sequence: int) -> None:
-        """The peer has everything up to a message; nobody asked, for best effort."""
+        """The peer has everything up to a message; a best-effort route does not need to know."""
 
     def lane_lost(self) -> None:
         """The bulk lane's connection is gone."""
         if self._switch.lane_lost():
             self._discard_bulk()
-            self._go_on()
+            self._resume_lane()
 
     def close(self) -> None:
-        """No more messages go this way."""
+        """Send no more messages."""
         self.link = None
         self._direct = False
         self._held.clear()
@@ -178,13 +180,13 @@ class RouteSender:
     # --- inside ---------------------------------------------------------------------------------------------
 
     def _send(self, stamp_ns: int, framed: Buffer) -> int:
-        self.sequence = sequence = self.sequence + 1 & _SEQUENCE_MASK
+        self.sequence = sequence = self.sequence + 1 & SERIAL_MASK
         if self._lane_for(len(framed)):
             return self._lane.send(self.route, sequence, stamp_ns, framed)
         return self._hold(sequence, stamp_ns, bytes(framed))
 
     def _lane_for(self, size: int) -> bool:
-        """Whether a message may go by the present lane now; begins to change it where it may not."""
+        """Whether a message may be sent by the present lane now; begins to change the lane where it may not."""
         if self.link is None or self._switch.fencing:
             return False
         if not self._switch.judge(size, self._loop.time()):
@@ -209,8 +211,8 @@ class RouteSender:
         self.dropped += dropped
         return dropped
 
-    def _go_on(self) -> None:
-        self._settle()
+    def _resume_lane(self) -> None:
+        self._use_lane()
         held, self._held = self._held, deque()
         self._held_bytes = 0
         for sequence, stamp_ns, payload in held:
@@ -221,23 +223,23 @@ class RouteSender:
                 self._hold(sequence, stamp_ns, payload)
 
     def _discard_bulk(self) -> None:
-        """Let go of what waits for the bulk lane's next connection: it would come behind what is sent now."""
+        """Drop what waits for the bulk lane's next connection: it would arrive behind what is sent now."""
         if self.link is not None:
             self.link.bulk.discard(self.route)
-            self._set_terms()
+            self._set_bounds()
 
-    def _settle(self) -> None:
-        """Use the switch's lane; begin to change it at once where it is not the one that is wanted."""
+    def _use_lane(self) -> None:
+        """Use the lane that the switch is on; begin to change it at once where it is not the one that is wanted."""
         if self.link is None:
             return
         self._lane = self.link.express if self._switch.lane is EXPRESS else self.link.bulk
         if self._switch.target is not self._switch.lane:
             self._begin_fence()
             return
-        # On the way back from the bulk lane each message is counted, so only the express lane is direct.
-        self._direct = self._switch.lane is EXPRESS and self._throttle is None
+        # Messages on the bulk lane are counted for the way back, so only the express lane is direct.
+        self._direct = self._switch.lane is EXPRESS and self._downsampler is None
 
-    def _set_terms(self) -> None:
+    def _set_bounds(self) -> None:
         if self.link is None:
             return
         contract = self.contract
@@ -248,20 +250,20 @@ class RouteSender:
             strict = contract.lifespan is not None
             lane.set_terms(self.route, self._depth, contract.lifespan if strict else stale, strict=strict)
 
-    def _wait_for_turn(self, throttle: Downsampler, stamp_ns: int, framed: Buffer) -> None:
-        """Keep the newest until the beat lets it go."""
+    def _keep_newest(self, downsampler: Downsampler, stamp_ns: int, framed: Buffer) -> None:
+        """Keep a message, in place of an older one, until the rate allows it."""
         if self._newest is not None:
-            throttle.skipped += 1
+            downsampler.skipped += 1
         self._newest = (stamp_ns, bytes(framed))
         if self._timer is None:
-            self._timer = self._loop.call_at(throttle.due, self._turn_came)
+            self._timer = self._loop.call_at(downsampler.due, self._send_newest)
 
-    def _turn_came(self) -> None:
+    def _send_newest(self) -> None:
         self._timer = None
-        if self._newest is None or self._throttle is None:
+        if self._newest is None or self._downsampler is None:
             return
-        if not self._throttle.admit(self._loop.time()):
-            self._timer = self._loop.call_at(self._throttle.due, self._turn_came)
+        if not self._downsampler.admit(self._loop.time()):
+            self._timer = self._loop.call_at(self._downsampler.due, self._send_newest)
             return
         stamp_ns, payload = self._newest
         self._newest = None
@@ -269,13 +271,13 @@ class RouteSender:
 
 
 class ReliableRouteSender(RouteSender):
-    """One route whose messages are kept until the peer has them, over links that fall and come back.
+    """Sends the messages of one reliable route: each is kept until the peer has it, over links that come and go.
 
     Args:
-        link: The peer's.
+        link: The link to the peer.
         route: The route's id.
         contract: What holds for it.
-        epoch: Names this numbering.
+        epoch: Names this numbering; see ``mesh.reliable``.
         large: Whether the source is known to have large messages.
     """
 
@@ -291,12 +293,12 @@ class ReliableRouteSender(RouteSender):
             epoch,
         )
         self._keep: Callable[[bytes, int], object] | None = None
-        self._told = 0
+        self._reported = 0
         super().__init__(link, route, contract, large=large)
         self._direct = False
 
     def begin(self, stamp_ns: int, size: int) -> bool:  # noqa: ARG002 - as the other kind
-        """A message that may have to be sent again is wanted whole."""
+        """A message that may have to be sent again is needed whole."""
         return False
 
     def acknowledged(self, sequence: int) -> None:
@@ -305,14 +307,14 @@ class ReliableRouteSender(RouteSender):
         self._pump()
 
     def lane_lost(self) -> None:
-        """The bulk lane's connection is gone: what was on it is sent again; the peer leaves out what it has."""
+        """The bulk lane's connection is gone: send again what was on it; the peer leaves out what it has."""
         if self._switch.lane is EXPRESS or self.link is None:
             return
-        # What still waits for the lane comes again too, in its place: in front of those torn it would be a gap.
+        # What still waits for the lane is sent again too: in front of the lost ones it would show as a gap.
         self._discard_bulk()
         self.sender.rewind()
         if self._switch.lane_lost():
-            self._go_on()
+            self._resume_lane()
         else:
             self._pump()
 
@@ -320,8 +322,8 @@ class ReliableRouteSender(RouteSender):
         """The link is gone; messages are kept until ``resume``, or until it is given up.
 
         Args:
-            keep: ``(payload, stamp_ns)``: offers a message to the sender, and sees to it that all suspended ones
-                together keep no more than they may.
+            keep: ``(payload, stamp_ns)``: offers a message to the sender within the bounds that all suspended
+                senders have together.
         """
         self.link = None
         self._keep = keep
@@ -330,24 +332,24 @@ class ReliableRouteSender(RouteSender):
     def resume(self, link: DataLink, route: int, after: int) -> None:
         """There is a new link, and the peer has everything up to ``after``.
 
-        An acknowledgement may know better: of two links that came up at once, the older one's word came last.
+        A later acknowledgement counts more: of two links that came up at once, the older one's message came last.
 
         Raises:
-            RemoteProtocolError: It cannot have.
+            RemoteProtocolError: It claims what was never sent, or less than it acknowledged.
         """
         known = self.sender.confirmed
-        self.sender.resume(known if after - known & _SEQUENCE_MASK >= _HALF else after)
+        self.sender.resume(known if is_earlier(after, known) else after)
         self._keep = None
         self.link, self.route = link, route
         self._switch.restart()
-        self._set_terms()
-        self._settle()
+        self._set_bounds()
+        self._use_lane()
         self._direct = False
         self._pump()
 
     def missed(self) -> int:
-        """Messages that the peer will never get, since this was asked last."""
-        missed, self._told = self.sender.lost - self._told, self.sender.lost
+        """Messages that the peer will never get, since the last call."""
+        missed, self._reported = self.sender.lost - self._reported, self.sender.lost
         return missed
 
     # --- inside ---------------------------------------------------------------------------------------------
@@ -368,27 +370,27 @@ class ReliableRouteSender(RouteSender):
         while self.link is not None and not self._switch.fencing:
             for message in self.sender.take(1):
                 if not self._lane_for(len(message.payload)):
-                    self.sender.untake()
+                    self.sender.put_back()
                     return
                 self._lane.send(self.route, message.sequence, message.stamp_ns, message.payload)
                 break
             else:
                 return
 
-    def _go_on(self) -> None:
-        self._settle()
+    def _resume_lane(self) -> None:
+        self._use_lane()
         self._direct = False
         self._pump()
 
-    def _set_terms(self) -> None:
-        """Nothing that was numbered may be dropped from a queue; the window bounds it instead."""
+    def _set_bounds(self) -> None:
+        """Bound nothing: what was numbered may not be dropped from a queue, and the window bounds it."""
         if self.link is not None:
             for lane in (self.link.express, self.link.bulk):
                 lane.set_terms(self.route, mesh_limits.KEEP_ALL_MESSAGES, None, strict=False)
 
 
 def make_route_sender(link: DataLink, route: int, contract: Contract, epoch: int, *, large: bool) -> RouteSender:
-    """The leg that a contract asks for."""
+    """The kind of sender that a contract asks for."""
     if contract.reliability is Reliability.RELIABLE:
         return ReliableRouteSender(link, route, contract, epoch, large=large)
     return RouteSender(link, route, contract, large=large)

@@ -61,7 +61,7 @@ class BodyLane(Protocol):
 
 
 class BodyLink(Protocol):
-    """What is needed of a link (``mesh.io.link.MeshLink``)."""
+    """What is needed of a link (``mesh.io.link.PeerLink``)."""
 
     @property
     def express(self) -> BodyLane:

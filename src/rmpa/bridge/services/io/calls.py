@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
 from rmpa.bridge.services.io.bodies import BodyReceiver, BodySender, Budget
+from rmpa.core.serial_number import SERIAL_MASK
 from rmpa.core.stats import SampleRing
 from rmpa.mesh import limits as mesh_limits
 
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from rmpa.ros.node.service_server import ServiceCall
     from rmpa.runtime.stream import Buffer
 
-_MASK: Final = (1 << 32) - 1
 _OK: Final = b"\x01"
 _FAILED: Final = b"\x00"
 _RECENT: Final = 64
@@ -100,7 +100,7 @@ class Caller(BodyReceiver):
             call.fail(text)
             return
         stats.active += 1
-        self._serial = serial = self._serial + 1 & _MASK
+        self._serial = serial = self._serial + 1 & SERIAL_MASK
         call.on_gone = partial(self._gone, serial)
         now = self.used_at = self._loop.time()
         self._pending[serial] = (call, now, size > mesh_limits.EXPRESS_MESSAGE_MAX)

@@ -7,13 +7,14 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from rmpa.bridge import limits
-from rmpa.bridge.data.io.flows import ExportFlow
+from rmpa.bridge.data.io.export_flow import ExportFlow
 from rmpa.bridge.data.io.route_sender import ReliableRouteSender
 from rmpa.bridge.data.losses import LossRecords
 from rmpa.bridge.messages import Description, Source
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.core.errors import RemoteProtocolError
-from rmpa.mesh.reliable import ResumeTable
+from rmpa.core.serial_number import is_later, serial_add
+from rmpa.mesh.resume_table import ResumeTable
 from rmpa.ros.node.subscription import PublisherConnection
 from rmpa.ros.wire.tcpros import TopicDescription as TcprosDescription
 from rmpa.runtime.descriptors import DESCRIPTORS
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
     from rmpa.ros.node.slave_node import SlaveNode
 
 _log = logging.getLogger(__name__)
-_SEQUENCE_MASK: Final = (1 << 32) - 1
-_HALF: Final = 1 << 31
 _TOO_LONG: Final = "it was away for longer than they were kept"
 _ENDED: Final = "its route had ended before they had come"
 
@@ -188,7 +187,7 @@ class LocalSubscriptions:
             return None
         waiting = leg.sender.following
         # What is kept may have come: what the peer has is not sent again.
-        return waiting if waiting - after - 1 & _SEQUENCE_MASK < _HALF else after + 1 & _SEQUENCE_MASK
+        return waiting if is_later(waiting, after) else serial_add(after, 1)
 
     def settle(self, source: Source, peer: int, epoch: int, after: int) -> Missed | None:
         """A peer asks for a source anew; see ``bridge.data.losses.Kept``."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.bridge import limits
 from rmpa.bridge.actions import Publish
-from rmpa.bridge.data.io.flows import ImportFlow
+from rmpa.bridge.data.io.import_flow import ImportFlow
 from rmpa.bridge.data.io.link_time import LinkTime
 from rmpa.bridge.proxy_names import proxy_name
 from rmpa.bridge.session.proxy_nodes import ProxyNodes

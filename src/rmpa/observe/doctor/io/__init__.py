@@ -1,1 +1,1 @@
-"""TODO room."""
+"""Reads the machine for ``rmpa doctor``, and lists the checks."""

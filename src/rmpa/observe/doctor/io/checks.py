@@ -1,46 +1,64 @@
-"""Everything that ``rmpa doctor`` looks at, one group of checks after the other."""
+"""All checks of ``rmpa doctor``. A new check goes here.
+
+A check is a function of ``DoctorInput``. It reads something of this machine, by a module of this folder, and has a
+pure ``judge_…`` function of the folder above say what that means. ``CHECKS`` lists them.
+"""
 
 from __future__ import annotations
 
 import socket
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import rmpa
 from rmpa.config.settings import Settings
 from rmpa.config.sources import Flags, load_settings
-from rmpa.core.errors import ConfigError, RmpaError
+from rmpa.core.errors import ConfigError, RmpaError, StartError
+from rmpa.discovery.io.interfaces import choose, list_interfaces
 from rmpa.observe import limits
+from rmpa.observe.check import FAIL, OK, SKIPPED, WARN, Check
 from rmpa.observe.doctor.agents import judge_agents
-from rmpa.observe.doctor.finding import Finding, FindingLevel
 from rmpa.observe.doctor.io import machine, network
+from rmpa.observe.doctor.io.firewall import check_firewall
+from rmpa.observe.doctor.io.multicast import hear_ourselves
 from rmpa.observe.doctor.io.programs import resolve
 from rmpa.observe.doctor.machine import judge_clock, judge_rights
-from rmpa.observe.doctor.network import judge_cards, judge_mtu_probing, judge_ports, judge_routes, judge_rp_filter
+from rmpa.observe.doctor.network import (
+    judge_interfaces,
+    judge_mtu_probing,
+    judge_multicast,
+    judge_ports,
+    judge_routes,
+    judge_rp_filter,
+)
 from rmpa.observe.doctor.ros_environment import RosShell, judge_shell, names_of
 from rmpa.observe.io.control_client import ControlClient, find_agents
 from rmpa.observe.snapshot import Snapshot
 from rmpa.ros.environment import DEFAULT_MASTER_URI, host_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
+
+    from rmpa.observe.doctor.network import NetworkInterface
 
 
 @dataclass(frozen=True, slots=True)
 class DoctorInput:
-    """What the checks are about.
+    """What several checks need, read once.
 
     Args:
         environ: The shell's variables.
         settings: What an agent that is started here would have; the defaults where they cannot be read.
-        problems: What is wrong with the settings.
-        agents: What each agent of this machine shows, by its name, or why it does not answer.
+        settings_checks: What reading the settings brought.
+        agents: The snapshot of each agent of this machine by its name, or why it does not answer.
+        interfaces: All network interfaces.
     """
 
     environ: Mapping[str, str]
     settings: Settings
-    problems: tuple[Finding, ...]
+    settings_checks: tuple[Check, ...]
     agents: Mapping[str, Snapshot | str]
+    interfaces: tuple[NetworkInterface, ...]
 
     @property
     def snapshots(self) -> dict[str, Snapshot]:
@@ -48,24 +66,27 @@ class DoctorInput:
         return {name: shown for name, shown in self.agents.items() if isinstance(shown, Snapshot)}
 
 
+@dataclass(frozen=True, slots=True)
+class DoctorCheck:
+    """One row of ``CHECKS``.
+
+    Args:
+        name: What it looks at; at least one of its results has this name.
+        run: Looks, and says what was found; takes two seconds at the most where nothing hangs.
+    """
+
+    name: str
+    run: Callable[[DoctorInput], Iterable[Check]]
+
+
 def look_at(environ: Mapping[str, str], config: str | None = None) -> DoctorInput:
-    """Read the settings, and ask the agents.
+    """Read the settings and the interfaces, and ask the agents.
 
     Args:
         environ: The shell's variables.
         config: The settings' file; the usual places by default.
     """
-    settings, problems = Settings(), []
-    try:
-        loaded = load_settings(Flags(config=config), environ, host_name=socket.gethostname())
-    except ConfigError as error:
-        problems.append(Finding("settings", error.source, FindingLevel.FAIL, str(error), "`rmpa up` will not start"))
-    else:
-        settings = loaded.settings
-        where = f"read from {settings.config_file}" if settings.config_file else "no file; defaults and variables"
-        text = f"{where}: name {settings.name}, domain {settings.domain}"
-        problems.append(Finding("settings", "", FindingLevel.OK, text))
-        problems += [Finding("settings", "", FindingLevel.WARN, note) for note in loaded.notes]
+    settings, checks = _settings(environ, config)
     agents: dict[str, Snapshot | str] = {}
     for found in find_agents(environ):
         try:
@@ -73,81 +94,118 @@ def look_at(environ: Mapping[str, str], config: str | None = None) -> DoctorInpu
                 agents[found.name] = client.snapshot()
         except RmpaError as error:
             agents[found.name] = str(error)
-    return DoctorInput(environ, settings, tuple(problems), agents)
+    return DoctorInput(environ, settings, checks, agents, network.read_interfaces(settings.interfaces))
 
 
-def examine(patient: DoctorInput) -> Iterator[Finding]:
-    """Each finding as soon as it is there; the whole takes some two seconds."""
-    settings, snapshots = patient.settings, patient.snapshots
-    yield from patient.problems
-    yield from judge_agents(patient.agents, rmpa.__version__)
-    cards = network.look_at_cards(settings.interfaces)
-    yield from judge_cards(cards, settings.interfaces, container=network.in_container())
-    yield from network.look_at_multicast(settings)
-    yield from network.look_at_firewall(settings)
-    yield from judge_rp_filter(network.look_at_rp_filter(), cards)
-    holes = any(peer.link and peer.link.path_problem for shown in snapshots.values() for peer in shown.peers)
-    yield judge_mtu_probing(network.look_at_mtu_probing(), black_hole=holes)
-    yield from judge_routes(_routes(patient))
-    yield from judge_ports(network.look_at_ports(settings, _ports(snapshots), _processes(snapshots)))
-    yield from judge_shell(_shell(patient, {str(n.ip) for card in cards for n in card.networks}))
-    yield from judge_clock(machine.look_at_clock())
-    yield from judge_rights(machine.look_at_rights(wanted=settings.realtime.enabled, agents=bool(snapshots)))
+def _settings(environ: Mapping[str, str], config: str | None) -> tuple[Settings, tuple[Check, ...]]:
+    try:
+        loaded = load_settings(Flags(config=config), environ, host_name=socket.gethostname())
+    except ConfigError as error:
+        return Settings(), (Check("settings", FAIL, str(error), "`rmpa up` will not start", where=error.source),)
+    settings = loaded.settings
+    where = f"read from {settings.config_file}" if settings.config_file else "no file; defaults and variables"
+    read = Check("settings", OK, f"{where}: name {settings.name}, domain {settings.domain}")
+    return settings, (read, *(Check("settings", WARN, note) for note in loaded.notes))
 
 
-def _routes(patient: DoctorInput) -> dict[str, str]:
+def examine(given: DoctorInput) -> Iterator[Check]:
+    """Run all checks; each result comes as soon as it is there. The whole takes some two seconds."""
+    for check in CHECKS:
+        yield from check.run(given)
+
+
+def _interfaces(given: DoctorInput) -> Iterable[Check]:
+    return judge_interfaces(given.interfaces, given.settings.interfaces, container=network.in_container())
+
+
+def _multicast(given: DoctorInput) -> Iterable[Check]:
+    """Send and receive on each interface that an agent would use, at the agents' own port."""
+    settings = given.settings
+    if not settings.multicast:
+        return [Check("multicast", SKIPPED, "the settings switch it off (discovery.multicast)")]
+    usable = choose(list_interfaces(), settings.interfaces)
+    try:
+        echoes = hear_ourselves(usable, settings.group, settings.discovery_port)
+    except StartError as error:
+        return [Check("multicast", FAIL, f"{error.what} {error.problem}", error.remedy)]
+    return judge_multicast(echoes, settings.group, settings.discovery_port)
+
+
+def _mtu_probing(given: DoctorInput) -> Iterable[Check]:
+    holes = any(peer.link and peer.link.path_problem for shown in given.snapshots.values() for peer in shown.peers)
+    return [judge_mtu_probing(network.read_mtu_probing(), black_hole=holes)]
+
+
+def _routes(given: DoctorInput) -> Iterable[Check]:
     targets = {
         address.partition(":")[0]: f"{address.partition(':')[0]} ({peer.name})"
-        for snapshot in patient.snapshots.values()
+        for snapshot in given.snapshots.values()
         for peer in snapshot.peers
         for address in peer.addresses[:1]
     }
-    names = [seed.host for seed in patient.settings.seeds]
+    names = [seed.host for seed in given.settings.seeds]
     known = resolve(names)
     for seed, addresses in known.items():
         targets |= {address: f"{address} (seed {seed})" for address in addresses[:1]}
-    found = {text: network.look_at_route(host) for host, text in targets.items()}
-    return found | {f"seed {name}": "nobody knows this name" for name in names if not known[name]}
+    found = {text: network.probe_route(host) for host, text in targets.items()}
+    return judge_routes(found | {f"seed {name}": "nobody knows this name" for name in names if not known[name]})
 
 
-def _processes(snapshots: Mapping[str, Snapshot]) -> dict[int, str]:
-    """The agents of this machine, by their processes."""
-    return {snapshot.agent.pid: name for name, snapshot in snapshots.items()}
-
-
-def _ports(snapshots: Mapping[str, Snapshot]) -> dict[int, str]:
-    """The ports that agents of this machine have."""
-    found = {}
-    for name, snapshot in snapshots.items():
+def _ports(given: DoctorInput) -> Iterable[Check]:
+    ours, processes = {}, {}
+    for name, snapshot in given.snapshots.items():
+        processes[snapshot.agent.pid] = name
         core = snapshot.agent.core_uri.rstrip("/").rpartition(":")[2]
         mesh = snapshot.agent.guid.partition("#")[0].rpartition(":")[2]
         for number, what in ((core, "the core of agent"), (mesh, "agent")):
             if number.isdecimal():
-                found[int(number)] = f"{what} {name}"
-    return found
+                ours[int(number)] = f"{what} {name}"
+    return judge_ports(network.probe_ports(given.settings, ours, processes))
 
 
-def _shell(patient: DoctorInput, addresses: set[str]) -> RosShell:
-    host_name = socket.gethostname()
-    environ, settings = patient.environ, patient.settings
-    resolved = resolve(names_of(environ, host_name))
-    return RosShell(
-        environ=environ,
+def _shell(given: DoctorInput) -> Iterable[Check]:
+    host_name, settings = socket.gethostname(), given.settings
+    own = {str(of.ip) for interface in given.interfaces for of in interface.networks}
+    shell = RosShell(
+        environ=given.environ,
         host_name=host_name,
-        addresses=frozenset({*addresses, "127.0.0.1"}),
-        resolved=resolved,
-        cores={name: snapshot.agent.core_uri for name, snapshot in patient.snapshots.items()},
-        domains={name: snapshot.agent.domain for name, snapshot in patient.snapshots.items()},
-        answers=_answers(environ.get("ROS_MASTER_URI", "") or DEFAULT_MASTER_URI),
+        addresses=frozenset({*own, "127.0.0.1"}),
+        resolved=resolve(names_of(given.environ, host_name)),
+        cores={name: snapshot.agent.core_uri for name, snapshot in given.snapshots.items()},
+        domains={name: snapshot.agent.domain for name, snapshot in given.snapshots.items()},
+        answers=_accepts(given.environ.get("ROS_MASTER_URI", "") or DEFAULT_MASTER_URI),
         external=(settings.core_master or DEFAULT_MASTER_URI) if settings.core_mode == "external" else "",
     )
+    return judge_shell(shell)
 
 
-def _answers(uri: str) -> bool:
-    """Whether somebody accepts connections where a URI says."""
+def _accepts(uri: str) -> bool:
+    """Whether TCP connections are accepted at a URI's host and port."""
     host, port = host_of(uri), uri.rstrip("/").rpartition(":")[2]
     try:
         with socket.create_connection((host, int(port)), limits.CONTROL_LOOK_TIMEOUT):
             return True
     except (OSError, ValueError, OverflowError):
         return False
+
+
+def _rights(given: DoctorInput) -> Iterable[Check]:
+    rights = machine.probe_rights(wanted=given.settings.realtime.enabled, agents=bool(given.snapshots))
+    return judge_rights(rights)
+
+
+CHECKS: Final = (
+    DoctorCheck("settings", lambda given: given.settings_checks),
+    DoctorCheck("agent", lambda given: judge_agents(given.agents, rmpa.__version__)),
+    DoctorCheck("interface", _interfaces),
+    DoctorCheck("multicast", _multicast),
+    DoctorCheck("firewall", lambda given: check_firewall(given.settings)),
+    DoctorCheck("rp_filter", lambda given: judge_rp_filter(network.read_rp_filter(), given.interfaces)),
+    DoctorCheck("mtu", _mtu_probing),
+    DoctorCheck("route", _routes),
+    DoctorCheck("port", _ports),
+    DoctorCheck("ROS", _shell),
+    DoctorCheck("clock", lambda _: judge_clock(machine.read_clock())),
+    DoctorCheck("realtime", _rights),
+)
+"""All checks, in the order of the output."""

@@ -1,4 +1,4 @@
-"""Looks at clock, rights and files of this machine."""
+"""Reads the clock, the rights and the limits of this machine."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _UNSYNCHRONISED: Final = 0x40
 
 
 class _Timex(ctypes.Structure):
-    """The beginning of ``struct timex``; the rest is room for the kernel to write into."""
+    """The beginning of ``struct timex`` (adjtimex(2)), with room for the rest of it."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),
@@ -32,8 +32,8 @@ class _Timex(ctypes.Structure):
     )
 
 
-def look_at_clock() -> WallClock:
-    """Watch the clock for a moment, and ask the kernel whether it follows another one."""
+def read_clock() -> WallClock:
+    """Watch the wall clock for ``limits.DOCTOR_CLOCK_LOOK``, and ask the kernel whether it is synchronised."""
     before = time.time() - time.monotonic()
     time.sleep(limits.DOCTOR_CLOCK_LOOK)
     after = time.time() - time.monotonic()
@@ -50,12 +50,12 @@ def look_at_clock() -> WallClock:
     )
 
 
-def look_at_rights(*, wanted: bool, agents: bool) -> KernelRights:
-    """Try SCHED_FIFO in a thread that ends at once, and read the limits.
+def probe_rights(*, wanted: bool, agents: bool) -> KernelRights:
+    """Try SCHED_FIFO in a thread of its own, and read the limits.
 
     Args:
         wanted: Whether the settings ask for real time.
-        agents: Whether an agent runs, which tells its own limit of open files.
+        agents: Whether an agent runs: its snapshot has its own limit of open files.
     """
     refusal = ["it was not tried"]
 
@@ -81,7 +81,7 @@ def look_at_rights(*, wanted: bool, agents: bool) -> KernelRights:
 
 
 def _may_lock() -> bool:
-    """Whether we are above the limit of locked memory (CAP_IPC_LOCK)."""
+    """Whether this process has CAP_IPC_LOCK, which the limit of locked memory does not bind."""
     for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
         if line.startswith("CapEff:"):
             return bool(int(line.split()[1], 16) >> 14 & 1)

@@ -1,4 +1,4 @@
-"""Multicast by hand: one socket that sends on a chosen interface, one that hears on chosen ones."""
+"""Sends and receives multicast packets on chosen interfaces: for ``rmpa doctor`` and ``rmpa multicast``."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from rmpa.discovery import limits as discovery_limits
 from rmpa.discovery.beacon import MAGIC, VERSION, BeaconKind
 from rmpa.discovery.io.sockets import Membership, open_receiver, receive
 from rmpa.observe import limits
+from rmpa.observe.doctor.network import MulticastEcho
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -24,17 +25,17 @@ if TYPE_CHECKING:
 _PKTINFO: Final = struct.Struct("@i4s4s")
 _IP_PKTINFO: Final = 8  # Linux's (linux/in.h); not in the socket module of every supported Python
 _NO_DOMAIN: Final = 0xFFFF
-"""Beyond every domain: agents pass such a beacon over without a word."""
+"""Greater than every domain: agents ignore beacons of it without logging."""
 
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One packet of the group.
+    """A packet that was received.
 
     Args:
         data: Its payload.
         source: ``address:port`` of its sender.
-        interface: The name of the interface that it came by.
+        interface: The name of the interface that it came in on.
     """
 
     data: bytes
@@ -42,23 +43,11 @@ class Packet:
     interface: str
 
 
-class GroupSender:
-    """Sends to one group, interface by interface; a context manager.
+class _Socket:
+    """A socket that a ``with`` block closes."""
 
-    Args:
-        group: Its address.
-        port: Its port.
-
-    Raises:
-        ConfigError: It is no multicast group.
-    """
-
-    def __init__(self, group: str, port: int) -> None:
-        _check_group(group)
-        self._to = (group, port)
-        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
-        self._sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, discovery_limits.MULTICAST_TTL)
-        self._sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
+    def __init__(self, sock: socket.socket) -> None:
+        self._sock = sock
 
     def __enter__(self) -> Self:
         return self
@@ -66,8 +55,27 @@ class GroupSender:
     def __exit__(self, *_: object) -> None:
         self._sock.close()
 
+
+class GroupSender(_Socket):
+    """A socket that sends to a group on an interface of choice; a context manager.
+
+    Args:
+        group: Its address.
+        port: Its port.
+
+    Raises:
+        ConfigError: The address is not a multicast group's.
+    """
+
+    def __init__(self, group: str, port: int) -> None:
+        _check_group(group)
+        self._to = (group, port)
+        super().__init__(socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC))
+        self._sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, discovery_limits.MULTICAST_TTL)
+        self._sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
+
     def send(self, interface: Interface, data: bytes) -> str:
-        """Send one packet; return why it could not be, or an empty string."""
+        """Send one packet; return why that failed, or an empty string."""
         source = interface.addresses[0].packed if interface.addresses else bytes(4)
         ancillary = [(socket.IPPROTO_IP, _IP_PKTINFO, _PKTINFO.pack(interface.index, source, bytes(4)))]
         try:
@@ -77,93 +85,72 @@ class GroupSender:
         return ""
 
 
-class GroupReceiver:
-    """Hears what comes for one group on the interfaces that it joined; a context manager.
+class GroupReceiver(_Socket):
+    """A socket that receives the packets of a group on the interfaces where it joined; a context manager.
 
     Args:
         group: Its address.
-        port: Its port; agents and others may have it too.
+        port: Its port, which is shared with agents and others.
 
     Raises:
-        ConfigError: It is no multicast group.
-        StartError: Somebody holds the port and does not share it.
+        ConfigError: The address is not a multicast group's.
+        StartError: Another program has the port and does not share it.
     """
 
     def __init__(self, group: str, port: int) -> None:
         _check_group(group)
         try:
-            self._sock = open_receiver(group, port)
+            super().__init__(open_receiver(group, port))
         except OSError as error:
             problem = f"cannot be opened ({error.strerror})"
             raise StartError(f"UDP port {port}", problem, "`ss -ulnp` shows who has it") from None
         self._members = Membership(self._sock, group)
         self._names: dict[int, str] = {}
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._sock.close()
-
     def join(self, interfaces: Iterable[Interface]) -> dict[str, str]:
-        """Join the group on these; return the names of those that refused, and why."""
+        """Join the group on these interfaces; return why it failed, by the names of those where it did."""
         wanted = tuple(interfaces)
         self._names = {interface.index: interface.name for interface in wanted}
         refused = self._members.update(wanted)
         return {name: error.strerror or str(error) for name, error in refused.items()}
 
     def wait(self, timeout: float | None = None) -> Packet | None:
-        """The next packet, or ``None`` if none came in time (seconds; ``None``: for ever)."""
+        """The next packet, or ``None`` after ``timeout`` seconds; without a time-out it waits for ever."""
         if not select.select([self._sock], [], [], None if timeout is None else max(0.0, timeout))[0]:
             return None
         try:
             data, (host, port), index = receive(self._sock)
         except BlockingIOError:
-            return None  # its checksum was wrong
+            return None  # the kernel dropped it: its checksum was wrong
         return Packet(data, f"{host}:{port}", self._names.get(index, f"interface {index}"))
 
 
-@dataclass(frozen=True, slots=True)
-class FlowOutcome:
-    """What became of a packet that was sent to ourselves on one interface.
+def hear_ourselves(interfaces: Iterable[Interface], group: str, port: int) -> tuple[MulticastEcho, ...]:
+    """Send one packet on each interface, and receive it there as an agent does.
 
-    Args:
-        interface: Which.
-        problem: Why it could not be sent or joined; empty if it could.
-        after: Seconds until it came back; ``None`` if it did not.
-    """
-
-    interface: Interface
-    problem: str = ""
-    after: float | None = None
-
-
-def hear_ourselves(interfaces: Iterable[Interface], group: str, port: int) -> tuple[FlowOutcome, ...]:
-    """Send one packet on each interface, and listen for it there as an agent does.
-
-    The packets are beacons of a domain that there cannot be, so agents that hear them pass them over.
+    The packets are beacons of a domain that cannot exist, so agents ignore them.
 
     Raises:
-        StartError: Somebody holds the port and does not share it.
+        StartError: Another program has the port and does not share it.
     """
     wanted = tuple(interfaces)
-    found: dict[str, FlowOutcome] = {}
+    found: dict[str, MulticastEcho] = {}
     with GroupReceiver(group, port) as receiver, GroupSender(group, port) as sender:
         refused = receiver.join(wanted)
         sent: dict[bytes, tuple[Interface, float]] = {}
         for interface in wanted:
             token = struct.pack(">4sBBH", MAGIC, VERSION, BeaconKind.HEARTBEAT, _NO_DOMAIN) + secrets.token_bytes(16)
             problem = refused.get(interface.name) or sender.send(interface, token)
-            found[interface.name] = FlowOutcome(interface, problem)
+            found[interface.name] = MulticastEcho(interface.name, problem)
             if not problem:
                 sent[token] = (interface, time.monotonic())
         until = time.monotonic() + limits.DOCTOR_HEAR
         while sent and (rest := until - time.monotonic()) > 0:
             packet = receiver.wait(rest)
-            # The same packet may come in on another interface too, where two share a network.
+            # Where two interfaces share a network, the packet comes in on the other one too.
             if packet is not None and packet.data in sent and sent[packet.data][0].name == packet.interface:
                 interface, when = sent.pop(packet.data)
-                found[interface.name] = FlowOutcome(interface, after=time.monotonic() - when)
+                found[interface.name] = MulticastEcho(interface.name, after=time.monotonic() - when)
     return tuple(found.values())
 
 

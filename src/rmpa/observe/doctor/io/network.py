@@ -1,4 +1,4 @@
-"""Looks at the network of this machine: interfaces, filters, routes, ports, firewalls."""
+"""Reads the network of this machine: interfaces, filters of the kernel, routes, ports."""
 
 from __future__ import annotations
 
@@ -11,14 +11,9 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 
-from rmpa.core.errors import StartError
 from rmpa.discovery.io.interfaces import choose, list_interfaces
 from rmpa.discovery.io.sockets import open_receiver
-from rmpa.observe.doctor.finding import Finding, FindingLevel
-from rmpa.observe.doctor.firewall import judge_rules, read_iptables, read_nft
-from rmpa.observe.doctor.io.multicast import hear_ourselves
-from rmpa.observe.doctor.io.programs import ask_program
-from rmpa.observe.doctor.network import MulticastEcho, NetworkInterface, Port, judge_multicast
+from rmpa.observe.doctor.network import NetworkInterface, Port
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -27,11 +22,11 @@ if TYPE_CHECKING:
 
 _CONF: Final = Path("/proc/sys/net/ipv4/conf")
 _MTU_PROBING: Final = Path("/proc/sys/net/ipv4/tcp_mtu_probing")
-_MARKS_OF_CONTAINERS: Final = (Path("/.dockerenv"), Path("/run/.containerenv"))
+_CONTAINER_MARKS: Final = (Path("/.dockerenv"), Path("/run/.containerenv"))
 
 
-def look_at_cards(wanted: tuple[str, ...]) -> tuple[NetworkInterface, ...]:
-    """All interfaces; ``wanted`` are those that the settings name, none for all."""
+def read_interfaces(wanted: tuple[str, ...]) -> tuple[NetworkInterface, ...]:
+    """All interfaces; ``wanted`` are the names that the settings give, none for all that can be used."""
     there = list_interfaces()
     used = {interface.name for interface in choose(there, wanted)}
     masks = {
@@ -57,32 +52,19 @@ def look_at_cards(wanted: tuple[str, ...]) -> tuple[NetworkInterface, ...]:
 
 
 def in_container() -> bool:
-    """Whether this is a container whose network is not the machine's own."""
-    if "container" not in os.environ and not any(mark.exists() for mark in _MARKS_OF_CONTAINERS):
+    """Whether this is a container with a network namespace of its own."""
+    if "container" not in os.environ and not any(mark.exists() for mark in _CONTAINER_MARKS):
         return False
     with contextlib.suppress(OSError, ValueError):
         link, own = (
             int(Path(f"/sys/class/net/eth0/{name}").read_text(encoding="ascii")) for name in ("iflink", "ifindex")
         )
-        return link != own  # one end of a pair whose other end is outside
+        return link != own  # a veth: its other end is outside
     return False
 
 
-def look_at_multicast(settings: Settings) -> list[Finding]:
-    """Send and hear on each interface that an agent would use, at the agents' own port."""
-    usable = choose(list_interfaces(), settings.interfaces)
-    if not settings.multicast:
-        return [Finding("multicast", "", FindingLevel.SKIPPED, "the settings switch it off (discovery.multicast)")]
-    try:
-        heard = hear_ourselves(usable, settings.group, settings.discovery_port)
-    except StartError as error:
-        return [Finding("multicast", "", FindingLevel.FAIL, f"{error.what} {error.problem}", error.remedy)]
-    echoes = [MulticastEcho(one.interface.name, one.problem, one.after) for one in heard]
-    return judge_multicast(echoes, settings.group, settings.discovery_port)
-
-
-def look_at_rp_filter() -> dict[str, int]:
-    """``rp_filter`` of each interface, and of ``all``."""
+def read_rp_filter() -> dict[str, int]:
+    """``net.ipv4.conf.NAME.rp_filter`` by name, ``all`` among them; empty where the kernel has none."""
     found = {}
     for path in _CONF.glob("*/rp_filter") if _CONF.is_dir() else ():
         with contextlib.suppress(OSError, ValueError):
@@ -90,7 +72,7 @@ def look_at_rp_filter() -> dict[str, int]:
     return found
 
 
-def look_at_mtu_probing() -> int | None:
+def read_mtu_probing() -> int | None:
     """``net.ipv4.tcp_mtu_probing``; ``None`` where there is no such setting."""
     try:
         return int(_MTU_PROBING.read_text(encoding="ascii"))
@@ -98,8 +80,8 @@ def look_at_mtu_probing() -> int | None:
         return None
 
 
-def look_at_route(host: str) -> str:
-    """Why the kernel knows no way to an address, or an empty string; nothing is sent."""
+def probe_route(host: str) -> str:
+    """Why the kernel has no route to an address, or an empty string. Sends nothing."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect((host, 9))
@@ -108,13 +90,13 @@ def look_at_route(host: str) -> str:
     return ""
 
 
-def look_at_ports(settings: Settings, ours: Mapping[int, str], agents: Mapping[int, str]) -> tuple[Port, ...]:
-    """Whether the ports of an agent with these settings can be had.
+def probe_ports(settings: Settings, ours: Mapping[int, str], agents: Mapping[int, str]) -> tuple[Port, ...]:
+    """Try to bind the ports of an agent with these settings.
 
     Args:
         settings: The settings.
-        ours: The ports that agents of this machine have, and whose each is.
-        agents: The agents of this machine that answer, by their processes.
+        ours: The owners of the ports that agents of this machine have, ready to read.
+        agents: The names of the agents of this machine that answer, by process id.
     """
     ports: list[Port] = []
     if settings.core_mode == "embedded":  # an external core has its port already
@@ -143,7 +125,7 @@ def _tcp(what: str, host: str, number: int, ours: Mapping[int, str]) -> Port:
 
 
 def _owner(number: int) -> str:
-    """Which program has a port, where the kernel tells us."""
+    """The program that has a port, ready to read; empty where the kernel does not say."""
     with contextlib.suppress(psutil.Error, OSError):
         for connection in psutil.net_connections("inet"):
             listens = connection.status in (psutil.CONN_LISTEN, psutil.CONN_NONE)
@@ -153,7 +135,7 @@ def _owner(number: int) -> str:
 
 
 def _users(number: int, agents: Mapping[int, str]) -> str:
-    """Which programs use a UDP port that can be shared, ready to read; empty for none."""
+    """The programs that share a UDP port, ready to read; empty for none."""
     names: dict[str, None] = {}
     with contextlib.suppress(psutil.Error, OSError):
         for connection in psutil.net_connections("udp4"):
@@ -170,35 +152,3 @@ def _name(pid: int | None, agents: Mapping[int, str]) -> str:
     with contextlib.suppress(psutil.Error):
         return f"{psutil.Process(pid).name()} (pid {pid})"
     return f"a program (pid {pid})"
-
-
-def look_at_firewall(settings: Settings) -> list[Finding]:
-    """What nftables, iptables and their front ends say."""
-    numbers = frozenset({settings.discovery_port, *((settings.port,) if settings.port else ())})
-    needed = f"UDP port {settings.discovery_port}, and the mesh's port (TCP and UDP"
-    needed += f", {settings.port})" if settings.port else "; it is any one without --port)"
-    found = []
-    for words, read in ((("nft", "list", "ruleset"), read_nft), (("iptables", "-S"), read_iptables)):
-        text = ask_program(*words)
-        if text is not None:
-            found.append(judge_rules(read(text, numbers), needed))
-    if not found:
-        why = "only root may read them" if os.geteuid() else "neither nft nor iptables is here, or they do not answer"
-        found.append(
-            Finding("firewall", "rules", FindingLevel.SKIPPED, why, "" if not os.geteuid() else "run it by sudo")
-        )
-    return found + _front_ends(needed)
-
-
-def _front_ends(needed: str) -> list[Finding]:
-    found = []
-    with contextlib.suppress(OSError):
-        if "ENABLED=yes" in Path("/etc/ufw/ufw.conf").read_text(encoding="utf-8", errors="replace"):
-            text = f"is switched on: it must let in {needed}"
-            found.append(Finding("firewall", "ufw", FindingLevel.WARN, text, "`sudo ufw status` shows its rules"))
-    if any(process.info["name"] == "firewalld" for process in psutil.process_iter(["name"])):
-        text = f"runs: its zone must let in {needed}"
-        found.append(
-            Finding("firewall", "firewalld", FindingLevel.WARN, text, "`firewall-cmd --list-all` shows its zone")
-        )
-    return found

@@ -1,4 +1,4 @@
-"""Other programs of the system, and the resolver: each within a time that a user waits."""
+"""Runs programs of the system, and asks the resolver, each with a time-out."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 
 def ask_program(*words: str) -> str | None:
-    """What a program prints; ``None`` if it is not there, fails, or takes too long."""
+    """What a program prints; ``None`` if it is missing, fails, or takes more than ``limits.DOCTOR_PROGRAM``."""
     path = shutil.which(words[0], path="/usr/sbin:/sbin:/usr/bin:/bin")
     if path is None:
         return None
     try:
-        done = subprocess.run(  # noqa: S603 - our own words, and a program of the system's folders
+        done = subprocess.run(  # noqa: S603 - fixed arguments, and a program of the system's folders
             [path, *words[1:]],
             capture_output=True,
             timeout=limits.DOCTOR_PROGRAM,
@@ -34,7 +34,7 @@ def ask_program(*words: str) -> str | None:
 
 
 def resolve(names: Iterable[str]) -> dict[str, tuple[str, ...]]:
-    """The IPv4 addresses of host names; none for one that is not known within ``limits.DOCTOR_NAME``."""
+    """The IPv4 addresses of host names; none for a name that is not resolved within ``limits.DOCTOR_NAME``."""
     found: dict[str, tuple[str, ...]] = dict.fromkeys(names, ())
 
     def look(name: str) -> None:

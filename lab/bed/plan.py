@@ -1,0 +1,36 @@
+"""What a run is asked for: where, with whose nodes, on which cables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Kind = Literal["classic", "rmpa"]
+"""Which system: one roscore for all hosts, or one agent and core on each host."""
+Size = Literal["short", "full"]
+Client = Literal["rospy", "roscpp", "own"]
+"""Whose nodes: those of the two ROS client libraries, or our own where ROS is not installed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What a run was asked for.
+
+    Args:
+        size: ``full`` for figures to quote; ``short`` to see in a minute or two that everything works.
+        bed: ``namespaces``: hosts with real ROS; ``loopback``: all on this machine with our own nodes and core.
+        clients: Whose nodes take part.
+        link: What each host's cable carries, as ``tc`` writes it (``100mbit``); empty for unshaped.
+        seed: Of all that is left to chance (the order of cells, phases).
+    """
+
+    size: Size = "full"
+    bed: Literal["namespaces", "loopback"] = "namespaces"
+    clients: tuple[Client, ...] = ("rospy", "roscpp")
+    link: str = "100mbit"
+    seed: int = 1
+
+    @property
+    def short(self) -> bool:
+        """Whether this is only to see that everything works."""
+        return self.size == "short"

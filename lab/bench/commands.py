@@ -1,0 +1,134 @@
+"""``python -m lab bench [NAME]... [--quick] [--json FILE]``."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import click
+from rich.console import Console
+
+from lab.bed import namespaces
+from lab.bed.bench import why_no_hosts, why_no_ros
+from lab.bench import (
+    bookkeeping,
+    crosstraffic,
+    decision,
+    idle,
+    joining,
+    load,
+    period,
+    profile,
+    roscore,
+    roundtrips,
+    scale,
+    services,
+    startup,
+    storm,
+    tasks,
+    throughput,
+)
+from lab.bench.contenders import ENTRIES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    Measure = Callable[[bool, Console, Path | None], object]
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """One name of the command line.
+
+    Args:
+        about: What it finds out, in a few words.
+        measure: Takes whether few samples will do, where to print, and a file for the result.
+        needs: Each says why it cannot run here, or an empty string.
+        realtime: Takes the same, and measures with nodes and agents under SCHED_FIFO.
+    """
+
+    about: str
+    measure: Measure
+    needs: tuple[Callable[[], str], ...] = (why_no_ros, why_no_hosts)
+    realtime: Measure | None = None
+
+
+MEASUREMENTS: Final[dict[str, Measurement]] = {
+    "path": Measurement(
+        "how late a message is, on every path", roundtrips.path, needs=()
+    ),  # leaves out what cannot start
+    "period": Measurement(
+        "how evenly messages arrive", period.measure, realtime=partial(period.measure, realtime=True)
+    ),
+    "crosstraffic": Measurement(
+        "a command beside images on 100 Mbit/s",
+        crosstraffic.measure,
+        realtime=partial(crosstraffic.measure, realtime=True),
+    ),
+    "load": Measurement("a command while every core is busy", load.measure),
+    "storm": Measurement(
+        "a stream while the core is asked 200 times a second",
+        storm.measure,
+        realtime=partial(storm.measure, realtime=True),
+    ),
+    "scale": Measurement("what more peers and more topics cost one stream", scale.measure),
+    "peers": Measurement(
+        "other middleware (Zenoh, DDS, ZeroMQ) in the same run", roundtrips.peers, needs=()
+    ),  # likewise
+    "profile": Measurement("what a relayed message costs an agent, and where that goes", profile.measure),
+    "throughput": Measurement("how much goes through", throughput.measure),
+    "startup": Measurement("how soon the first message arrives", startup.measure),
+    "joining": Measurement(
+        "how soon modules and their graphs are joined, and what a mesh costs while nothing happens", joining.measure
+    ),
+    "services": Measurement("a service call through two agents, and a direct one", services.measure),
+    "roscore": Measurement(
+        "what it costs to follow a real roscore, and how soon changes are seen", roscore.measure, (why_no_ros,)
+    ),
+    "idle": Measurement("what an agent costs while nothing happens", idle.measure),
+    "tasks": Measurement(
+        "how evenly a resource's task runs, beside loops of rospy and roscpp",
+        tasks.measure,
+        (why_no_ros,),
+        partial(tasks.measure, realtime=True),
+    ),
+    "decision": Measurement("how long a resource takes to decide", decision.measure, needs=()),
+    "bookkeeping": Measurement("what measuring quality costs, and how soon a resource adapts", bookkeeping.measure),
+}
+
+
+@click.command(epilog="\b\n" + "\n".join(f"{name:12} {row.about}" for name, row in MEASUREMENTS.items()))
+@click.argument("names", nargs=-1, metavar="[NAME]...", type=click.Choice(list(MEASUREMENTS)))
+@click.option("--quick", is_flag=True, help="Few samples: to see whether it works, not to quote.")
+@click.option("--json", "file", type=click.Path(path_type=Path), help="Write the result there too (one measurement).")
+@click.option(
+    "--only",
+    default="",
+    metavar="KEYS",
+    help="path: these contenders, comma-separated (lab/bench/contenders.py has them).",
+)
+@click.option(
+    "--realtime",
+    is_flag=True,
+    help=f"{', '.join(name for name, row in MEASUREMENTS.items() if row.realtime)}: "
+    "nodes and agents under SCHED_FIFO, so that other processes of this machine are out of the figures.",
+)
+def bench(names: tuple[str, ...], quick: bool, file: Path | None, only: str, realtime: bool) -> None:
+    """Measure what is named below (default: all of it, in this order); results are written to lab/results."""
+    console = Console(width=130 if not sys.stdout.isatty() else None)
+    if not why_no_hosts():
+        namespaces.remove_stale()
+    for name in names or MEASUREMENTS:
+        row = MEASUREMENTS[name]
+        if reason := next(filter(None, (why() for why in row.needs)), ""):
+            console.print(f"{name} is left out: {reason}", style="yellow")
+        elif name == "path" and only:
+            if unknown := sorted({*only.split(",")} - {*ENTRIES}):
+                raise click.BadParameter(f"no {unknown[0]}; there are {', '.join(ENTRIES)}", param_hint="--only")
+            roundtrips.path(quick, console, file, tuple(only.split(",")))
+        else:
+            measure = (realtime and row.realtime) or row.measure
+            measure(quick, console, file)

@@ -1,0 +1,244 @@
+"""The paths that are compared: each starts its processes once and then answers rounds of round trips."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from array import array
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from lab.bed.bench import why_no_hosts, why_no_ros
+from lab.bed.namespaces import MACHINE
+from lab.bed.ros import NODES, Ros, compiled, free_port
+from lab.usage import Meter, Usage
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from lab.bed.agents import Agent
+    from lab.bed.bench import Bed
+    from lab.bed.processes import Process
+
+SIZES: Final = (64, 64 * 1024, 1024 * 1024)
+"""Bytes of the messages that are measured."""
+RELAY: Final = Path("/usr/lib/topic_tools/relay")
+_INSTALL: Final = "pip install -c constraints.txt -e '.[lab-peers]'"
+_ROUND_DEADLINE: Final = 120.0
+
+
+@dataclass(slots=True)
+class RoundTripPath:
+    """One path from ``ping`` and back.
+
+    Args:
+        key: Its name in JSON.
+        title: Its name in tables.
+        ping: The process that takes "SIZE COUNT FILE" lines.
+        processes: Every process on the path, by name.
+        still: Those that may be stopped (SIGSTOP) while others are measured: no other process supervises them.
+    """
+
+    key: str
+    title: str
+    ping: Process
+    processes: dict[str, Process]
+    still: list[Process] = field(default_factory=list)
+
+    def round(self, size: int, count: int, scratch: Path) -> tuple[array[int], int, dict[str, Usage]]:
+        """Make ``count`` round trips; return their times in ns, the number lost, and the usage by process."""
+        since = self.ping.mark_events()
+        meter = Meter({name: process.pid for name, process in self.processes.items()})
+        self.ping.tell(f"{size} {count} {scratch}")
+        event = self.ping.wait_event("round", _ROUND_DEADLINE, since=since)
+        usage = meter.read()
+        samples = array("Q")
+        samples.frombytes(scratch.read_bytes())
+        return samples, int(str(event["lost"])), usage
+
+    @contextmanager
+    def awake(self) -> Iterator[None]:
+        """Let its processes run only inside."""
+        for process in self.still:
+            process.thaw()
+        try:
+            yield
+        finally:
+            for process in self.still:
+                process.freeze()
+
+
+def floor_c(bed: Bed) -> RoundTripPath:
+    """Raw TCP in C++."""
+    shell = bed.shell()
+    program = compiled("floor", NODES)
+    server = shell.start(program, "serve")
+    port = str(server.wait_event("up")["port"])
+    return _raw("floor_c", "C, raw TCP", shell.start(program, "ping", port, commands=True), server)
+
+
+def _raw(key: str, title: str, ping: Process, server: Process) -> RoundTripPath:
+    ping.wait_event("ready")
+    return RoundTripPath(key, title, ping, {"ping": ping, "pong": server}, [ping, server])
+
+
+def script(
+    key: str, title: str, program: str, words: Callable[[], list[str]] = list, *, freeze: bool = False
+) -> Callable[[Bed], RoundTripPath]:
+    """Both ends are one Python script of ``nodes/``, called with ``serve`` and with ``ping``.
+
+    Args:
+        key: Its name in JSON.
+        title: Its name in tables.
+        program: The script.
+        words: Makes the arguments of both ends; without any, ``ping`` gets the port at which ``serve`` listens.
+        freeze: Whether both may be stopped while others are measured: not where ends watch each other's life.
+    """
+
+    def start(bed: Bed) -> RoundTripPath:
+        shell, given = bed.shell(), words()
+        server = shell.start(sys.executable, NODES / program, "serve", *given, name=f"{key} pong")
+        up = server.wait_event("up")
+        given = [str(up["port"])] if "port" in up else given
+        ping = shell.start(sys.executable, NODES / program, "ping", *given, name=f"{key} ping", commands=True)
+        ping.wait_event("ready", 30.0)
+        ends = {"ping": ping, "pong": server}
+        return RoundTripPath(key, title, ping, ends, list(ends.values()) if freeze else [])
+
+    return start
+
+
+def direct(client: str, *, nodelay: bool) -> Callable[[Bed], RoundTripPath]:
+    """One client library, straight from node to node."""
+
+    def start(bed: Bed) -> RoundTripPath:
+        shell = bed.shell()
+        shell.master()
+        word = "tcpNoDelay" if nodelay else "Nagle"
+        key = f"{client}_{'nodelay' if nodelay else 'nagle'}"
+        return _nodes(key, f"{client} direct, {word}", shell, shell, client, nodelay=nodelay)
+
+    return start
+
+
+def direct_hosts(bed: Bed) -> RoundTripPath:
+    """Roscpp straight from host to host by the same kind of cable as the agents': classic ROS at its best."""
+    here, there = bed.classic()
+    return _nodes("roscpp_hosts", "roscpp direct, two hosts", here, there, "roscpp")
+
+
+def relays(bed: Bed) -> RoundTripPath:
+    """Roscpp through two C++ relays each way: as many hops as through two agents."""
+    shell = bed.shell()
+    shell.master()
+    between = {}
+    for stage, (source, target) in enumerate(
+        [("/ping", "/ping1"), ("/ping1", "/ping2"), ("/pong", "/pong1"), ("/pong1", "/pong2")], start=1
+    ):
+        between[f"relay {stage}"] = shell.start(RELAY, source, target, f"__name:=relay{stage}")
+    return _nodes("relays", "roscpp, two C++ relays", shell, shell, "roscpp", between, ask="/ping2", answer="/pong2")
+
+
+def agents_hosts(bed: Bed) -> RoundTripPath:
+    """Roscpp through two agents in two network namespaces."""
+    a, b = bed.lab.hosts("a", "b")
+    first, second = bed.agent(a, name="a"), bed.agent(b, name="b")
+    return _through("agents_hosts", "roscpp, two agents, two hosts", bed, first, second)
+
+
+def agents_one_host(bed: Bed) -> RoundTripPath:
+    """Roscpp through two agents on the real machine."""
+    first, second = bed.agent(MACHINE, name="one"), bed.agent(MACHINE, name="two")
+    return _through("agents_one_host", "roscpp, two agents, one host", bed, first, second)
+
+
+def _through(key: str, title: str, bed: Bed, first: Agent, second: Agent) -> RoundTripPath:
+    between = {"agent 1": first.process, "agent 2": second.process}
+    here, there = (bed.shell(agent.host, agent.core_port) for agent in (first, second))
+    made = _nodes(key, title, here, there, "roscpp", between)
+    made.still = []
+    return made
+
+
+def _nodes(
+    key: str,
+    title: str,
+    here: Ros,
+    there: Ros,
+    client: str,
+    between: dict[str, Process] | None = None,
+    *,
+    nodelay: bool = True,
+    ask: str = "/ping",
+    answer: str = "/pong",
+) -> RoundTripPath:
+    pong = there.node(client, "velocity", "__name:=pong", cmd=ask, vel="/pong", nodelay=nodelay)
+    start = here.rospy if client == "rospy" else here.roscpp
+    ping = start("ping", "__name:=ping", commands=True, topic="/ping", reply=answer, nodelay=nodelay)
+    ping.wait_event("ready", 30.0)
+    processes = {"ping": ping, **(between or {}), "pong": pong}
+    return RoundTripPath(key, title, ping, processes, list(processes.values()))
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A contender that may take part.
+
+    Args:
+        start: Starts its processes.
+        module: The Python module that it needs, or empty.
+        needs: Each says why it cannot run here, or an empty string.
+    """
+
+    start: Callable[[Bed], RoundTripPath]
+    module: str = ""
+    needs: tuple[Callable[[], str], ...] = ()
+
+    def why_not(self) -> str:
+        """Why it cannot take part here, or an empty string."""
+        if self.module and importlib.util.find_spec(self.module) is None:
+            return f"{self.module} is not installed ({_INSTALL})"
+        return next(filter(None, (why() for why in self.needs)), "")
+
+
+def _port() -> list[str]:
+    return [str(free_port())]
+
+
+_ROS: Final = (why_no_ros,)
+_HOSTS: Final = (why_no_ros, why_no_hosts)
+ENTRIES: Final[dict[str, Entry]] = {
+    "floor_c": Entry(floor_c, needs=_ROS),  # compiled with the nodes' flags
+    "floor_python": Entry(script("floor_python", "Python, raw TCP", "floor.py", freeze=True)),
+    "roscpp_nodelay": Entry(direct("roscpp", nodelay=True), needs=_ROS),
+    "roscpp_nagle": Entry(direct("roscpp", nodelay=False), needs=_ROS),
+    "roscpp_hosts": Entry(direct_hosts, needs=_HOSTS),
+    "rospy_nodelay": Entry(direct("rospy", nodelay=True), needs=_ROS),
+    "rospy_nagle": Entry(direct("rospy", nodelay=False), needs=_ROS),
+    "relays": Entry(relays, needs=_ROS),
+    "zenoh": Entry(script("zenoh", "zenoh (Python), TCP", "ping_zenoh.py", _port), "zenoh"),
+    "zenoh_shm": Entry(
+        script("zenoh_shm", "zenoh (Python), shared memory", "ping_zenoh.py", lambda: [*_port(), "--shared-memory"]),
+        "zenoh",
+    ),
+    "cyclonedds": Entry(
+        script(
+            "cyclonedds",
+            "cyclonedds (Python), reliable",
+            "ping_dds.py",
+            lambda: [str(free_port() % 200 + 20), *map(str, SIZES)],  # a domain of our own, and the types' sizes
+        ),
+        "cyclonedds",
+    ),
+    "pyzmq": Entry(script("pyzmq", "pyzmq, PAIR over TCP", "ping_zmq.py", freeze=True), "zmq"),
+    "agents_hosts": Entry(agents_hosts, needs=_HOSTS),
+    "agents_one_host": Entry(agents_one_host, needs=_ROS),
+}
+"""All ways to carry bytes from process to process, each at its best (Zenoh peer to peer, DDS over loopback alone)."""
+_LIBRARIES: Final = {"zenoh", "zenoh_shm", "cyclonedds", "pyzmq"}
+PATH: Final = tuple(key for key in ENTRIES if key not in _LIBRARIES)
+"""Those of ``path``: every path of ROS and RMPA."""
+PEERS: Final = tuple(key for key in ENTRIES if key not in {"roscpp_hosts", "relays"})
+"""Those of ``peers``: the libraries beside the nodes."""

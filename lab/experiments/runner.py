@@ -1,0 +1,142 @@
+"""Measures cell after cell, keeps what comes, and goes on where one fails."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Protocol
+
+from lab import machine
+from lab.experiments.model import Measured
+from lab.experiments.store import utc
+from lab.frames import frame
+from rmpa.core.errors import RmpaError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from contextlib import AbstractContextManager
+
+    from lab.bed.plan import Plan
+    from lab.bed.stage import Stage
+    from lab.experiments.model import Cell, Experiment
+    from lab.experiments.store import Store
+
+LATENESS: Final = "lateness"
+"""Each cell's table of how late the machine's own wake-ups came: ``when`` (before, after the cell), ``late_us``."""
+LATENESS_SECONDS: Final = 0.3
+"""Of sleeps before and after each cell."""
+ATTEMPTS: Final = 2
+"""How often a cell is tried."""
+
+
+class Watcher(Protocol):
+    """Is notified of a run's progress."""
+
+    def cell_begins(self, cell: Cell, attempt: int) -> None:
+        """A cell is tried for the first or the second time."""
+        ...
+
+    def cell_ends(self, cell: Cell, seconds: float) -> None:
+        """It was measured, and that took so long."""
+        ...
+
+    def cell_fails(self, cell: Cell, error: str, *, again: bool) -> None:
+        """It could not be measured; ``again``: it is tried once more."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """The outcome of a run.
+
+    Args:
+        measured: Cells that were measured now.
+        there: Cells that had been measured before.
+        failed: Those that could not be: experiment, cell and the last error.
+    """
+
+    measured: int
+    there: int
+    failed: tuple[tuple[str, str, str], ...]
+
+
+Job = tuple["Experiment", "Sequence[Cell]"]
+"""An experiment, and which of its cells are wanted."""
+
+
+def to_measure(jobs: Sequence[Job], store: Store) -> list[tuple[Experiment, Cell]]:
+    """The cells that are not there yet, in the order in which they are going to be measured."""
+    return [(experiment, cell) for experiment, cells in jobs for cell in cells if not store.is_done(cell)]
+
+
+def run(
+    jobs: Sequence[Job],
+    store: Store,
+    make_stage: Callable[[Plan], AbstractContextManager[Stage]],
+    watcher: Watcher,
+    *,
+    lateness: Callable[[float], list[float]] = machine.lateness,
+    now: Callable[[], float] = time.monotonic,
+) -> Outcome:
+    """Measure what is not there yet; call it from the main thread, which child processes are tied to.
+
+    A KeyboardInterrupt ends it, with all that was measured until then kept.
+
+    Args:
+        jobs: What is wanted.
+        store: Where it is kept.
+        make_stage: Sets the stage for one cell.
+        watcher: Is told how it goes.
+        lateness: Says how late sleeps of so many seconds altogether end, in µs.
+        now: The clock, in seconds.
+    """
+    for experiment, cells in jobs:
+        store.expect(experiment.name, experiment.title, cells)
+    measured, failed = 0, []
+    waiting = to_measure(jobs, store)
+    for experiment, cell in waiting:
+        began = now()
+        error = ""
+        for attempt in range(1, ATTEMPTS + 1):
+            watcher.cell_begins(cell, attempt)
+            started, started_utc = now(), utc()
+            try:
+                came = _measure(experiment, cell, store.plan, make_stage, lateness)
+                took = now() - started
+                store.keep(cell, came, began=started_utc, seconds=took, attempts=attempt, error=error)
+            except Exception as caught:  # noqa: BLE001 - the top of one cell: the others do not depend on it
+                error = _told(caught)
+                watcher.cell_fails(cell, error, again=attempt < ATTEMPTS)
+                if attempt == ATTEMPTS:
+                    store.note_failure(cell, error, began=started_utc, seconds=now() - started, attempts=attempt)
+                    failed.append((cell.experiment, cell.key, error))
+            else:
+                watcher.cell_ends(cell, now() - began)
+                measured += 1
+                break
+    return Outcome(measured, sum(len(cells) for _, cells in jobs) - len(waiting), tuple(failed))
+
+
+def _measure(
+    experiment: Experiment,
+    cell: Cell,
+    plan: Plan,
+    make_stage: Callable[[Plan], AbstractContextManager[Stage]],
+    lateness: Callable[[float], list[float]],
+) -> Measured:
+    before = lateness(LATENESS_SECONDS)
+    with make_stage(plan) as stage:
+        came = experiment.measure(cell, stage)
+    after = lateness(LATENESS_SECONDS)
+    if LATENESS in came.tables:
+        raise ValueError(f"{experiment.name} has a table {LATENESS!r}, which is the runner's")
+    rows = [("before", round(late, 1)) for late in before] + [("after", round(late, 1)) for late in after]
+    return Measured({**came.tables, LATENESS: frame(("when", "late_us"), rows)}, came.facts)
+
+
+def _told(error: Exception) -> str:
+    """What a bed says is for its user; anything else is a mistake of ours, and its place is needed."""
+    if isinstance(error, RmpaError):
+        return f"{type(error).__name__}: {error}"
+    return "".join(traceback.format_exception(error)).rstrip()

@@ -1,0 +1,208 @@
+"""An agent's place in the network: its GUID and mesh port, discovery and mesh, wired to the bridge.
+
+When the machine loses the address in the GUID (an agent that started before the network did has 127.0.0.1), the agent
+leaves with a goodbye and joins under a new GUID. Its core and the local graph do not notice.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits
+from rmpa.core.errors import RmpaError
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+from rmpa.discovery.events import PeerChanged, PeerConflict, PeerFound, PeerLost, PeerRestarted
+from rmpa.discovery.io.discovery import Discovery
+from rmpa.discovery.io.interfaces import choose, further_addresses, list_interfaces, pick_address
+from rmpa.mesh import limits as mesh_limits
+from rmpa.mesh.io.link import LinkHandlers
+from rmpa.mesh.io.mesh import Mesh
+from rmpa.mesh.peering import LinkDown, LinkDownCause
+from rmpa.runtime.sockets import open_mesh_port
+from rmpa.runtime.system_clock import SystemClock
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from ipaddress import IPv4Address
+
+    from rmpa.bridge.io.bridge import Bridge
+    from rmpa.config.settings import Settings
+    from rmpa.discovery.events import Event
+    from rmpa.discovery.io.interfaces import Interface
+    from rmpa.mesh.io.link import PeerLink
+
+_log = logging.getLogger(__name__)
+
+_INCARNATIONS: Final = 1 << 16
+
+
+class NetworkEndpoint:
+    """Discovery and mesh under one identity, feeding the bridge.
+
+    Args:
+        settings: The agent's settings.
+        bridge: Gets links, their messages and their end.
+        port: The mesh port; 0 lets the system choose.
+        on_displaced: Called when the machine has lost the address in the GUID.
+
+    Raises:
+        StartError: The port cannot be bound.
+    """
+
+    def __init__(self, settings: Settings, bridge: Bridge, *, port: int, on_displaced: Callable[[], None]) -> None:
+        clock = SystemClock()
+        self._settings = settings
+        self._bridge = bridge
+        self._on_displaced = on_displaced
+        tcp, udp = open_mesh_port(port)
+        self.port: int = tcp.getsockname()[1]
+        usable = choose(list_interfaces(), settings.interfaces)
+        address = pick_address(usable)
+        # Seconds modulo 18 hours: later for each restart. The random instance id is what decides.
+        incarnation = clock.wall_ns() // 1_000_000_000 % _INCARNATIONS
+        self.identity = Identity(
+            Guid.of(address, self.port, incarnation),
+            os.urandom(limits.INSTANCE_ID_BYTES),
+            settings.name,
+            settings.domain,
+            further_addresses(usable, address),
+        )
+        bridge.place(self.identity)
+        self.mesh = Mesh(
+            self.identity,
+            tcp,
+            on_link_up=self._link_up,
+            on_link_down=self._link_down,
+            on_control=bridge.control,
+            handlers=LinkHandlers(bridge.data, bridge.part, bridge.mark, bridge.clock, bridge.lane_lost),
+            lanes=settings.lanes,
+            clock=clock,
+        )
+        self.discovery = Discovery(
+            self.identity, settings, udp, on_event=self._event, on_interfaces=self._interfaces, clock=clock
+        )
+        self._udp = udp
+
+    async def start(self) -> None:
+        """Accept links, then send beacons."""
+        await self.mesh.start()
+        await self.discovery.start()
+        _log.info("= %s, domain %d, is on the air", self.identity, self.identity.domain)
+
+    async def close(self) -> None:
+        """Send the goodbye, and close the links in order."""
+        await self.discovery.close()
+        self._udp.close()
+        await self.mesh.close()
+
+    def _event(self, event: Event) -> None:
+        match event:
+            case PeerFound(identity=identity, source=source):
+                _log.info("+ %s found", identity)
+                self.mesh.peer_found(identity, source[0] if source else None)
+            case PeerChanged(identity=identity):
+                self.mesh.peer_found(identity)
+            case PeerRestarted(identity=identity, previous=previous, source=source):
+                _log.info("+ %s restarted, it was %s", identity, previous.guid)
+                self.mesh.peer_gone(previous.guid)
+                self.mesh.peer_found(identity, source[0] if source else None)
+            case PeerLost(identity=identity, reason=reason):
+                _log.info("- %s %s", identity, reason.value)
+                self.mesh.peer_gone(identity.guid)
+            case PeerConflict():
+                pass  # discovery has logged it, at a bounded rate
+
+    def _link_up(self, link: PeerLink) -> None:
+        # Its beacons come from its mesh port; an accepted connection may come from any port.
+        self.discovery.link_up(link.identity, (link.remote_endpoint[0], link.identity.guid.port))
+        self._bridge.link_up(link)
+
+    def _link_down(self, link: PeerLink, down: LinkDown) -> None:
+        self._bridge.link_down(link)
+        if down.cause is not LinkDownCause.REPLACED:  # else its peer stays linked, and keeps its endpoint
+            self.discovery.link_down(link.identity.guid, link.identity.instance)
+
+    def _interfaces(self, everything: tuple[Interface, ...]) -> bool:
+        """The machine's interfaces have changed; returns whether the GUID still fits."""
+        displaced = is_displaced(self.identity.guid.address, everything, self._settings.interfaces)
+        if displaced:
+            self._on_displaced()
+        return not displaced
+
+
+class Network:
+    """Keeps an agent in the network, and moves it to a new endpoint when it has lost its address.
+
+    Args:
+        settings: The agent's settings.
+        bridge: Its bridge.
+    """
+
+    def __init__(self, settings: Settings, bridge: Bridge) -> None:
+        self._settings = settings
+        self._bridge = bridge
+        self._moving: asyncio.Task[None] | None = None
+        self.endpoint: NetworkEndpoint | None = None
+        """The place now; ``None`` before the start, and while the agent moves."""
+
+    async def start(self) -> None:
+        """Join the network.
+
+        Raises:
+            StartError: The mesh's port is taken.
+        """
+        await self._join(self._settings.port)
+
+    async def close(self) -> None:
+        """Leave the network."""
+        if self._moving is not None:
+            self._moving.cancel()
+        await self._leave()
+
+    async def _join(self, port: int) -> None:
+        self.endpoint = NetworkEndpoint(self._settings, self._bridge, port=port, on_displaced=self._displaced)
+        await self.endpoint.start()
+
+    async def _leave(self) -> None:
+        if self.endpoint is not None:
+            endpoint, self.endpoint = self.endpoint, None
+            await endpoint.close()
+
+    def _displaced(self) -> None:
+        if self._moving is None:
+            self._moving = asyncio.create_task(self._move(), name="move to the new address")
+
+    async def _move(self) -> None:
+        try:
+            port = self.endpoint.port if self.endpoint is not None else self._settings.port
+            _log.info("= the machine's addresses have changed: taking a new GUID")
+            await self._leave()
+            while self.endpoint is None:
+                try:
+                    await self._join(port)
+                except RmpaError as error:
+                    _log.warning("! cannot join with the new address yet: %s", error)
+                    await asyncio.sleep(mesh_limits.JOIN_RETRY)
+        finally:
+            self._moving = None
+
+
+def is_displaced(ours: IPv4Address, everything: tuple[Interface, ...], wanted: tuple[str, ...]) -> bool:
+    """Whether the agent needs a GUID with another address.
+
+    An interface without its cable keeps its address, and links by other interfaces go on meanwhile. An address that
+    is gone may come back too (a lease is renewed), but not one in whose place there is another.
+
+    Args:
+        ours: The address in the GUID.
+        everything: All interfaces, up or not.
+        wanted: The names of the interfaces that the settings give; empty for all.
+    """
+    if pick_address(choose(everything, wanted)).is_loopback:
+        return False
+    kept = {address for i in everything if not wanted or i.name in wanted for address in i.addresses}
+    return ours.is_loopback or ours not in kept

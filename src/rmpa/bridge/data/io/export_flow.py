@@ -1,0 +1,175 @@
+"""The data path from one local publisher to the peers: what happens to each message, and nothing else.
+
+An ``ExportFlow`` is called from a socket's read callback with a view of its buffer, and passes it on with one system
+call for each receiver, a large message in parts while it still arrives. It takes routes as commands and shares no
+state with the planning side.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from itertools import islice
+from typing import TYPE_CHECKING
+
+from rmpa.bridge.data.io.route_sender import ReliableRouteSender, RouteSender, make_route_sender
+from rmpa.core.contract import Contract, Durability
+from rmpa.ros import limits as ros_limits
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.bridge.data.io.route_sender import DataLink
+
+
+class ExportFlow:
+    """From one local publisher to the peers that want it, each by a route sender of its own."""
+
+    __slots__ = (
+        "_history",
+        "_keeping",
+        "_received",
+        "_senders",
+        "_size",
+        "_stamp",
+        "_streaming",
+        "_whole",
+        "by_peer",
+        "bytes",
+        "dropped",
+        "large",
+        "latching",
+        "messages",
+        "oversized",
+        "oversized_bytes",
+    )
+
+    def __init__(self) -> None:
+        self.by_peer: dict[int, RouteSender] = {}
+        self._senders: tuple[RouteSender, ...] = ()
+        self._history: deque[tuple[bytes, int]] = deque(maxlen=1)
+        """Message and stamp of the last messages, for peers that come later."""
+        self._keeping = False
+        self._streaming: list[RouteSender] = []
+        """The senders that get the present message in parts."""
+        self._whole: bytearray | None = None
+        """The present message so far, where a sender or the history needs it whole."""
+        self._size = self._received = self._stamp = 0
+        self.latching = False
+        """Whether the publisher latches: a peer that comes later gets its last message, whatever the contract."""
+        self.large = False
+        """Whether the publisher has sent messages that come in parts."""
+        self.messages = 0
+        self.bytes = 0
+        self.dropped = 0
+        self.oversized = self.oversized_bytes = 0
+        """Messages of the publisher that were left out because they are too long; bytes of the last one."""
+
+    def left_out(self, size: int) -> None:
+        """A message of so many bytes was too long."""
+        self.oversized += 1
+        self.oversized_bytes = size
+
+    def latch(self) -> None:
+        """The publisher latches."""
+        self.latching = True
+        self.keep(1)
+
+    def keep(self, depth: int) -> None:
+        """Keep the last ``depth`` messages for peers that come later."""
+        self._keeping = True
+        if depth > (self._history.maxlen or 0):
+            self._history = deque(self._history, maxlen=min(depth, ros_limits.LATCHED_MAX))
+
+    def add(self, peer: int, link: DataLink, route: int, contract: Contract, epoch: int) -> RouteSender:
+        """Send to one more peer from now on; first what its contract, or the publisher, has kept for it."""
+        self.remove(peer)
+        sender = make_route_sender(link, route, contract, epoch, large=self.large)
+        if contract.durability is Durability.TRANSIENT_LOCAL:
+            self.keep(contract.kept)
+        # What is kept because another peer asked for it is old data, and may be an old command, to this one.
+        kept = contract.kept if contract.durability is Durability.TRANSIENT_LOCAL else int(self.latching)
+        for framed, stamp in islice(self._history, max(0, len(self._history) - kept), None):
+            sender.message(stamp, framed)
+        self.by_peer[peer] = sender
+        self._senders = tuple(self.by_peer.values())
+        return sender
+
+    def suspend(self, peer: int, keep: Callable[[bytes, int], object] | None = None) -> None:
+        """A peer's link is gone: keep its messages; see ``ReliableRouteSender.suspend``."""
+        sender = self.by_peer.get(peer)
+        if isinstance(sender, ReliableRouteSender):
+            sender.suspend(keep)
+
+    def inherit(self, old: int, new: int) -> RouteSender | None:
+        """Keep for peer ``new``, which has no sender yet, what was kept for peer ``old``."""
+        sender = self.by_peer.pop(old, None)
+        if sender is not None:
+            self.by_peer[new] = sender
+        return sender
+
+    def remove(self, peer: int) -> None:
+        """Send to that peer no longer."""
+        sender = self.by_peer.pop(peer, None)
+        if sender is not None:
+            sender.close()
+            self._senders = tuple(self.by_peer.values())
+            if sender in self._streaming:
+                self._streaming.remove(sender)
+
+    def close(self) -> None:
+        """The publisher is not subscribed any more: release what was kept of it, which may be large."""
+        for peer in tuple(self.by_peer):
+            self.remove(peer)
+        self._history.clear()
+        self._whole = None
+
+    def message(self, framed: memoryview) -> None:
+        """Pass one message on; ``framed`` has its length in front and is valid during the call only."""
+        stamp = time.time_ns()
+        self.messages += 1
+        self.bytes += len(framed)
+        for sender in self._senders:
+            dropped = sender.message(stamp, framed)
+            if dropped:
+                self.dropped += dropped
+        if self._keeping:
+            self._history.append((bytes(framed), stamp))
+
+    def begin(self, size: int) -> None:
+        """A message of ``size`` bytes, its length in front, begins to come."""
+        self._stamp = time.time_ns()
+        self._size, self._received = size, 0
+        self.large = True
+        self._streaming = [sender for sender in self._senders if sender.begin(self._stamp, size)]
+        self._whole = bytearray() if self._keeping or len(self._streaming) < len(self._senders) else None
+
+    def part(self, part: memoryview) -> None:
+        """Pass a part of it on; valid during the call only."""
+        for sender in self._streaming:
+            self.dropped += sender.part(part)
+        if self._whole is not None:
+            self._whole += part
+        self._received += len(part)
+        if self._received >= self._size:
+            self._complete()
+
+    def abort(self) -> None:
+        """The rest will not come: the publisher closed its connection."""
+        for sender in self._streaming:
+            sender.abort()
+        self._streaming = []
+        self._whole = None
+
+    def _complete(self) -> None:
+        self.messages += 1
+        self.bytes += self._size
+        streamed, self._streaming = self._streaming, []
+        if self._whole is None:
+            return
+        whole, self._whole = bytes(self._whole), None
+        for sender in self._senders:
+            if sender not in streamed:
+                self.dropped += sender.message(self._stamp, whole)
+        if self._keeping:
+            self._history.append((whole, self._stamp))

@@ -1,0 +1,245 @@
+"""Finds the Smart Resources of the graph, of this module and of others, and reads what they publish."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from rmpa.cli.graph import GraphName, peer_of, read_graph, read_name
+from rmpa.cli.output import printable
+from rmpa.cli.stream import with_node
+from rmpa.config.values import did_you_mean
+from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
+from rmpa.resource.run.descriptor import TOPIC, Descriptor
+from rmpa.ros.types.messages import MessageType
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+
+    from rmpa.cli.graph import Graph
+    from rmpa.cli.master import Master
+    from rmpa.cli.options import GraphOptions
+    from rmpa.ros.node.node import Node
+    from rmpa.ros.node.topics import Received
+
+TEXT: Final = "std_msgs/String"
+_ANSWER: Final = 3.0
+"""Seconds for a latched message: the route of another module's topic has to open first."""
+_NODE: Final = "rmpa_resource"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenResource:
+    """A resource of the graph.
+
+    Args:
+        path: The name of its node, below which this module's graph has its topics: ``/sonar``.
+        peer: The peer that it runs at; ``None``: this module.
+        caller: The node that publishes its topics in this graph: its own, or a proxy.
+        descriptor: Its published description.
+    """
+
+    path: str
+    peer: str | None
+    caller: str
+    descriptor: Descriptor
+
+    def __str__(self) -> str:
+        """As a user writes it."""
+        return str(GraphName(self.path, self.peer))
+
+
+@dataclass(frozen=True, slots=True)
+class ResourceGraph:
+    """The resources of a graph, and a node to ask them by.
+
+    Args:
+        node: This command's own node.
+        graph: The master's graph.
+        seen: All resources in it.
+    """
+
+    node: Node
+    graph: Graph
+    seen: tuple[SeenResource, ...]
+
+    def pick(self, text: str | None) -> SeenResource:
+        """The resource that a user names: ``sonar``, ``/sonar``, ``base:/sonar``; ``None``: the only one.
+
+        Raises:
+            ConfigError: It is no name.
+            RmpaError: There is none, or there are several.
+        """
+        if text is None:
+            own = [each for each in self.seen if each.peer is None] or list(self.seen)
+            return _only(own, "say which resource is meant")
+        wanted = read_name(text, "resource")
+        found = [s for s in self.seen if s.path == wanted.name and (wanted.peer is None or s.peer == wanted.peer)]
+        if not found:
+            near = did_you_mean(str(wanted), map(str, self.seen))
+            remedy = f"did you mean {printable(near)}?" if near else "`rmpa resource list` shows all"
+            raise RmpaError(f"no resource {printable(str(wanted))}; {remedy}")
+        return _only([each for each in found if each.peer is None] or found, "say whose is meant")
+
+    async def hear(
+        self,
+        each: Iterable[SeenResource],
+        name: str,
+        kind: str = TEXT,
+        timeout: float = _ANSWER,  # noqa: ASYNC109
+    ) -> dict[SeenResource, Any]:
+        """The first message of a topic of each resource; without those that send none in time.
+
+        Args:
+            each: Which resources.
+            name: The topic below them.
+            kind: Its type.
+            timeout: Seconds.
+        """
+        found: dict[SeenResource, Any] = {}
+        callers: dict[str, dict[str, SeenResource]] = {}
+        for one in each:
+            callers.setdefault(f"{one.path}/{name}", {})[one.caller] = one
+        messages = await first_messages(self.node, {t: set(c) for t, c in callers.items()}, kind, timeout)
+        for (topic, caller), received in messages.items():
+            found[callers[topic][caller]] = received.message
+        return found
+
+    async def texts(self, each: Sequence[SeenResource], *names: str) -> list[dict[SeenResource, str]]:
+        """The texts of ``std_msgs/String`` topics: by topic, then by resource."""
+        heard = await asyncio.gather(*(self.hear(each, name) for name in names))
+        return [{one: str(message.data) for one, message in found.items()} for found in heard]
+
+    async def configuration(self, one: SeenResource) -> dict[str, bool | int | float | str]:
+        """The values of a resource's parameters."""
+        from rmpa.resource.run.dynamic_reconfigure import CONFIG_TYPE, read_config
+
+        message = (await self.hear([one], "parameter_updates", CONFIG_TYPE)).get(one)
+        return read_config(message) if message is not None else {}
+
+    async def configure(self, one: SeenResource, values: Mapping[str, str]) -> None:
+        """Set text parameters of a resource.
+
+        Raises:
+            RmpaError: It cannot be reached, or refuses; then nothing has changed.
+        """
+        from rmpa.resource.run.dynamic_reconfigure import SERVICE_TYPE
+        from rmpa.ros.types.service_types import ServiceType
+
+        service = GraphName(f"{one.path}/set_parameters", one.peer)
+        server = self.graph.require_service(service)
+        if one.peer is None and peer_of(server) is not None:
+            raise RmpaError(f"service {service} is another module's; {one} does not offer it")
+        pairs: Any = [{"name": name, "value": value} for name, value in values.items()]
+        kind = ServiceType(SERVICE_TYPE)
+        try:
+            await self.node.call_service(service.name, kind, {"config": {"strs": pairs}})
+        except PeerRefused as error:
+            raise RmpaError(printable(f"{one}: {error.reason}")) from None
+
+
+def _only(found: Sequence[SeenResource], remedy: str) -> SeenResource:
+    if len(found) == 1:
+        return found[0]
+    if not found:
+        raise RmpaError("there is no resource; `rmpa run` runs one, `rmpa resource list` shows all")
+    raise RmpaError(f"there are {', '.join(printable(str(each)) for each in found)}; {remedy}")
+
+
+def run_with_resources(options: GraphOptions, body: Callable[[ResourceGraph], Awaitable[None]]) -> None:
+    """Find all resources of the graph that the options name, and run ``body`` with them."""
+    asyncio.run(with_resources(options.master(), body))
+
+
+async def with_resources(master: Master, body: Callable[[ResourceGraph], Awaitable[None]]) -> None:
+    """Find all resources of a master's graph, and run ``body`` with them."""
+    graph = await read_graph(master)
+
+    async def within(node: Node) -> None:
+        await body(ResourceGraph(node, graph, await find_resources(node, graph)))
+
+    await with_node(master, _NODE, within)
+
+
+async def find_resources(node: Node, graph: Graph) -> tuple[SeenResource, ...]:
+    """All resources that publish a descriptor, this module's first."""
+    ending = f"/{TOPIC}"
+    topics = {
+        topic: set(nodes)
+        for topic, nodes in graph.publishers.items()
+        if topic.endswith(ending) and graph.types.get(topic) == TEXT
+    }
+    found = []
+    for (topic, caller), received in (await first_messages(node, topics, TEXT, _ANSWER)).items():
+        try:
+            descriptor = Descriptor.parse(str(received.message.data))
+        except RmpaError:
+            continue  # another program's topic of that name
+        found.append(SeenResource(topic.removesuffix(ending), peer_of(caller), caller, descriptor))
+    return tuple(sorted(found, key=lambda each: (each.peer or "", each.path)))
+
+
+async def first_messages(
+    node: Node,
+    callers: Mapping[str, set[str]],
+    kind: str,
+    timeout: float,  # noqa: ASYNC109 - a time-out is no error here
+) -> dict[tuple[str, str], Received]:
+    """The first message of each publisher, by topic and publisher; without those that send none in time."""
+    found: dict[tuple[str, str], Received] = {}
+    missing = {(topic, caller) for topic, names in callers.items() for caller in names}
+    change = asyncio.Event()
+
+    def take(topic: str, received: Received) -> None:
+        key = topic, received.caller_id
+        if key in missing:
+            missing.discard(key)
+            found[key] = received
+            if not missing:
+                change.set()
+
+    type_ = MessageType(kind)
+    subscribers = [await node.subscribe(topic, type_, functools.partial(take, topic)) for topic in callers]
+    try:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout):
+                while missing:
+                    await change.wait()
+    finally:
+        for subscriber in subscribers:
+            await subscriber.close()
+    return found
+
+
+def decision_of(text: str) -> dict[str, Any]:
+    """Parse a resource's account of its last decision, a JSON object.
+
+    Raises:
+        RmpaError: It is none.
+    """
+    try:
+        found = msgspec.json.decode(text)
+    except msgspec.DecodeError as error:
+        raise RmpaError(f"it says something strange about its decision: {error}") from None
+    if not isinstance(found, dict):
+        raise RmpaError("it says something strange about its decision")
+    return found
+
+
+def known_name(what: str, text: str, known: Iterable[str]) -> str:
+    """Check that a resource has a profile or context of that name; return the name.
+
+    Raises:
+        ConfigError: It has none.
+    """
+    names = list(known)
+    if text not in names:
+        near = did_you_mean(text, names)
+        remedy = f"did you mean {printable(near)}?" if near else f"there are {printable(', '.join(names)) or 'none'}"
+        raise ConfigError(what.upper(), f"there is no {what} {text!r}", remedy)
+    return text

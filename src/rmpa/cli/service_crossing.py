@@ -1,0 +1,53 @@
+"""What the agent knows of the services that cross the mesh, as ``rmpa service`` shows it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rmpa.cli.output import duration, print_line, warn
+
+if TYPE_CHECKING:
+    from rmpa.cli.graph import GraphName
+    from rmpa.cli.master import Master
+    from rmpa.observe.snapshot import ServiceInfo
+
+
+def crossing(master: Master, wanted: GraphName) -> tuple[ServiceInfo, ...]:
+    """What the master's agent knows of a service, at all peers or the named one; empty without an agent."""
+    snapshot = master.snapshot()
+    return tuple(
+        info
+        for info in (snapshot.services if snapshot is not None else ())
+        if info.name == wanted.name and wanted.peer in (None, info.peer)
+    )
+
+
+def print_crossing(infos: tuple[ServiceInfo, ...]) -> None:
+    """Print whether a service may cross, each peer that offers it, and how its calls went."""
+    for info in infos:
+        print_line(f" * {_headline(info)}")
+        for label, text in _facts(info):
+            print_line(f"     {label:<10} {text}")
+        if info.problem:
+            warn(f"{info.peer or info.node}: {info.problem}")
+
+
+def _headline(info: ServiceInfo) -> str:
+    if info.direction == "out":
+        who = f", open at {', '.join(info.callers)}" if info.callers else ""
+        return f"{'may cross' if info.crosses else 'stays home'}: {info.policy}{who}"
+    over_there = f", {info.wire} over there" if info.wire else ""
+    state = f"not here: {info.hidden}" if info.hidden else info.state
+    return f"from {info.peer}: {info.node}{over_there}, {state}"
+
+
+def _facts(info: ServiceInfo) -> list[tuple[str, str]]:
+    facts = []
+    if info.calls or info.active:
+        under_way = f", {info.active} under way" if info.active else ""
+        facts.append(("calls", f"{info.calls}, {info.failed} failed{under_way}"))
+    if info.latency is not None:
+        spread = info.latency
+        label = "latency" if info.direction == "in" else "server"
+        facts.append((label, f"p50 {duration(spread.p50)}, p99 {duration(spread.p99)}, max {duration(spread.max)}"))
+    return facts

@@ -1,0 +1,532 @@
+"""The protocol machine of one connection: handshake, frames, keepalive, bye.
+
+Sans-I/O: bytes and ``now`` in, events and bytes out. A link with a peer has one connection for each of its lanes;
+each runs this machine, and ``mesh.io.link`` joins them.
+
+::
+
+    HANDSHAKING ──welcome sent or received──► UP ──bye sent──► CLOSING ──drained, 1 s──► CLOSED
+         ├─ refuse or bye sent: CLOSING         └─ bye received, lease over, protocol error: CLOSED
+         └─ refused, time out, error: CLOSED
+
+The driver passes what it reads to ``receive``, sends what ``take_output`` returns, calls ``handle_timer`` when
+``next_timer`` is due and closes the socket at ``ConnectionClosed``. Events and data come in the order of the bytes,
+from within ``receive``.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum, auto
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final
+
+from rmpa.core import limits as core_limits
+from rmpa.core.errors import LocalProtocolError, RemoteProtocolError
+from rmpa.core.outbox import FIRST, LAST
+from rmpa.mesh import frames, limits
+from rmpa.mesh.frames import Frame, FrameKind
+from rmpa.mesh.handshake import HandshakeError, Hello, Lane, Refuse, judge_welcome
+from rmpa.mesh.keepalive import Keepalive
+from rmpa.mesh.timing import LinkClock
+from rmpa.runtime import limits as runtime_limits
+
+if TYPE_CHECKING:
+    from rmpa.core.guid import Guid
+    from rmpa.core.identity import Identity
+
+_log = logging.getLogger(__name__)
+
+_HEADER: Final = limits.FRAME_HEADER_BYTES
+_DATA: Final = int(FrameKind.DATA)
+_WHOLE: Final = frames.WHOLE
+_FIRST_PART: Final = 4
+"""Bytes that the first part of a message must have: the message's length."""
+
+
+class ConnectionRole(Enum):
+    """Which side of the TCP connection this is."""
+
+    DIALLER = auto()
+    ACCEPTOR = auto()
+
+
+class ConnectionState(Enum):
+    """Where a connection is in its life."""
+
+    HANDSHAKING = auto()
+    UP = auto()
+    CLOSING = auto()
+    CLOSED = auto()
+
+
+class _Step(Enum):
+    WELCOMED = auto()
+    REFUSING = auto()
+    LEAVING = auto()
+    ENDED = auto()
+
+
+_NEXT: Final[Mapping[tuple[ConnectionState, _Step], ConnectionState]] = MappingProxyType(
+    {
+        (ConnectionState.HANDSHAKING, _Step.WELCOMED): ConnectionState.UP,
+        (ConnectionState.HANDSHAKING, _Step.REFUSING): ConnectionState.CLOSING,
+        (ConnectionState.HANDSHAKING, _Step.LEAVING): ConnectionState.CLOSING,
+        (ConnectionState.HANDSHAKING, _Step.ENDED): ConnectionState.CLOSED,
+        (ConnectionState.UP, _Step.LEAVING): ConnectionState.CLOSING,
+        (ConnectionState.UP, _Step.ENDED): ConnectionState.CLOSED,
+        (ConnectionState.CLOSING, _Step.ENDED): ConnectionState.CLOSED,
+    }
+)
+
+_WHEN_UP: Final[frozenset[int]] = frozenset(
+    {
+        FrameKind.PING,
+        FrameKind.PONG,
+        FrameKind.CONTROL,
+        FrameKind.DATA,
+        FrameKind.BYE,
+        FrameKind.ACK,
+        FrameKind.FENCE,
+        FrameKind.FENCED,
+    }
+)
+_ALLOWED: Final[Mapping[tuple[ConnectionRole, ConnectionState], frozenset[int]]] = MappingProxyType(
+    {
+        (ConnectionRole.DIALLER, ConnectionState.HANDSHAKING): frozenset(
+            {int(FrameKind.WELCOME), int(FrameKind.REFUSE)}
+        ),
+        (ConnectionRole.ACCEPTOR, ConnectionState.HANDSHAKING): frozenset({int(FrameKind.HELLO)}),
+        (ConnectionRole.DIALLER, ConnectionState.UP): _WHEN_UP,
+        (ConnectionRole.ACCEPTOR, ConnectionState.UP): _WHEN_UP,
+    }
+)
+
+
+@dataclass(frozen=True, slots=True)
+class HelloReceived:
+    """Acceptor: the dialler said hello; the driver answers by ``accept`` or ``refuse``."""
+
+    hello: Hello
+
+
+@dataclass(frozen=True, slots=True)
+class HandshakeDone:
+    """Both sides accepted the connection; frames may be sent."""
+
+    hello: Hello
+
+
+@dataclass(frozen=True, slots=True)
+class ControlReceived:
+    """A control frame came.
+
+    Args:
+        payload: Its bytes, a copy.
+    """
+
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class PongReceived:
+    """A ping was answered.
+
+    Args:
+        stamp: What identifies the ping: its time stamp.
+        rtt: Seconds on the wire, the time that the remote side took to answer not included.
+    """
+
+    stamp: int
+    rtt: float
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """One of the two sides refused the connection. ``ConnectionClosed`` follows.
+
+    Args:
+        refuse: Why.
+        by_us: Whether this side refused.
+    """
+
+    refuse: Refuse
+    by_us: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ConnectionClosed:
+    """The connection is over: the driver sends what is left and closes the socket.
+
+    Args:
+        reason: Why, for people.
+        orderly: Whether one of the sides ended it by a frame (bye, refuse), rather than an error or silence.
+    """
+
+    reason: str
+    orderly: bool
+
+
+@dataclass(frozen=True, slots=True)
+class MarkReceived:
+    """An acknowledgement, a fence or its answer came.
+
+    Args:
+        kind: ``ACK``, ``FENCE`` or ``FENCED``.
+        route: The id of the route.
+        sequence: ``ACK``: the last message that arrived; else the fence's number.
+    """
+
+    kind: FrameKind
+    route: int
+    sequence: int
+
+
+ConnectionEvent = (
+    HelloReceived | HandshakeDone | ControlReceived | PongReceived | MarkReceived | Refused | ConnectionClosed
+)
+OnEvent = Callable[[ConnectionEvent], None]
+OnData = Callable[[int, int, int, memoryview], None]
+OnPart = Callable[[int, int, int, int, memoryview], None]
+
+
+class ConnectionProtocol:
+    """One side of one connection.
+
+    Args:
+        role: Which side.
+        ours: The identity of this agent.
+        now: Monotonic seconds at which the connection was established.
+        wall_ns: The wall clock; only called where a stamp is needed.
+        on_event: Called from within the methods below; it may call any of them but ``receive``.
+        on_data: Called with ``(route, sequence, stamp_ns, payload)`` for each message in one frame; the payload is a
+            view of the bytes given to ``receive`` and only valid during the call. The attribute may be assigned
+            later: only the handshake tells which peer this is, and what receives its data.
+        on_part: Called with ``(route, sequence, stamp_ns, flags, part)`` for each part of a longer message; parts of
+            one message come in order, those of other routes in between. Otherwise as ``on_data``.
+        expected: Dialler: the GUID that was dialled; ``None`` if only the address is known.
+        lane: Dialler: what the connection is for.
+        lease: Seconds after which the silence of this side means that it is dead.
+        label: For log lines, until the remote side's name is known.
+    """
+
+    def __init__(
+        self,
+        role: ConnectionRole,
+        ours: Identity,
+        now: float,
+        *,
+        wall_ns: Callable[[], int],
+        on_event: OnEvent,
+        on_data: OnData,
+        on_part: OnPart | None = None,
+        expected: Guid | None = None,
+        lane: Lane = Lane.EXPRESS,
+        lease: float = limits.LINK_LEASE,
+        label: str = "?",
+    ) -> None:
+        self.role = role
+        self.clock = LinkClock()
+        self.remote: Hello | None = None
+        """What the remote side said of itself, as soon as it did."""
+        self.on_event = on_event
+        self.on_data = on_data
+        self.on_part = on_part if on_part is not None else _no_parts
+        self._ours = ours
+        self._wall_ns = wall_ns
+        self._missing = 0
+        """Bytes of a data frame that was handed on in part, and whose rest is still to come."""
+        self._begun = (0, 0, 0, 0)
+        """Route, sequence, stamp and LAST flag of that frame."""
+        self._expected = expected
+        self._label = label
+        self._state = ConnectionState.HANDSHAKING
+        self._keepalive = Keepalive(lease, now, acceptor=role is ConnectionRole.ACCEPTOR)
+        self._deadline = now + limits.HANDSHAKE_TIMEOUT
+        self._reason = ""
+        self._output = bytearray()
+        if role is ConnectionRole.DIALLER:
+            hello = Hello.of(ours, lease=lease, expected=expected, lane=lane)
+            self._send(Frame(FrameKind.HELLO, hello.serialize()))
+
+    @property
+    def state(self) -> ConnectionState:
+        """Where the connection is in its life."""
+        return self._state
+
+    @property
+    def heard_at(self) -> float:
+        """Monotonic seconds at which bytes last came."""
+        return self._keepalive.heard
+
+    @property
+    def has_output(self) -> bool:
+        """Whether ``take_output`` has something."""
+        return bool(self._output)
+
+    def take_output(self) -> bytes:
+        """Bytes to send, before all data that is sent later."""
+        output = bytes(self._output)
+        self._output.clear()
+        return output
+
+    def heard(self, now: float) -> None:
+        """Bytes came at ``now``, though perhaps no whole frame: a large message renews the lease as it arrives."""
+        self._keepalive.heard = max(self._keepalive.heard, now)
+
+    def receive(self, view: memoryview, now: float) -> tuple[int, int]:
+        """Take whole frames from the start of ``view``.
+
+        Returns:
+            How many bytes were taken, and how many bytes there must be behind those for the next frame (0: a
+            header, or nothing more).
+
+        Raises:
+            RemoteProtocolError: The remote side broke the protocol; the connection is ``CLOSED``.
+        """
+        self._keepalive.heard = now
+        size = len(view)
+        offset = 0
+        try:
+            if self._missing:
+                offset = self._take_rest(view)
+            while size - offset >= _HEADER:
+                length, kind, flags, _, route, sequence, stamp_ns = frames.unpack_header(view, offset)
+                if (kind != _DATA or self._state is not ConnectionState.UP) and not self._admit(kind):
+                    return size, 0
+                # One comparison each on the data path; check_header says what is wrong.
+                if kind != _DATA or length > limits.DATA_PAYLOAD_MAX or flags != _WHOLE:
+                    frames.check_header(length, kind, flags)
+                start = offset + _HEADER
+                end = start + length
+                if end > size:
+                    if kind != _DATA or length <= core_limits.CUT_THROUGH_BYTES or size - start < _FIRST_PART:
+                        return offset, end - offset
+                    # Handed on as it comes: a large frame is not awaited, and not moved within the buffer.
+                    self._missing = end - size
+                    self._begun = (route, sequence, stamp_ns, flags & LAST)
+                    self.on_part(route, sequence, stamp_ns, flags & FIRST, view[start:])
+                    return size, 0
+                offset = end
+                if kind != _DATA:
+                    self._handle(FrameKind(kind), view[start:end], route, sequence, stamp_ns, now)
+                elif flags == _WHOLE:
+                    self.on_data(route, sequence, stamp_ns, view[start:end])
+                else:
+                    self.on_part(route, sequence, stamp_ns, flags, view[start:end])
+        except RemoteProtocolError as error:
+            self._end(f"{self._name} broke the protocol: {error}")
+            raise
+        return (size if self._state is ConnectionState.CLOSED else offset), 0
+
+    def accept(self, now: float) -> None:
+        """Acceptor, after ``HelloReceived``: welcome the remote side; the connection is up.
+
+        Raises:
+            LocalProtocolError: There was no hello, or it was answered.
+        """
+        hello = self._unanswered()
+        if hello.lane == Lane.BULK:
+            self._keepalive.promise(limits.BULK_LEASE)
+        welcome = Hello.of(self._ours, lease=self._keepalive.lease, expected=hello.guid, lane=hello.lane)
+        self._send(Frame(FrameKind.WELCOME, welcome.serialize()))
+        self._open(hello, now)
+
+    def refuse(self, refuse: Refuse, now: float) -> None:
+        """Acceptor, after ``HelloReceived``: refuse the connection, and close it.
+
+        Raises:
+            LocalProtocolError: There was no hello, or it was answered.
+        """
+        self._unanswered()
+        self._refuse(refuse, now)
+
+    def control(self, payload: bytes) -> bytes:
+        """The bytes of a control frame, for the driver to send.
+
+        Raises:
+            LocalProtocolError: It is too long.
+        """
+        return Frame(FrameKind.CONTROL, payload, stamp_ns=self._wall_ns()).serialize()
+
+    def close(self, reason: str, now: float) -> None:
+        """Say bye; ``ConnectionClosed`` comes from ``drained`` or the timer. Without effect once closing."""
+        if self._state in (ConnectionState.CLOSING, ConnectionState.CLOSED):
+            return
+        if self._state is ConnectionState.UP:
+            self._send(Frame(FrameKind.BYE, frames.text_payload(reason), stamp_ns=self._wall_ns()))
+        self._close(_Step.LEAVING, reason, now)
+
+    def drained(self) -> None:
+        """The driver has sent all that was to be sent; the end of ``CLOSING``."""
+        if self._state is ConnectionState.CLOSING:
+            self._end(self._reason, orderly=True)
+
+    def lost(self, reason: str) -> None:
+        """The TCP connection is gone; without effect once closed."""
+        if self._state is not ConnectionState.CLOSED:
+            self._end(self._reason or reason, orderly=self._state is ConnectionState.CLOSING)
+
+    def ping(self, now: float) -> int:
+        """Measure a round trip on demand; the answer is a ``PongReceived`` with the stamp that this returns.
+
+        Raises:
+            LocalProtocolError: The connection is not up.
+        """
+        if self._state is not ConnectionState.UP:
+            raise LocalProtocolError(f"no ping on a link that is {self._state.name}")
+        return self._ping(now)
+
+    def next_timer(self) -> float | None:
+        """When ``handle_timer`` is due, in monotonic seconds."""
+        if self._state is ConnectionState.CLOSED:
+            return None
+        return self._keepalive.due if self._state is ConnectionState.UP else self._deadline
+
+    def handle_timer(self, now: float) -> None:
+        """Do what is due: keepalive, end of the lease, end of the time for the handshake or for closing."""
+        due = self.next_timer()
+        if due is None or now < due:
+            return
+        keepalive = self._keepalive
+        if now - due > limits.PAUSE_NOTICED:
+            keepalive.excuse(now - due, now)
+        if self._state is ConnectionState.CLOSING:
+            self._end(self._reason, orderly=True)
+        elif self._state is ConnectionState.HANDSHAKING:
+            self._end(f"{self._name} did not finish the handshake within {limits.HANDSHAKE_TIMEOUT:g} s")
+        elif now >= keepalive.lease_end:
+            excused = keepalive.excused
+            ours = f", our own pauses of {excused:.2g} s not counted" if excused else ""
+            self._end(f"{self._name} was silent for its lease of {keepalive.awaited_lease:g} s{ours}")
+        else:
+            self._ping(now)
+
+    # --- inside ---------------------------------------------------------------------------------------------
+
+    @property
+    def _name(self) -> str:
+        return self.remote.name if self.remote is not None else self._label
+
+    def _admit(self, kind: int) -> bool:
+        """Whether a frame of this kind is read now; false while closing, when nothing more is read.
+
+        Raises:
+            RemoteProtocolError: Such a frame may not come in this state.
+        """
+        if self._state in (ConnectionState.CLOSING, ConnectionState.CLOSED):
+            return False
+        if kind not in _ALLOWED[self.role, self._state] or (
+            self.remote is not None and self._state is not ConnectionState.UP
+        ):
+            what = FrameKind(kind).name.lower() if kind in frames.PAYLOAD_MAX else f"kind {kind}"
+            raise RemoteProtocolError(f"{what} frame while {self._state.name.lower()}")
+        return True
+
+    def _take_rest(self, view: memoryview) -> int:
+        """Hand on what has come of a data frame that was begun; return how many bytes that were."""
+        count = min(self._missing, len(view))
+        self._missing -= count
+        if self._state is ConnectionState.UP:
+            route, sequence, stamp_ns, last = self._begun
+            self.on_part(route, sequence, stamp_ns, 0 if self._missing else last, view[:count])
+        return count
+
+    def _handle(
+        self, kind: FrameKind, payload: memoryview, route: int, sequence: int, stamp_ns: int, now: float
+    ) -> None:
+        if _log.isEnabledFor(logging.DEBUG):
+            _log.debug("< %s: %s, %d bytes", self._name, kind.name, len(payload))
+        if kind is FrameKind.PING:
+            came = self._wall_ns()
+            self._send(frames.pong(stamp_ns, came, self._wall_ns()))
+            self._keepalive.sent = now
+        elif kind is FrameKind.PONG:
+            t1, t2 = frames.parse_pong(payload)
+            sample = self.clock.ponged(t1, t2, stamp_ns, self._wall_ns(), now)
+            if sample is not None:
+                self.on_event(PongReceived(t1, sample.rtt))
+        elif kind is FrameKind.CONTROL:
+            self.on_event(ControlReceived(bytes(payload)))
+        elif kind in {FrameKind.ACK, FrameKind.FENCE, FrameKind.FENCED}:
+            self.on_event(MarkReceived(kind, route, sequence))
+        elif kind is FrameKind.BYE:
+            self._end(f"{self._name} left: {frames.parse_text(payload)}", orderly=True)
+        elif kind is FrameKind.REFUSE:
+            refuse = Refuse.parse(payload)
+            self.on_event(Refused(refuse, by_us=False))
+            self._end(f"{self._label} refused: {refuse}", orderly=True)
+        else:
+            self._handshake(payload, now)
+
+    def _handshake(self, payload: memoryview, now: float) -> None:
+        try:
+            hello = Hello.parse(payload)
+        except HandshakeError as error:
+            self._refuse(error.refuse, now)
+            return
+        if self.role is ConnectionRole.ACCEPTOR:
+            self.remote = hello
+            self.on_event(HelloReceived(hello))
+        elif refuse := judge_welcome(hello, self._ours, self._expected):
+            self._refuse(refuse, now)
+        else:
+            self._open(hello, now)
+
+    def _unanswered(self) -> Hello:
+        if (
+            self.role is not ConnectionRole.ACCEPTOR
+            or self.remote is None
+            or self._state is not ConnectionState.HANDSHAKING
+        ):
+            raise LocalProtocolError(f"no hello waits for an answer (state {self._state.name})")
+        return self.remote
+
+    def _open(self, hello: Hello, now: float) -> None:
+        self._state = _NEXT[self._state, _Step.WELCOMED]
+        self.remote = hello
+        self._keepalive.begin(hello.lease, now)
+        _log.debug("= %s: up", self._name)
+        self._ping(now)
+        self.on_event(HandshakeDone(hello))
+
+    def _refuse(self, refuse: Refuse, now: float) -> None:
+        self._send(
+            Frame(FrameKind.REFUSE, refuse.serialize())
+            if self.role is ConnectionRole.ACCEPTOR
+            else Frame(FrameKind.BYE, frames.text_payload(refuse.text))
+        )
+        self._close(_Step.REFUSING, f"refused: {refuse}", now)
+        self.on_event(Refused(refuse, by_us=True))
+
+    def _close(self, step: _Step, reason: str, now: float) -> None:
+        self._state = _NEXT[self._state, step]
+        self._reason = reason
+        self._deadline = now + runtime_limits.DRAIN_TIMEOUT
+        _log.debug("= %s: closing: %s", self._name, reason)
+
+    def _end(self, reason: str, *, orderly: bool = False) -> None:
+        if self._state is ConnectionState.CLOSED:
+            return
+        self._state = _NEXT[self._state, _Step.ENDED]
+        self._reason = reason
+        _log.debug("= %s: closed: %s", self._name, reason)
+        self.on_event(ConnectionClosed(reason, orderly))
+
+    def _ping(self, now: float) -> int:
+        stamp = self._wall_ns()
+        self.clock.pinged(stamp, now)
+        self._send(Frame(FrameKind.PING, stamp_ns=stamp))
+        self._keepalive.pinged(now)
+        return stamp
+
+    def _send(self, frame: Frame) -> None:
+        if _log.isEnabledFor(logging.DEBUG):
+            _log.debug("> %s: %s", self._name, frame)
+        self._output += frame.serialize()
+
+
+def _no_parts(_route: int, _sequence: int, _stamp_ns: int, _flags: int, _part: memoryview) -> None:
+    """Ignores parts of messages, where the owner of the machine takes none."""

@@ -1,0 +1,423 @@
+"""One TCP connection with a peer: drives the connection's machine by one stream and one timer."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+import math
+from typing import TYPE_CHECKING, Final, Protocol
+
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.outbox import URGENT, Outbox
+from rmpa.core.serial_number import SERIAL_MASK
+from rmpa.mesh import limits
+from rmpa.mesh.connection import (
+    ConnectionClosed,
+    ConnectionEvent,
+    ConnectionProtocol,
+    ConnectionRole,
+    ConnectionState,
+    ControlReceived,
+    HandshakeDone,
+    HelloReceived,
+    MarkReceived,
+    PongReceived,
+    Refused,
+)
+from rmpa.mesh.frames import Frame, FrameKind
+from rmpa.mesh.handshake import Lane
+from rmpa.mesh.io.sockets import reset_at_close, unacknowledged
+from rmpa.mesh.path_mtu import StallWatch
+from rmpa.runtime.machine_timer import MachineTimer
+from rmpa.runtime.stream import Stream
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Callable
+
+    from rmpa.core.clock import Clock
+    from rmpa.core.guid import Guid
+    from rmpa.core.identity import Identity
+    from rmpa.mesh.connection import OnData, OnPart
+    from rmpa.mesh.handshake import Hello, Refuse
+    from rmpa.mesh.timing import LinkClock
+
+    OnMark = Callable[[FrameKind, int, int], None]
+
+_log = logging.getLogger(__name__)
+
+_SILENCE: Final = frozenset(
+    {errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ENETDOWN, errno.ECONNRESET, errno.EPIPE}
+)
+"""Errors of a connection that the remote side gave up after a silence, or whose process died with bytes unread."""
+
+_ANSWERED: Final = -1
+"""In place of a probe's stamp."""
+
+
+class ConnectionOwner(Protocol):
+    """What a connection tells the mesh; all methods are called from the event loop."""
+
+    def connection_judge(self, connection: Connection, hello: Hello) -> Refuse | None:
+        """Decide on the hello of a dialler: ``None`` accepts the connection."""
+        ...
+
+    def connection_opened(self, connection: Connection) -> None:
+        """The handshake succeeded."""
+        ...
+
+    def connection_refused(self, connection: Connection, refuse: Refuse, *, by_us: bool) -> None:
+        """The handshake was refused; ``connection_ended`` follows."""
+        ...
+
+    def connection_control(self, connection: Connection, payload: bytes) -> None:
+        """A control frame came."""
+        ...
+
+    def connection_ponged(self, connection: Connection) -> None:
+        """A ping was answered: the remote clock is known better."""
+        ...
+
+    def connection_quiet(self, connection: Connection) -> None:
+        """Nothing came for ``limits.GHOST_QUIET``; repeated from time to time while that lasts."""
+        ...
+
+    def connection_tick(self, connection: Connection) -> None:
+        """The timer of a connection that is up, about once in a keepalive interval."""
+        ...
+
+    def connection_closing(self, connection: Connection, reason: str) -> None:
+        """The connection sends no more data; ``connection_ended`` follows. May be called more than once."""
+        ...
+
+    def connection_ended(self, connection: Connection, reason: str) -> None:
+        """The socket is closed; called once."""
+        ...
+
+
+class Connection:
+    """One TCP connection: frames, handshake, keepalive.
+
+    What its frames are for is decided by the link that receives them; see ``mesh.io.link.PeerLink``.
+
+    Args:
+        connection_id: The mesh's number for it.
+        sock: Connected, non-blocking; owned by the connection from here on.
+        role: Whether this side dialled.
+        ours: The identity of this agent.
+        owner: What is told of events.
+        clock: The time.
+        endpoint: Address and port of the remote side.
+        expected: The GUID that was dialled; ``None`` on an accepted connection.
+        lane: What this side dials for; on an accepted connection the remote side's hello says it.
+        segment: Bytes that one packet may carry; ``None`` for as many as the kernel chooses.
+    """
+
+    def __init__(
+        self,
+        connection_id: int,
+        sock: socket.socket,
+        role: ConnectionRole,
+        ours: Identity,
+        *,
+        owner: ConnectionOwner,
+        clock: Clock,
+        endpoint: tuple[str, int],
+        expected: Guid | None = None,
+        lane: Lane = Lane.EXPRESS,
+        segment: int | None = None,
+    ) -> None:
+        self.id = connection_id
+        self.sock = sock
+        self.remote_endpoint = endpoint
+        self.since: float | None = None
+        """Monotonic seconds at which the handshake ended."""
+        self.malformed = False
+        """Whether the remote side broke the protocol."""
+        self.silent = False
+        """Once ended: whether it ended by silence (lease expired, no route, reset) rather than by a bye."""
+        self.stalls = StallWatch(segment, clock.now())
+        """Whether what is sent gets through."""
+        self._owner = owner
+        self._clock = clock
+        self._loop = asyncio.get_running_loop()
+        self._requested_lane = lane
+        self._pings: dict[int, asyncio.Future[float]] = {}
+        self._end: asyncio.Future[None] = self._loop.create_future()
+        self._ended = False
+        self._finishing = False
+        self._on_mark: OnMark = _ignore_mark
+        self._probe: int | None = None
+        self._probed_at = -math.inf
+        self._sent_before = 0
+        self.stream = Stream(
+            sock,
+            on_bytes=self._receive,
+            on_close=self._lost,
+            outbox=Outbox(1, limits.LINK_URGENT_BYTES),
+            segment=segment,
+        )
+        self._machine = ConnectionProtocol(
+            role,
+            ours,
+            clock.now(),
+            wall_ns=clock.wall_ns,
+            on_event=self._event,
+            on_data=_ignore_data,
+            expected=expected,
+            lane=lane,
+            lease=limits.BULK_LEASE if lane is Lane.BULK else limits.LINK_LEASE,
+            label=f"{endpoint[0]}:{endpoint[1]}",
+        )
+        self._timer = MachineTimer(self._machine.next_timer, self._due, now=clock.now)
+        self._send_output()
+        self._timer.arm()
+
+    @property
+    def remote(self) -> Hello | None:
+        """What the remote side said of itself, as soon as it did."""
+        return self._machine.remote
+
+    @property
+    def identity(self) -> Identity:
+        """The remote side; only once the connection is up.
+
+        Raises:
+            AttributeError: The remote side has not said hello.
+        """
+        if self._machine.remote is None:
+            raise AttributeError("the other side of this link has not said who it is")
+        return self._machine.remote.identity
+
+    @property
+    def name(self) -> str:
+        """The name of the remote side, or its address while that is not known."""
+        remote = self._machine.remote
+        return remote.name if remote is not None else f"{self.remote_endpoint[0]}:{self.remote_endpoint[1]}"
+
+    @property
+    def dialled(self) -> bool:
+        """Whether this side dialled."""
+        return self._machine.role is ConnectionRole.DIALLER
+
+    @property
+    def up(self) -> bool:
+        """Whether messages go through."""
+        return self._machine.state is ConnectionState.UP and not self._ended
+
+    @property
+    def lane(self) -> int:
+        """What the connection is for (``handshake.Lane``); of an accepted one once the remote side said it."""
+        remote = self._machine.remote
+        return self._requested_lane if self.dialled or remote is None else remote.lane
+
+    @property
+    def clock(self) -> LinkClock:
+        """Round-trip time and remote clock, as the pings of this connection show them."""
+        return self._machine.clock
+
+    @property
+    def heard_at(self) -> float:
+        """Monotonic seconds at which bytes last came."""
+        return max(self._machine.heard_at, self.stream.last_in)
+
+    def receive(self, data: OnData | None, part: OnPart | None, mark: OnMark | None) -> None:
+        """Pass what comes to these from now on; ``None`` drops it. See ``ConnectionProtocol`` for the arguments."""
+        self._machine.on_data = _ignore_data if data is None else data
+        self._machine.on_part = _ignore_part if part is None else part
+        self._on_mark = _ignore_mark if mark is None else mark
+
+    def send_mark(self, kind: FrameKind, route: int, sequence: int) -> None:
+        """Acknowledge messages of a route, or answer a fence: in front of all data that waits."""
+        if self._machine.state is ConnectionState.UP:
+            frame = Frame(kind, route=route, sequence=sequence & SERIAL_MASK).serialize()
+            self.stream.send((frame,), URGENT)
+
+    def send_control(self, payload: bytes) -> None:
+        """Send one control frame, before all data that waits; never dropped.
+
+        If more than ``limits.LINK_URGENT_BYTES`` wait the connection is closed: the remote side does not read.
+        """
+        if self._machine.state is not ConnectionState.UP:
+            return
+        self.stream.send((self._machine.control(payload),), URGENT)
+        self._check_urgent()
+
+    async def ping(self) -> float | None:
+        """Measure one round trip now, in seconds; ``None`` if no answer came within ``limits.PING_TIMEOUT``."""
+        if not self.up:
+            return None
+        answer: asyncio.Future[float] = self._loop.create_future()
+        stamp = self._machine.ping(self._clock.now())
+        self._pings[stamp] = answer
+        self._send_output()
+        try:
+            async with asyncio.timeout(limits.PING_TIMEOUT):
+                return await answer
+        except TimeoutError:
+            return None
+        finally:
+            self._pings.pop(stamp, None)
+
+    def probe(self) -> None:
+        """Send a small packet now; ``take_probe`` returns whether it was answered."""
+        now = self._clock.now()
+        if self.up and now - self._probed_at >= limits.STALL_SUSPECTED:
+            self._probe, self._probed_at = self._machine.ping(now), now
+            self._send_output()
+
+    def take_probe(self) -> bool:
+        """Whether the last ``probe`` was answered since the last call."""
+        answered = self._probe == _ANSWERED
+        if answered:
+            self.forget_probe()
+        return answered
+
+    def forget_probe(self) -> None:
+        """Ignore the answer to the last ``probe``."""
+        self._probe = None
+
+    def has_sent(self) -> bool:
+        """Whether bytes were sent since the last call, or are not acknowledged yet."""
+        before, self._sent_before = self._sent_before, self.stream.bytes_out
+        return self._sent_before != before or unacknowledged(self.sock) > 0
+
+    def segment(self, size: int) -> None:
+        """Send in packets of at most ``size`` bytes from now on."""
+        self.stalls = StallWatch(size, self._clock.now(), self.stalls)
+        self.stream.segment(size)
+
+    def close(self, reason: str) -> None:
+        """Say bye, let the last bytes leave for at most ``limits.DRAIN_TIMEOUT``, and close."""
+        self._machine.close(reason, self._clock.now())
+        self._send_output()
+
+    def abort(self, reason: str) -> None:
+        """Close at once, without a bye."""
+        self._machine.lost(reason)
+
+    def sever(self, reason: str) -> None:
+        """Close at once and send not a byte more: its outbox belongs to another connection from now on."""
+        self.stream.close()
+        self._machine.lost(reason)
+
+    def reset(self, reason: str) -> None:
+        """Close at once, so that the remote side notices although earlier bytes are lost on the way."""
+        self.silent = True
+        reset_at_close(self.sock)
+        self.abort(reason)
+
+    async def ended(self) -> None:
+        """Wait until the socket is closed and the owner has been told."""
+        await asyncio.shield(self._end)
+
+    # --- inside ---------------------------------------------------------------------------------------------
+
+    def _receive(self, view: memoryview) -> tuple[int, int]:
+        try:
+            taken = self._machine.receive(view, self._clock.now())
+        except RemoteProtocolError:
+            self.malformed = True
+            raise
+        if self._machine.has_output:
+            self._send_output()
+        return taken
+
+    def _event(self, event: ConnectionEvent) -> None:
+        if isinstance(event, ControlReceived):
+            self._owner.connection_control(self, event.payload)
+        elif isinstance(event, MarkReceived):
+            self._on_mark(event.kind, event.route, event.sequence)
+        elif isinstance(event, PongReceived):
+            self._ponged(event)
+        elif isinstance(event, HelloReceived):
+            verdict = self._owner.connection_judge(self, event.hello)
+            if verdict is None:
+                self._machine.accept(self._clock.now())
+            else:
+                self._machine.refuse(verdict, self._clock.now())
+        elif isinstance(event, HandshakeDone):
+            self.since = self._clock.now()
+            # The welcome leaves before all that the owner sends now.
+            self._send_output()
+            self._timer.arm()
+            self._owner.connection_opened(self)
+        elif isinstance(event, Refused):
+            self._owner.connection_refused(self, event.refuse, by_us=event.by_us)
+        elif isinstance(event, ConnectionClosed):
+            self._finish(event.reason)
+
+    def _ponged(self, event: PongReceived) -> None:
+        if event.stamp == self._probe:
+            self._probe = _ANSWERED
+        if (answer := self._pings.get(event.stamp)) is not None and not answer.done():
+            answer.set_result(event.rtt)
+        self._owner.connection_ponged(self)
+
+    def _send_output(self) -> None:
+        """Send what the machine has to say; a connection that closes waits for the remote end, or its time."""
+        if self._machine.has_output:
+            self.stream.send((self._machine.take_output(),), URGENT)
+            self._check_urgent()
+        if self._machine.state is ConnectionState.CLOSING and not self._finishing:
+            # Closing at once would turn what the remote side still sends into a reset that overtakes our bye.
+            self._finishing = True
+            self._owner.connection_closing(self, f"{self.name}: its express lane ends")
+            self.stream.finish()
+            self._timer.arm()
+
+    def _check_urgent(self) -> None:
+        waiting = self.stream.outbox.urgent_bytes
+        if waiting > limits.LINK_URGENT_BYTES:
+            self.abort(f"{self.name} does not read: {waiting} bytes of control frames wait for it")
+
+    def _lost(self, error: Exception | None) -> None:
+        self.silent = isinstance(error, OSError) and error.errno in _SILENCE
+        reason = f"{self.name} closed the connection" if error is None else f"connection to {self.name} lost: {error}"
+        self._machine.lost(reason)
+
+    def _finish(self, reason: str) -> None:
+        if self._ended:
+            return
+        self._ended = True
+        self._owner.connection_closing(self, reason)
+        self._timer.close()
+        # Not from here: this may be ``receive``, or a ``send`` in the middle of the owner's loop over its links.
+        self._loop.call_soon(self._report_end, reason)
+
+    def _report_end(self, reason: str) -> None:
+        self.stream.close()
+        self.receive(None, None, None)
+        # The machine would hold this object in a cycle until the collector looks, and what waits here may be large.
+        self._machine.on_event = _ignore_event
+        self._end.set_result(None)
+        self._owner.connection_ended(self, reason)
+
+    def _due(self, now: float) -> None:
+        # A large message renews the lease while it arrives, long before the machine sees a whole frame of it.
+        self._machine.heard(self.stream.last_in)
+        was_up = self._machine.state is ConnectionState.UP
+        if was_up:
+            self._owner.connection_tick(self)
+        self._machine.handle_timer(now)
+        self.silent = was_up and self._machine.state is ConnectionState.CLOSED
+        if was_up and not self.silent and now - self.heard_at > limits.GHOST_QUIET:
+            self._owner.connection_quiet(self)
+        self._send_output()
+
+
+def _ignore_data(_route: int, _sequence: int, _stamp_ns: int, _payload: memoryview) -> None:
+    """Drops data of a connection that no link uses."""
+
+
+def _ignore_part(_route: int, _sequence: int, _stamp_ns: int, _flags: int, _part: memoryview) -> None:
+    """Drops parts of messages of a connection that no link uses."""
+
+
+def _ignore_mark(_kind: FrameKind, _route: int, _sequence: int) -> None:
+    """Leaves a fence without an answer, because the messages before it were dropped."""
+
+
+def _ignore_event(_event: ConnectionEvent) -> None:
+    """Drops what the machine of a connection that has ended still says."""

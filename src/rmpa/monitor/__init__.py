@@ -1,1 +1,0 @@
-"""The agent, seen from outside: snapshots and the control socket."""

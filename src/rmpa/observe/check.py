@@ -1,0 +1,70 @@
+"""The result of a check: one model behind ``rmpa doctor``, ``rmpa why``, the agent's health and ``/diagnostics``."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import TYPE_CHECKING, Self
+
+import msgspec
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+
+class CheckLevel(StrEnum):
+    """How bad a result is."""
+
+    OK = "ok"
+    WARN = "warn"
+    """It works, or may work: the first place to look at when something does not."""
+    FAIL = "fail"
+    """Something cannot work like this. ERROR on ``/diagnostics``."""
+    SKIPPED = "skipped"
+    """It could not be looked at."""
+    UNKNOWN = "unknown"
+    """The agent that knows it did not answer; a walk along a path goes on."""
+    STALE = "stale"
+    """It was there, and is no more (REP 107)."""
+
+
+OK, WARN, FAIL = CheckLevel.OK, CheckLevel.WARN, CheckLevel.FAIL
+SKIPPED, UNKNOWN, STALE = CheckLevel.SKIPPED, CheckLevel.UNKNOWN, CheckLevel.STALE
+
+
+class Check(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One result of one check.
+
+    It crosses the mesh as a stage of ``rmpa why``, where ``level`` is called ``verdict``.
+
+    Attributes:
+        name: What was looked at: ``multicast``, ``clock``, a stage of a topic's path, a component of
+            ``/diagnostics``.
+        level: How bad it is.
+        text: What was seen, ready to read.
+        remedy: What to do, where something is to be done.
+        where: Which of several: an interface, a variable, a peer; empty where there is one only.
+        evidence: Figures by their name, as ``/diagnostics`` shows them; units stand in the names.
+    """
+
+    name: str
+    level: CheckLevel = msgspec.field(name="verdict")
+    text: str
+    remedy: str = ""
+    where: str = ""
+    evidence: dict[str, str] = {}
+
+    @classmethod
+    def from_message(cls, name: str, level: CheckLevel, message: str, remedy: str = "", where: str = "") -> Self:
+        """The opposite of ``message``: what stands behind the first "; " is the remedy, in place of the one given."""
+        text, _, told = message.partition("; ")
+        return cls(name, level, text, told or remedy, where)
+
+    @property
+    def message(self) -> str:
+        """Text and remedy in one line."""
+        return f"{self.text}; {self.remedy}" if self.remedy else self.text
+
+
+def exit_code(checks: Iterable[Check]) -> int:
+    """The exit code of a command: 1 if something fails, else 0; warnings do not count."""
+    return int(any(check.level is FAIL for check in checks))

@@ -1,0 +1,192 @@
+"""The operations of the control socket: ``OPERATIONS`` has them all. A new operation is one method and one row."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from rmpa.bridge import limits as bridge_limits
+from rmpa.bridge.params.transfer import QUESTIONS as PARAM_REQUESTS
+from rmpa.bridge.policy import OWN_NODE
+from rmpa.config.values import did_you_mean
+from rmpa.core.errors import ConfigError, PeerRefused, RmpaError, UnreachableError
+from rmpa.observe import limits
+from rmpa.observe.io import node_requests
+from rmpa.observe.reload_reply import ReloadReply
+from rmpa.observe.snapshot import FollowedInfo, PingReply, Snapshot
+from rmpa.observe.why.diagnosis import Diagnosis
+from rmpa.ros.node_info import NodeLine, PeerNodes
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Collection
+
+    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.bridge.params.io.part import Params
+    from rmpa.observe.io.control_server import Handler
+    from rmpa.observe.io.snapshot_builder import SnapshotBuilder
+    from rmpa.observe.why.io.why import WhyService
+
+Args = dict[str, object]
+
+
+class ControlOperations:
+    """The operations of one agent.
+
+    Args:
+        name: The agent's name.
+        bridge: Its bridge.
+        params: The bridge's part for parameters.
+        snapshots: Builds its snapshots.
+        why: Answers ``why``.
+        reload: Reads the settings again; with ``check`` it changes nothing.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        bridge: Bridge,
+        params: Params,
+        snapshots: SnapshotBuilder,
+        why: WhyService,
+        reload: Callable[..., Awaitable[ReloadReply]],
+    ) -> None:
+        self._name = name
+        self._bridge = bridge
+        self._params = params
+        self._snapshots = snapshots
+        self._why = why
+        self._reload = reload
+
+    def handlers(self) -> dict[str, Handler]:
+        """The handler of each operation, for ``ControlServer``."""
+        return {operation.name: partial(operation.handler, self) for operation in OPERATIONS}
+
+    def snapshot(self, args: Args) -> Snapshot:
+        """``topics``: the only ones that are wanted, or ``None`` for everything."""
+        topics = args.get("topics")
+        if topics is not None and not isinstance(topics, list):
+            raise ConfigError("topics", f"{topics!r} is not a list of topics")
+        return self._snapshots.build(frozenset(map(str, topics)) if topics is not None else None)
+
+    async def ping(self, args: Args) -> PingReply:
+        """``peer``: its name or GUID; ``count``: the number of pings."""
+        link = self._session(args.get("peer", "")).link
+        count = args.get("count", 1)
+        if not isinstance(count, int) or not 1 <= count <= limits.CONTROL_PINGS_MAX:
+            raise ConfigError("count", f"{count!r} is not between 1 and {limits.CONTROL_PINGS_MAX}")
+        times = [await link.ping() for _ in range(count)]
+        host, port = link.remote_endpoint
+        return PingReply(times=tuple(times), remote=f"{host}:{port}")
+
+    async def why(self, args: Args) -> tuple[Diagnosis, ...]:
+        """The arguments of ``WhyService.answer``."""
+        return await self._why.answer(args)
+
+    async def reload(self, args: Args) -> ReloadReply:
+        """``check``: whether to say only what would change."""
+        return await self._reload(check=args.get("check") is True)
+
+    async def param(self, args: Args) -> Any:
+        """Pass a request about parameters on to a peer: ``peer``, ``what`` and the ``args`` of that request."""
+        what, inner = _request(args, PARAM_REQUESTS), args.get("args")
+        if not isinstance(inner, dict):
+            raise ConfigError("args", f"{inner!r} is no table")
+        session = self._session(args.get("peer", ""))
+        return await self._bridge.asks.ask(session, what, inner, bridge_limits.PARAM_ASK_TIMEOUT)
+
+    def followed(self, _args: Args) -> tuple[FollowedInfo, ...]:
+        """The parameters of other modules that this one follows."""
+        return tuple(
+            FollowedInfo(
+                key=entry.rule.to,
+                owner=entry.rule.owner,
+                owner_key=entry.rule.key,
+                state=entry.state,
+                size=len(entry.text) if entry.text is not None else None,
+                problem=entry.problem,
+            )
+            for entry in self._params.followed
+        )
+
+    async def node(self, args: Args) -> Any:
+        """Pass a request about a node on to a peer: ``peer``, ``what``, ``node``; without a peer, list all nodes."""
+        what, peer = _request(args, node_requests.REPLIES), args.get("peer")
+        if peer is None:
+            return await asyncio.gather(*(self._nodes_of(session) for session in list(self._bridge.attached())))
+        session = self._session(peer)
+        if what == node_requests.LIST:
+            return [await self._nodes_of(session)]
+        request = {"node": str(args.get("node", "")), "by": OWN_NODE, "reason": "user request"}
+        return await self._bridge.asks.ask(session, what, request, bridge_limits.NODE_KILL_TIMEOUT)
+
+    async def _nodes_of(self, session: PeerSession) -> PeerNodes:
+        """The nodes of a peer; where it does not answer, those of which this module has proxies."""
+        peer = session.link.name
+        try:
+            value = await self._bridge.asks.ask(session, node_requests.LIST, {})
+            return PeerNodes(peer=peer, nodes=msgspec.convert(value, tuple[NodeLine, ...]))
+        except (RmpaError, msgspec.ValidationError) as error:
+            nodes = tuple(NodeLine(name=node) for node, _ in session.inbound)
+            return PeerNodes(peer=peer, nodes=nodes, problem=str(error))
+
+    def _session(self, name: object) -> PeerSession:
+        """The linked peer of a name or GUID.
+
+        Raises:
+            PeerRefused: Several peers have that name.
+            UnreachableError: No linked peer has it.
+        """
+        peer = str(name)
+        sessions = list(self._bridge.attached())
+        fitting = [s for s in sessions if peer in {s.link.name, str(s.link.guid), str(s.link.guid).partition("#")[0]}]
+        if len(fitting) == 1:
+            return fitting[0]
+        if fitting:
+            raise PeerRefused(self._name, f"{len(fitting)} peers are named {peer}", "name one by its GUID")
+        similar = did_you_mean(peer, [session.link.name for session in sessions])
+        remedy = "`rmpa peer list` shows who is there, and why one is not linked"
+        raise UnreachableError("linked peer", repr(peer), f"did you mean {similar}?" if similar else remedy)
+
+
+def _request(args: Args, known: Collection[str]) -> str:
+    """The argument ``what``: the name of a request to a peer.
+
+    Raises:
+        ConfigError: There is no such request.
+    """
+    what = str(args.get("what", ""))
+    if what not in known:
+        similar = did_you_mean(what, known)
+        raise ConfigError("what", f"{what!r} is no question", f"did you mean {similar}?" if similar else "")
+    return what
+
+
+@dataclass(frozen=True, slots=True)
+class Operation:
+    """One row of ``OPERATIONS``.
+
+    Args:
+        name: As clients call it.
+        handler: Gets the request's arguments; an ``RmpaError`` becomes the client's error.
+        reply: The type of its value; ``object`` where that depends on the arguments, as said beside it.
+    """
+
+    name: str
+    handler: Callable[[ControlOperations, Args], Awaitable[object] | object]
+    reply: object
+
+
+OPERATIONS: Final = (
+    Operation("snapshot", ControlOperations.snapshot, Snapshot),
+    Operation("ping", ControlOperations.ping, PingReply),
+    Operation("why", ControlOperations.why, tuple[Diagnosis, ...]),
+    Operation("reload", ControlOperations.reload, ReloadReply),
+    Operation("param", ControlOperations.param, object),  # the value that the peer replies
+    Operation("followed", ControlOperations.followed, tuple[FollowedInfo, ...]),
+    Operation("node", ControlOperations.node, object),  # tuple[PeerNodes, ...] for lists, else as REPLIES says
+)
+"""All operations of the control socket."""

@@ -1,0 +1,112 @@
+"""The peers' requests about this module's nodes: list, describe, ping and end them."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from rmpa.bridge import limits as bridge_limits
+from rmpa.bridge.io.node_shutdown import KILL
+from rmpa.bridge.policy import OWN_NODE, is_own
+from rmpa.bridge.proxy_names import proxied_node
+from rmpa.config import limits as config_limits
+from rmpa.config.values import did_you_mean
+from rmpa.core.errors import RmpaError
+from rmpa.core.names import is_global_name, matches
+from rmpa.ros.core.node_calls import end_node, ping_node
+from rmpa.ros.node_info import NodeEnd, NodeFacts, NodeLine, NodePing, describe_node, list_nodes
+from rmpa.runtime.event_loop import yielding_to_data
+
+if TYPE_CHECKING:
+    from rmpa.bridge.io.bridge import PeerSession
+    from rmpa.bridge.session.peer_rpc import PeerRpc
+    from rmpa.config.settings import Settings
+    from rmpa.ros.core.api import Core
+
+_log = logging.getLogger(__name__)
+
+LIST: Final = "node.list"
+"""The request for a module's own nodes."""
+INFO: Final = "node.info"
+"""The request for what is known of a ``node``."""
+PING: Final = "node.ping"
+"""The request to ping a ``node``."""
+REPLIES: Final[dict[str, object]] = {LIST: tuple[NodeLine, ...], INFO: NodeFacts, PING: NodePing, KILL: NodeEnd}
+"""What each request is replied by; ``KILL`` ends a ``node``, where ``nodes.kill`` allows it."""
+
+
+class NodeRequests:
+    """Answers the peers' requests about this module's nodes.
+
+    Args:
+        settings: The agent's.
+        core: Its ROS core.
+        asks: Brings the requests.
+    """
+
+    def __init__(self, settings: Settings, core: Core, asks: PeerRpc) -> None:
+        self._settings = settings
+        self._core = core
+        asks.on(LIST, self._list)
+        asks.on(INFO, self._info)
+        asks.on(PING, self._ping)
+        asks.on(KILL, self._kill)
+
+    def reload(self, settings: Settings) -> None:
+        """Other settings hold from now on."""
+        self._settings = settings
+
+    def _list(self, _asker: PeerSession, _args: dict[str, Any]) -> tuple[NodeLine, ...]:
+        state = self._core.state()
+        problems = {node: found.problem for node, found in self._core.unreachable().items()}
+        tables = (state.publishers, state.subscribers, state.services)
+        found = list_nodes(*tables, state.nodes, problems, yielding_to_data)
+        return tuple(line for line in found if not is_own(line.name))
+
+    async def _info(self, _asker: PeerSession, args: dict[str, Any]) -> NodeFacts:
+        node, uri = self._own(args)
+        state = self._core.state()
+        facts = describe_node(node, uri, state.publishers, state.subscribers, state.services, state.types)
+        try:
+            answer = await ping_node(node, uri, OWN_NODE)
+        except RmpaError as error:
+            return msgspec.structs.replace(facts, problem=str(error))
+        return msgspec.structs.replace(facts, pid=answer.pid)
+
+    async def _ping(self, _asker: PeerSession, args: dict[str, Any]) -> NodePing:
+        node, uri = self._own(args)
+        return await ping_node(node, uri, OWN_NODE)
+
+    async def _kill(self, asker: PeerSession, args: dict[str, Any]) -> NodeEnd:
+        node, uri = self._own(args)
+        who = f"{asker.link.name}'s {str(args.get('by', ''))[: bridge_limits.ASK_NAME_MAX]}"
+        here = self._settings.name
+        if not any(matches(glob, node) for glob in self._settings.nodes.kill):
+            _log.warning("! %s may not end %s: no glob of nodes.kill fits", who, node)
+            raise RmpaError(f"no glob of nodes.kill in the rmpa.toml of {here} fits {node}; allow it there")
+        _log.warning("= %s ends %s", who, node)
+        gone = await end_node(node, uri, OWN_NODE, f"killed by {who}")
+        self._core.suspect(node)  # roscpp leaves its registrations behind when it ends in a hurry
+        return NodeEnd(gone=gone)
+
+    def _own(self, args: dict[str, Any]) -> tuple[str, str]:
+        """The node of this module that a request names, and its slave API.
+
+        Raises:
+            RmpaError: There is no such node.
+        """
+        here = self._settings.name
+        node = args.get("node")
+        if not isinstance(node, str) or len(node) > config_limits.CROSSING_NAME_MAX or not is_global_name(node):
+            raise RmpaError("the question names no node")
+        if is_own(node):
+            origin = proxied_node(node)
+            whose = f"it is {origin[0]}'s {origin[1]}: ask there" if origin is not None else "it is its agent"
+            raise RmpaError(f"{node} is no node of {here}: {whose}")
+        nodes = self._core.state().nodes
+        if node not in nodes:
+            near = did_you_mean(node, [name for name in nodes if not is_own(name)])
+            raise RmpaError(f"{here} has no node {node}" + (f"; did you mean {near}?" if near else ""))
+        return node, nodes[node]

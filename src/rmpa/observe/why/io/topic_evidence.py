@@ -1,0 +1,216 @@
+"""What this agent knows of a topic on its path: for its own user, and for the agent at the other end."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+from rmpa.bridge import limits as bridge_limits
+from rmpa.bridge.messages import Source
+from rmpa.bridge.policy import Policy, is_own
+from rmpa.bridge.proxy_names import proxy_name
+from rmpa.config import limits as config_limits
+from rmpa.config.values import did_you_mean
+from rmpa.core.contract import Reliability
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.core.names import is_global_name
+from rmpa.observe.why.diagnosis import (
+    ProxyState,
+    PublisherReport,
+    SubscriberConnection,
+    TopicAtPublisher,
+    TopicAtSubscriber,
+)
+from rmpa.ros.wire.tcpros import printable
+from rmpa.runtime.event_loop import yielding_to_data
+
+if TYPE_CHECKING:
+    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.config.settings import Settings
+    from rmpa.observe.io.snapshot_builder import SnapshotBuilder
+    from rmpa.observe.snapshot import PeerInfo
+    from rmpa.ros.core.api import Core
+
+
+class TopicEvidence:
+    """Reads what the rooms know of one topic; changes nothing.
+
+    Args:
+        settings: The agent's.
+        core: Its ROS core.
+        bridge: Its bridge.
+        snapshots: Its snapshots.
+    """
+
+    def __init__(self, settings: Settings, core: Core, bridge: Bridge, snapshots: SnapshotBuilder) -> None:
+        self._core = core
+        self._bridge = bridge
+        self._snapshots = snapshots
+        self.reload(settings)
+
+    def reload(self, settings: Settings) -> None:
+        """Other settings hold from now on."""
+        self._policy = Policy(settings.policy, settings.peers, settings.time)
+
+    def own(self, topic: str) -> dict[str, str]:
+        """The module's own publishers of a topic, and their addresses."""
+        return {node: uri for node, uri in self._core.publishers(topic).items() if not is_own(node)}
+
+    def awaited(self, topic: str) -> list[str]:
+        """Nodes that published a topic before this agent was restarted, each with its address."""
+        return [f"{node} at {uri}" for node, uri in self._core.unverified(topic).items()]
+
+    def there(self, peer: str, topic: str) -> tuple[str, str]:
+        """The names of a topic of a peer here and at the peer.
+
+        A user may write either: a name that no topic of the peer can have here is taken for the peer's own.
+        """
+        names = self._bridge.names.of(peer)
+        wires = names.wires_of(topic)
+        return (topic, wires[0]) if wires else (names.local_name(topic), topic)
+
+    def here(self, session: PeerSession | None, peer: PeerInfo | None, topic: str) -> TopicAtSubscriber:
+        """What is known here of a topic that a peer publishes.
+
+        Args:
+            session: The session whose link carries it, if one does.
+            peer: The module of its publishers.
+            topic: Its name here.
+        """
+        snapshot = self._snapshots.build(frozenset({topic}))
+        if session is None or peer is None:
+            return TopicAtSubscriber(snapshot, topic)
+        proxies = {}
+        publishers, standing = self._core.publishers(topic), dict(session.inbound)
+        for number, source in list(self._bridge.imports.at(topic)):
+            entry = self._bridge.imports.get(number, source)
+            if number != session.peer or entry is None:
+                continue
+            if (entry.origin.instance if entry.origin else session.link.identity.instance.hex()) != peer.instance:
+                continue
+            node = source.node
+            name = session.inbound.names.get(node) or proxy_name(session.inbound.prefix, node)
+            proxies[node] = ProxyState(
+                name=name,
+                registered=node in standing and publishers.get(name) == standing[node].node.uri,
+                conflict=entry.conflict,
+                connections=self._connections(session, source),
+                mismatches=self._bridge.mismatches(source),
+            )
+        return TopicAtSubscriber(snapshot, topic, session.link.name, proxies)
+
+    @staticmethod
+    def _connections(session: PeerSession, source: Source) -> tuple[SubscriberConnection, ...]:
+        publication = session.inbound.publication(source)
+        return tuple(
+            SubscriberConnection(
+                number=link.number,
+                node=printable(link.other),
+                held=not link.connected,
+                messages=link.messages,
+                waiting=link.waiting,
+                dropped=link.dropped,
+            )
+            for link in (publication.connections() if publication is not None else ())
+        )
+
+    async def answer(self, session: PeerSession, args: dict[str, Any]) -> TopicAtPublisher:
+        """The reply to ``why.topic``.
+
+        Args:
+            session: The peer that asks.
+            args: ``topic``: its name on the wire; ``instance``: the instance id of its module, if this module only
+                relays it.
+        """
+        wire = name_in(args, "topic")
+        instance = args.get("instance") or ""
+        asker = session.link.name
+        names = self._bridge.names.of(asker)
+        state = self._core.state()
+        sources: list[PublisherReport] = []
+        subscribers: list[str] = []
+        awaited: list[str] = []
+        for topic in names.locals_of(wire):
+            kind = self._core.type_of(topic)
+            nodes = self._relayed(topic, instance) if instance else list(self.own(topic))
+            if names.wire_name(topic, kind) == wire:
+                sources += [self._report(session, Source(topic, node), wire) for node in nodes]
+                subscribers += [node for node in state.subscribers.get(topic, {}) if not is_own(node)]
+                awaited += self.awaited(topic)
+        endpoint = self._snapshots.endpoint
+        problem = endpoint.mesh.paths.problem(session.link) if endpoint is not None else None
+        return TopicAtPublisher(
+            path_problem=problem.text if problem is not None else "",
+            path_remedy=problem.remedy if problem is not None else "",
+            sources=tuple(sources[: bridge_limits.WHY_SOURCES_MAX]),
+            subscribers=tuple(subscribers[: bridge_limits.WHY_SOURCES_MAX]),
+            similar="" if sources else await self._similar(session.link.name, wire),
+            awaited=tuple(awaited[: bridge_limits.WHY_SOURCES_MAX]),
+        )
+
+    async def _similar(self, asker: str, wire: str) -> str:
+        """The topic of this module whose name on the wire is most like this one; empty if none is."""
+        names, state = self._bridge.names.of(asker), self._core.state()
+        known = {
+            names.wire_name(topic, state.types.get(topic, ""))
+            for topic, nodes in yielding_to_data(list(state.publishers.items()))
+            if not all(map(is_own, nodes))
+        }
+        # In a thread: comparing thousands of names takes longer than a message may wait.
+        return await asyncio.to_thread(did_you_mean, wire, known) or ""
+
+    def _relayed(self, topic: str, instance: object) -> list[str]:
+        """The proxies of the nodes of a module whose topic this one relays."""
+        offered = self._bridge.exports.offered
+        return [
+            node
+            for node in self._core.publishers(topic)
+            if (local := offered.get(Source(topic, node))) is not None
+            and local.origin is not None
+            and local.origin.instance == instance
+        ]
+
+    def _report(self, session: PeerSession, source: Source, wire: str) -> PublisherReport:
+        exports = self._bridge.exports
+        local = exports.offered.get(source)
+        kind = local.type if local is not None else self._core.type_of(source.topic)
+        node = source.node if local is None or local.origin is None else local.origin.node
+        decision = self._policy.judge(source.topic, kind, node)
+        if decision.allowed:
+            special = self._policy.judge_for(session.link.name, source.topic, kind, wire)
+            decision = special if special.rule else decision
+        flow = self._bridge.outbound.flows.get(source)
+        contract = exports.contract(source, session.peer)
+        reliable = contract is not None and contract.reliability is Reliability.RELIABLE
+        return PublisherReport(
+            node=source.node,
+            topic=source.topic,
+            type=kind,
+            crosses=decision.allowed,
+            rule=decision.rule,
+            offered=exports.offer(session.peer, source) is not None,
+            route="open" if session.peer in exports.flowing(source) else "opening" if contract is not None else "",
+            messages=flow.messages if flow is not None else 0,
+            dropped=flow.dropped if flow is not None and not reliable else 0,
+            lost=self._bridge.outbound.lost(source, session.peer),
+            oversized=flow.oversized if flow is not None else 0,
+            oversized_bytes=flow.oversized_bytes if flow is not None else 0,
+            beyond=exports.beyond.limit if exports.is_beyond(source) else 0,
+            unreachable="" if flow is not None and flow.messages else self._unreachable(source.node),
+        )
+
+    def _unreachable(self, node: str) -> str:
+        found = self._core.unreachable().get(node)
+        return f"{found.api}: {found.problem}" if found is not None else ""
+
+
+def name_in(args: dict[str, Any], key: str) -> str:
+    """The argument ``key`` of a peer's request, a ROS name.
+
+    Raises:
+        RemoteProtocolError: It is not a ROS name.
+    """
+    name = args.get(key)
+    if not isinstance(name, str) or len(name) > config_limits.CROSSING_NAME_MAX or not is_global_name(name):
+        raise RemoteProtocolError(f"the question names no {key}")
+    return name

@@ -1,0 +1,257 @@
+"""Answers ``rmpa why``: gathers what this agent knows, asks the agent at the other end, and has both judged."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import msgspec
+
+from rmpa.bridge import limits
+from rmpa.config.values import did_you_mean
+from rmpa.core.errors import ConfigError, RemoteProtocolError, RmpaError
+from rmpa.core.names import is_global_name
+from rmpa.observe.check import FAIL, Check
+from rmpa.observe.why.diagnosis import BothEnds, Diagnosis, TopicAtPublisher
+from rmpa.observe.why.io.service_evidence import ServiceEvidence
+from rmpa.observe.why.io.topic_evidence import TopicEvidence, name_in
+from rmpa.observe.why.services import ServiceAtServer, diagnose_service
+from rmpa.observe.why.topics import diagnose_topic, find_peer, peer_stages
+
+if TYPE_CHECKING:
+    from rmpa.bridge.io.bridge import Bridge, PeerSession
+    from rmpa.bridge.services.io.part import Services
+    from rmpa.config.settings import Settings
+    from rmpa.observe.io.snapshot_builder import SnapshotBuilder
+    from rmpa.observe.snapshot import PeerInfo
+    from rmpa.ros.core.api import Core
+
+_T = TypeVar("_T")
+TOPIC: Final = "why.topic"
+"""The request to a publisher's agent: what it knows of a topic. Replied by ``TopicAtPublisher``."""
+SERVICE: Final = "why.service"
+"""The request to a server's agent: what it knows of a service. Replied by ``ServiceAtServer``."""
+HERE: Final = "why.here"
+"""The request to a subscriber's agent: how a topic of this module arrives there. Replied by ``Diagnosis``, a list."""
+_MOVING: Final = frozenset({"open", "lingering", "opening"})
+
+
+class WhyService:
+    """The op ``why`` of the control socket, and the peers' requests about it. Changes nothing.
+
+    Args:
+        settings: The agent's.
+        core: Its ROS core.
+        bridge: Its bridge.
+        services: The bridge's part for services.
+        snapshots: Its snapshots.
+    """
+
+    def __init__(
+        self, settings: Settings, core: Core, bridge: Bridge, services: Services, snapshots: SnapshotBuilder
+    ) -> None:
+        self._core = core
+        self._bridge = bridge
+        self._snapshots = snapshots
+        self._topics = TopicEvidence(settings, core, bridge, snapshots)
+        self._services = ServiceEvidence(settings, core, bridge, services)
+        bridge.asks.on(TOPIC, self._topics.answer)
+        bridge.asks.on(SERVICE, self._services.answer)
+        bridge.asks.on(HERE, self._answer_here)
+
+    def reload(self, settings: Settings) -> None:
+        """Other settings hold from now on."""
+        self._topics.reload(settings)
+        self._services.reload(settings)
+
+    async def answer(self, args: dict[str, object]) -> tuple[Diagnosis, ...]:
+        """The control socket's op ``why``.
+
+        Args:
+            args: ``name``: a topic or a service; ``peer``: one peer's name or GUID, or ``None`` for all peers that
+                have it or receive it; ``service``: whether a service is meant even where a topic has that name.
+
+        Raises:
+            ConfigError: The name is not a ROS name.
+        """
+        name, peer = args.get("name"), args.get("peer")
+        if not isinstance(name, str) or not is_global_name(name):
+            raise ConfigError("name", f"{name!r} is not a topic, nor a service", "write /name, or PEER:/name")
+        wanted = str(peer) if peer is not None else None
+        if args.get("service") is True or self._is_service(name):
+            return await self._service(name, wanted)
+        found = await (self._everywhere(name) if wanted is None else self._one(wanted, name))
+        failed = found[0].failed
+        if failed is not None and failed.name == "publisher":
+            # No topic has this name anywhere; a service that does not cross may have it.
+            service = await self._service(name, wanted)
+            if any(diagnosis.node for diagnosis in service):
+                return service
+        return found
+
+    def _is_service(self, name: str) -> bool:
+        state = self._core.state()
+        if name in state.publishers or name in state.subscribers or any(self._bridge.imports.at(name)):
+            return False
+        return name in state.services or self._services.known(name)
+
+    # --- topics of peers --------------------------------------------------------------------------------------
+
+    async def _one(self, peer: str, topic: str) -> tuple[Diagnosis, ...]:
+        """A topic of one peer; or, where only this module has a publisher, its own topic on its path to that peer."""
+        found = await self._arrives(peer, topic)
+        failed = found[0].failed
+        if failed is not None and failed.name == "publisher" and self._topics.own(topic):
+            return await self._leaves(topic, peer)
+        return found
+
+    def _carrier(self, peer: PeerInfo) -> PeerSession | None:
+        """The link that carries what a peer publishes: its own, or that of the relay that passes it on."""
+        for session in self._bridge.attached():
+            if str(session.link.guid) == peer.guid or (peer.via and session.link.name == peer.via):
+                return session
+        return None
+
+    async def _everywhere(self, topic: str) -> tuple[Diagnosis, ...]:
+        """All paths of a topic, in and out; where there is none, what is known of it."""
+        peers = self._reachable_peers()
+        own = self._topics.own(topic)
+        coming = [peer.guid for peer in peers if self._offers(peer, topic)]
+        if not coming and not own:
+            # No peer offers it; one may have it, and not let it cross.
+            known = await asyncio.gather(*(self._both_ends(peer, topic) for peer in peers))
+            coming = [p.guid for p, e in zip(peers, known, strict=True) if e.there is not None and e.there.sources]
+        ways = [self._arrives(guid, topic) for guid in coming]
+        ways += [self._leaves(topic, peer.guid) for peer in peers if own and peer.state == "linked"]
+        found = [diagnosis for diagnoses in await asyncio.gather(*ways) for diagnosis in diagnoses]
+        return tuple(found) or (await self._nowhere(topic, [peer.name for peer in peers]),)
+
+    def _reachable_peers(self) -> list[PeerInfo]:
+        return [peer for peer in self._snapshots.build(frozenset()).peers if peer.state in ("linked", "relayed")]
+
+    def _offers(self, peer: PeerInfo, topic: str) -> bool:
+        session = self._carrier(peer)
+        return session is not None and bool(self._topics.here(session, peer, topic).proxies)
+
+    async def _nowhere(self, topic: str, linked: list[str]) -> Diagnosis:
+        here = self._snapshots.build(frozenset()).agent.name
+        if self._topics.own(topic):
+            text, remedy = "no peer is linked that it could go to", "`rmpa peer list` tells of the peers"
+            return Diagnosis.of((Check("peer", FAIL, text, remedy),), name=topic, peer=here, to="")
+        state = self._core.state()
+        similar = await asyncio.to_thread(did_you_mean, topic, {*state.publishers, *state.subscribers})
+        if awaited := self._topics.awaited(topic):
+            text = f"{', '.join(awaited)} published {topic} before this agent was restarted, and does not answer"
+            remedy = "it is asked again by itself; is that program stopped or stuck? Else start it again"
+            return Diagnosis.of((Check("publisher", FAIL, text, remedy),), name=topic, peer=here, to="")
+        text = f"neither {here} nor a linked peer ({', '.join(linked) or 'there is none'}) publishes {topic}"
+        remedy = "`rmpa topic list` shows what there is, `rmpa peer list` who"
+        remedy = f"did you mean {similar}?" if similar else remedy
+        return Diagnosis.of((Check("publisher", FAIL, text, remedy),), name=topic, peer="", to=here)
+
+    async def _arrives(self, name: str, topic: str) -> tuple[Diagnosis, ...]:
+        """Judge the paths from a peer to here."""
+        peer = find_peer(self._snapshots.build(frozenset()), name)
+        if peer is None:
+            return diagnose_topic(BothEnds(self._topics.here(None, None, topic)), name)
+        topic, wire = self._topics.there(peer.name, topic)
+        ends = await self._both_ends(peer, topic)
+        later = None
+        if any(r.state in _MOVING for t in ends.here.snapshot.topics for r in t.routes if r.direction == "in"):
+            # Only a second look shows whether messages move.
+            await asyncio.sleep(limits.WHY_WINDOW)
+            later = await self._both_ends(peer, topic)
+        return diagnose_topic(ends, peer.guid, later, wire)
+
+    async def _both_ends(self, peer: PeerInfo, topic: str) -> BothEnds:
+        """What both ends know now."""
+        session = self._carrier(peer)
+        if session is None:
+            return BothEnds(self._topics.here(None, peer, topic), refusal="it is not linked")
+        _, wire = self._topics.there(peer.name, topic)
+        question = {"topic": wire, "instance": peer.instance if peer.state == "relayed" else ""}
+        try:
+            there, refusal = await self._ask(session, TOPIC, question, TopicAtPublisher), ""
+        except RmpaError as error:
+            there, refusal = None, str(error)
+        return BothEnds(self._topics.here(session, peer, topic), there, refusal)
+
+    # --- topics of this module -------------------------------------------------------------------------------
+
+    async def _leaves(self, topic: str, name: str) -> tuple[Diagnosis, ...]:
+        """Have a peer judge the paths from here to it."""
+        snapshot = self._snapshots.build(frozenset())
+        here = snapshot.agent.name
+        begin = peer_stages(snapshot, name)
+        peer = find_peer(snapshot, name)
+        session = self._carrier(peer) if peer is not None else None
+        to = peer.name if peer is not None else name
+        if session is None or session.link.name != to:
+            stages = begin if begin[-1].level is FAIL else (*begin, _no_link(to))
+            return (Diagnosis.of(stages, name=topic, peer=here, to=to),)
+        question = {"topic": self._bridge.names.wire_name(to, topic, self._core.type_of(topic))}
+        try:
+            found = await self._ask(session, HERE, question, tuple[Diagnosis, ...], limits.WHY_TIMEOUT)
+            if not found:
+                raise RemoteProtocolError("it walked no way at all")
+            return found[: limits.WHY_SOURCES_MAX]
+        except RmpaError as error:
+            remedy = f"run `rmpa why {here}:{topic}` there"
+            silent = Check("link", FAIL, f"{to} does not tell: {error}", remedy)
+            return (Diagnosis.of((*begin, silent), name=topic, peer=here, to=to),)
+
+    async def _answer_here(self, session: PeerSession, args: dict[str, Any]) -> tuple[Diagnosis, ...]:
+        topic = self._bridge.names.local_name(session.link.name, name_in(args, "topic"))
+        return (await self._arrives(str(session.link.guid), topic))[: limits.WHY_SOURCES_MAX]
+
+    # --- services ---------------------------------------------------------------------------------------------
+
+    async def _service(self, service: str, name: str | None) -> tuple[Diagnosis, ...]:
+        """Judge the path of a service from one peer, or from each, to here."""
+        peers = self._reachable_peers()
+        if name is None:
+            carried = [(peer, at) for peer in peers if (at := self._carrier(peer)) is not None]
+            offering = [p.guid for p, at in carried if self._services.offers(at, service, p.instance)]
+            found = await asyncio.gather(
+                *(self._calls(guid, service) for guid in offering or [p.guid for p in peers])
+            )
+            served = tuple(diagnosis for diagnosis in found if diagnosis.node)
+            here = self._snapshots.build(frozenset()).agent.name
+            return served or (await self._services.nowhere(here, service, [p.name for p in peers]),)
+        return (await self._calls(name, service),)
+
+    async def _calls(self, name: str, service: str) -> Diagnosis:
+        snapshot = self._snapshots.build(frozenset())
+        peer = find_peer(snapshot, name)
+        session = self._carrier(peer) if peer is not None else None
+        if peer is None or session is None:
+            return diagnose_service(peer_stages(snapshot, name), snapshot.agent.name, name, service)
+        service, wire = self._topics.there(peer.name, service)
+        there: ServiceAtServer | None = None
+        refusal = ""
+        try:
+            there = await self._ask(session, SERVICE, {"service": wire}, ServiceAtServer)
+        except RmpaError as error:
+            refusal = str(error)
+        here = await self._services.here(session, service, wire)
+        begin = peer_stages(snapshot, name)
+        return diagnose_service(begin, snapshot.agent.name, peer.name, service, here, there, refusal)
+
+    async def _ask(
+        self,
+        session: PeerSession,
+        what: str,
+        args: dict[str, Any],
+        kind: type[_T],
+        limit: float = limits.ASK_TIMEOUT,
+    ) -> _T:
+        value = await self._bridge.asks.ask(session, what, args, limit)
+        try:
+            return msgspec.convert(value, kind)
+        except (msgspec.ValidationError, RecursionError) as error:
+            raise RemoteProtocolError(f"it answers in another way: {error}; is it another version?") from None
+
+
+def _no_link(peer: str) -> Check:
+    remedy = "ask on its own machine; or try again in a moment"
+    return Check("link", FAIL, f"there is no link to {peer} that could be asked", remedy)

@@ -1,0 +1,298 @@
+"""A running resource: its node, its parts and its life cycle."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+from typing import TYPE_CHECKING
+
+from rmpa.core.errors import ConfigError, PeerRefused, RmpaError
+from rmpa.resource.decide.lifecycle import LifeCycle, LifecycleState, Transition
+from rmpa.resource.run.adapter import Adapter
+from rmpa.resource.run.contexts import Contexts
+from rmpa.resource.run.demands import Demands
+from rmpa.resource.run.output_types import learn_outputs
+from rmpa.resource.run.persistence import Persistence
+from rmpa.resource.run.reconfigure import Reconfigure
+from rmpa.resource.run.registry_writer import FILE, RegistryWriter
+from rmpa.resource.run.runtime import Runtime, RuntimePart
+from rmpa.resource.run.store import ResourceStore
+from rmpa.resource.run.tasks import Tasks
+from rmpa.ros.http.client import call_api
+from rmpa.ros.node.node import Node
+from rmpa.runtime.threads import in_thread
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Sequence
+    from pathlib import Path
+
+    from rmpa.resource.declare.adaptation_settings import AdaptationSettings
+    from rmpa.resource.declare.resource import Resource
+    from rmpa.resource.run.task_runners import TaskProblem
+
+_log = logging.getLogger(__name__)
+
+
+class ResourceNode:
+    """Runs one resource on the core of its module.
+
+    Args:
+        resource: Declared completely.
+        master_uri: The core's.
+        window: Seconds of one quality window; ``None``: as declared.
+        settings: Of the control loop; ``None``: as declared.
+        store: Where its state is kept over a restart; ``None``: nowhere.
+        registry: Where the resources of this module's graph are recorded; for one resource of a process.
+        observers: Further parts, started last.
+
+    Raises:
+        ConfigError: It declares no profile, so there is nothing to decide.
+    """
+
+    def __init__(
+        self,
+        resource: Resource,
+        master_uri: str,
+        *,
+        window: float | None = None,
+        settings: AdaptationSettings | None = None,
+        store: ResourceStore | None = None,
+        registry: ResourceStore | None = None,
+        observers: Sequence[RuntimePart] = (),
+    ) -> None:
+        if not resource.profiles:
+            remedy = "declare one: @NAME.profile(offers={…})"
+            raise ConfigError(f"resource {resource.name}", "it has no System Profile", remedy)
+        self.resource = resource
+        self.life = LifeCycle()
+        self.ended = asyncio.Event()
+        """Set when the resource is finalized, or shut down through its node."""
+        node = Node(resource.name, master_uri=master_uri, on_shutdown=lambda _reason: self.ended.set())
+        self.runtime = Runtime(resource, node)
+        self.runtime.close_outputs()
+        self.tasks = Tasks(self.runtime, on_problem=self._task_problem, on_deactivate=self._deactivate_soon)
+        self.adapter = Adapter(
+            self.runtime,
+            self.tasks,
+            window=window if window is not None else resource.window,
+            settings=settings if settings is not None else resource.settings,
+            problems=self.problems,
+        )
+        self.contexts = Contexts(self.runtime, self.tasks, self.adapter)
+        self.configuration = Reconfigure(self.runtime, self.tasks, self.adapter, self.contexts)
+        self.demands = Demands(self.runtime)
+        self._persistence = Persistence(self.runtime, self.adapter, self.contexts, store) if store else None
+        self.registry = RegistryWriter(self.runtime, self.demands, registry) if registry else None
+        # The parameters are loaded before ``configure``, which opens the device before a profile sets it.
+        first = [_StartStep(self.configuration.load), _StartStep(self._configure), self.tasks]
+        parts = [*first, self.adapter, self.contexts, self.configuration, self.demands]
+        stores = filter(None, (self._persistence, self.registry))
+        self.parts: list[RuntimePart] = [*parts, *stores, *observers]
+        """In the order of their start."""
+        self._deactivating: asyncio.Task[None] | None = None
+
+    async def learn(self) -> None:
+        """Wait until the types of all outputs are known."""
+        await learn_outputs(self.resource, self.runtime.node.master_uri, self.runtime.node.name)
+
+    async def start(self) -> None:
+        """Configure and activate the resource, once the types of all its outputs are known.
+
+        Raises:
+            PeerRefused: The core has a node of this name already, or a callback of the life cycle raised.
+            UnreachableError: The core does not answer.
+        """
+        await self._refuse_duplicate()
+        await self.learn()
+        if self._persistence is not None:
+            saved = await self._persistence.restore()
+            self.adapter.restore(saved)
+            self.contexts.preset(saved.context)
+        try:
+            await self.runtime.start(self.parts)
+        except BaseException:
+            if self._persistence is not None:
+                await self._persistence.close()
+            raise
+        await self.adapter.settled()  # the function of the first profile ends before ``activate``
+        try:
+            await self._change_state(Transition.ACTIVATE)
+        except RmpaError:
+            await self.close()
+            raise
+
+    async def activate(self) -> None:
+        """Begin the tasks again.
+
+        Raises:
+            PeerRefused: Its callback raised.
+        """
+        await self._change_state(Transition.ACTIVATE)
+
+    async def deactivate(self) -> None:
+        """End all tasks."""
+        await self._change_state(Transition.DEACTIVATE)
+
+    async def close(self) -> None:
+        """Finalize the resource in any state."""
+        if self.life.state is LifecycleState.FINALIZED:
+            return
+        if self._deactivating is not None:
+            await asyncio.wait([self._deactivating])
+        if self.life.state is LifecycleState.ACTIVE:
+            await self._change_state(Transition.DEACTIVATE)
+        await self._change_state(Transition.FINALIZE)
+        await self.runtime.close()
+        self.ended.set()
+
+    def problems(self) -> tuple[list[str], list[str]]:
+        """Problems beside the quality, as texts: what is missing, and what does not work."""
+        missing = [
+            f"nobody publishes {name}"
+            for name, item in self.resource.inputs.items()
+            if item.required and not self.runtime.publishers_of(item)
+        ]
+        absent, short = self.demands.problems()
+        broken = [*self.tasks.problems, *short, *(f"rule over {problem}" for problem in self.contexts.problems)]
+        stores = (self._persistence, self.registry)
+        broken += [part.problem for part in stores if part is not None and part.problem]
+        if self.life.state is not LifecycleState.ACTIVE:
+            broken.append(f"it is {self.life.state}")
+        return [*missing, *absent], broken
+
+    # --- inside -------------------------------------------------------------------------------------------------
+
+    async def _configure(self) -> None:
+        try:
+            await self._change_state(Transition.CONFIGURE)
+        except RmpaError:
+            await self._change_state(Transition.FINALIZE)
+            raise
+
+    async def _refuse_duplicate(self) -> None:
+        """Refuse to start if a node of this name runs; the registration would shut it down."""
+        node = self.runtime.node
+        reply = await call_api(node.master_uri, "lookupNode", node.name, node.name)
+        if reply.code != 1:
+            return
+        try:
+            other = await call_api(str(reply.value), "getPid", node.name, timeout=1.0)
+        except RmpaError:
+            return  # a stale registration
+        text = f"a node {node.name} runs there already (process {other.value})"
+        raise PeerRefused(f"the core at {node.master_uri}", text, "end it, or name this resource otherwise")
+
+    async def _change_state(self, transition: Transition) -> None:
+        self.life.begin(transition)
+        if transition is Transition.DEACTIVATE:
+            await self.tasks.deactivate()
+        elif transition is Transition.ACTIVATE:
+            self.runtime.open_outputs()
+        why = ""
+        hook = self.resource.hooks.get(transition.value)
+        try:
+            if inspect.iscoroutinefunction(hook):
+                await hook()
+            elif hook is not None:
+                outcome = await in_thread(hook, transition.value)
+                if outcome is not None:
+                    await outcome
+        except Exception as error:  # noqa: BLE001 - the top of the user's code
+            why = f"{type(error).__name__}: {error}"
+            _log.warning("! %s: %s: %s", self.runtime.node.name, transition, why)
+        state = self.life.failed(why) if why else self.life.succeeded()
+        if state is not LifecycleState.ACTIVE:
+            self.runtime.close_outputs()
+        if transition is Transition.ACTIVATE and not why:
+            self.tasks.activate()
+        await self.runtime.advertise_text("state", state.value)
+        if why and transition in (Transition.CONFIGURE, Transition.ACTIVATE):
+            raise PeerRefused(f"resource {self.resource.name}", f"{transition}: {why}")
+
+    def _task_problem(self, problem: TaskProblem) -> None:
+        _log.warning("! %s: %s", self.runtime.node.name, problem)
+
+    def _deactivate_soon(self, why: str) -> None:
+        over = self._deactivating is None or self._deactivating.done()
+        if over and self.life.state is LifecycleState.ACTIVE and self.life.under_way is None:
+            _log.error("! %s is deactivated: %s", self.runtime.node.name, why)
+            self._deactivating = asyncio.get_running_loop().create_task(self.deactivate(), name="deactivate")
+
+
+class _StartStep(RuntimePart):
+    """A coroutine function that is called in the order of the parts; its errors end the start."""
+
+    def __init__(self, step: Callable[[], Awaitable[None]]) -> None:
+        self._step = step
+
+    async def start(self) -> None:
+        await self._step()
+
+
+async def run_all(
+    resources: list[Resource],
+    master_uri: str,
+    stop: asyncio.Event,
+    ready: Callable[[], None],
+    stores: Path | None = None,
+) -> None:
+    """Run resources until ``stop`` is set or all of them have ended.
+
+    Args:
+        resources: Of one module, of different names.
+        master_uri: Its core's.
+        stop: Set by the caller.
+        ready: Called when all are active.
+        stores: The folder of their stores; ``None``: nothing is kept over a restart.
+
+    Raises:
+        RmpaError: One of them cannot start; those that have started are closed.
+    """
+    running: list[ResourceNode] = []
+    stopped = asyncio.create_task(_wait(stop))
+    try:
+        # Last those that wait for the type of an output.
+        for resource in sorted(resources, key=lambda each: any(o.kind.known is None for o in each.outputs.values())):
+            store = ResourceStore(stores / f"{resource.name}.sqlite") if stores is not None else None
+            registry = ResourceStore(stores / FILE) if stores is not None and not running else None
+            one = ResourceNode(resource, master_uri, store=store, registry=registry)
+            if not await _start(one, stopped):
+                return
+            running.append(one)
+        ready()
+        ended = asyncio.create_task(_all_ended(running))
+        await asyncio.wait([ended, stopped], return_when=asyncio.FIRST_COMPLETED)
+        ended.cancel()
+        await asyncio.gather(ended, return_exceptions=True)
+    finally:
+        stopped.cancel()
+        await asyncio.gather(stopped, return_exceptions=True)
+        for one in reversed(running):
+            await one.close()
+
+
+async def _start(node: ResourceNode, stopped: asyncio.Task[None]) -> bool:
+    """Start a resource; false if it still waited for a type when ``stopped`` ended.
+
+    Raises:
+        RmpaError: It cannot start.
+    """
+    types = asyncio.create_task(node.learn(), name=f"types of {node.resource.name}")
+    await asyncio.wait([types, stopped], return_when=asyncio.FIRST_COMPLETED)
+    if not types.done():
+        types.cancel()
+        await asyncio.gather(types, return_exceptions=True)
+        return False
+    await types
+    await node.start()
+    return True
+
+
+async def _all_ended(nodes: list[ResourceNode]) -> None:
+    for node in nodes:
+        await node.ended.wait()
+
+
+async def _wait(event: asyncio.Event) -> None:
+    await event.wait()

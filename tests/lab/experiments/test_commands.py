@@ -1,0 +1,321 @@
+"""``python -m lab experiment``, with an experiment and a bed that cost nothing (the real ones: tests/interop)."""
+
+from __future__ import annotations
+
+import io
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import pytest
+
+from lab.__main__ import main
+from lab.bed import stage
+from lab.bed.processes import BedError
+from lab.experiments import code, runner
+from lab.experiments.estimate import Estimate
+from lab.experiments.model import Cell
+from lab.experiments.progress import Bars, Lines
+from lab.experiments.registry import EXPERIMENTS
+from lab.experiments.store import Store
+from tests.lab.experiments import fakes
+from tests.lab.experiments.fakes import FakeExperiment
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from lab.bed.plan import Plan
+
+DEADLINE = 60.0
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture
+def fake(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[FakeExperiment]:
+    """The only experiment that there is, on a bed for which root is missing."""
+
+    def why_not(plan: Plan) -> str:
+        return "network namespaces need root" if plan.bed == "namespaces" else ""
+
+    table = cast("dict[str, tuple[str, str]]", EXPERIMENTS)
+    before = dict(table)
+    table.clear()
+    table["fake"] = ("tests.lab.experiments.fakes", "nothing at all")
+    monkeypatch.setattr(fakes, "EXPERIMENT", FakeExperiment())
+    monkeypatch.setattr(stage, "why_not", why_not)
+    monkeypatch.setattr(stage, "make_stage", fakes.no_stage)
+    monkeypatch.setattr(runner, "LATENESS_SECONDS", 0.01)
+    monkeypatch.setattr(code, "code_here", lambda: fakes.CODE)  # whoever edits the package while tests run
+    monkeypatch.chdir(tmp_path)
+    yield fakes.EXPERIMENT
+    table.clear()
+    table.update(before)
+
+
+def lab(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
+    code = main(["experiment", *words])
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def test_list_says_what_there_is_and_where_it_would_run(
+    fake: FakeExperiment, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = lab(capsys, "list")
+    assert code == 0
+    assert out.splitlines() == [
+        "NAME  CELLS    TIME  SHORT  WHAT IT MEASURES",
+        "fake      4  16.0 s  4.0 s  nothing at all",
+        "",
+        "here: all on loopback, our own nodes, full",
+    ]
+    assert err == "! network namespaces need root: all on loopback, with our own nodes and core\n"
+
+
+def test_list_as_json(fake: FakeExperiment, capsys: pytest.CaptureFixture[str]) -> None:
+    said = json.loads(lab(capsys, "list", "--json")[1])
+    assert said["experiments"] == [
+        {"name": "fake", "about": "nothing at all", "cells": 4, "seconds": 16.0, "seconds_short": 4.0}
+    ]
+    assert (said["bed"], said["clients"], said["why"][:26]) == ("loopback", ["own"], "network namespaces need ro")
+
+
+def test_a_run_measures_and_writes_its_report(
+    fake: FakeExperiment, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    code, out, err = lab(capsys, "run", "--short", "--out", "mine")
+    assert code == 0, err
+    lines = out.splitlines()
+    assert lines[:2] == ["all on loopback, our own nodes, short; 4 cells, about 4.0 s", "into mine"]
+    assert "fake        reached     20 Hz  ≤ 20 Hz      -  highest rate" in lines
+    assert f"report: {Path('mine/report/report.html')}" in lines
+    assert "[4/4] fake system=rmpa rate=20 round=1:" in err
+    assert err.count(" left\n") == 3  # behind the last one nothing is left to wait for
+    store = Store.load(tmp_path / "mine")
+    assert (store.plan.size, store.plan.bed) == ("short", "loopback")
+    assert [session.end for session in store.manifest.sessions] == ["finished"]
+    assert store.manifest.sessions[0].argv[:3] == ["python", "-m", "lab"]
+    assert (tmp_path / "mine" / "report" / "report.html").exists()
+    assert (tmp_path / "mine" / "report" / "report.md").exists()
+
+
+def test_a_run_as_json_is_one_document(fake: FakeExperiment, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = lab(capsys, "run", "--short", "--out", "mine", "--json")
+    said = json.loads(out)
+    assert code == 0
+    assert (said["measured"], said["there"], said["failed"], said["directory"]) == (4, 0, [], "mine")
+    assert said["claims"] == [
+        {
+            "experiment": "fake",
+            "claim": "highest rate",
+            "wanted": 20.0,
+            "at_least": False,
+            "unit": "Hz",
+            "measured": 20.0,
+            "paper": None,
+            "reached": True,
+        }
+    ]
+    assert Path(said["html"]).exists()
+
+
+def test_without_out_each_run_has_a_directory_of_its_date(
+    fake: FakeExperiment, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert lab(capsys, "run", "--short")[0] == 0
+    (made,) = (tmp_path / "rmpa-experiments").iterdir()
+    assert Store.load(made).names == ["fake"]
+
+
+def test_a_run_goes_on_with_what_is_missing_as_it_was_begun(
+    fake: FakeExperiment, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, _ = lab(capsys, "run", "fake", "--short", "--seed", "7", "--out", "mine", "--only", "system=rmpa")
+    assert code == 0
+    code, out, _ = lab(capsys, "run", "--out", "mine")  # short and its seed are the run's
+    assert code == 0
+    assert "short; 2 cells" in out
+    assert set(fake.tried.values()) == {1}
+    assert len(fake.tried) == 4
+    code, _, err = lab(capsys, "run", "--out", "mine", "--seed", "8")
+    assert (code, err) == (2, "lab: --out: mine was planned otherwise: seed 7, not 8; name a new directory\n")
+
+
+def test_what_failed_is_told_and_the_exit_code_is_1(fake: FakeExperiment, capsys: pytest.CaptureFixture[str]) -> None:
+    def broken(cell: Cell, _: int) -> None:
+        if cell.settings["system"] == "rmpa" and cell.settings["rate"] == 20:
+            raise BedError("the agent said nothing\n    rmpa up| its last line")
+
+    fake.before = broken
+    code, out, err = lab(capsys, "run", "--short", "--out", "mine")
+    assert code == 1
+    assert "report: " in out
+    assert "fake system=rmpa rate=20 round=1 failed, and is tried again: BedError: the agent said nothing" in err
+    assert "! fake system-rmpa_rate-20_round-1 could not be measured: BedError: the agent said nothing\n" in err
+    said = json.loads(lab(capsys, "run", "--out", "mine", "--json")[1])
+    assert [(one["experiment"], one["cell"]) for one in said["failed"]] == [("fake", "system-rmpa_rate-20_round-1")]
+    assert said["there"] == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["run", "fkae"], "fkae: no such experiment; did you mean fake?"),
+        (["run", "--only", "rat=10"], "--only: no cell has a setting 'rat'; did you mean rate?"),
+        (["run", "--only", "rate=10", "--only", "system=rmpa", "--link", "fast"], "--link: 'fast' is no rate"),
+        (["run", "--bed", "loopback", "--link", "100mbit"], "--link: loopback has no cables"),
+        (["report", "nowhere"], "nowhere: is no run directory"),
+        (["compare", "nowhere", "nowhere"], "nowhere: is no run directory"),
+    ],
+)
+def test_what_cannot_be_is_said_and_leaves_nothing_behind(
+    fake: FakeExperiment, capsys: pytest.CaptureFixture[str], tmp_path: Path, words: list[str], said: str
+) -> None:
+    code, out, err = lab(capsys, *words)
+    assert (code, out) == (2, "")
+    assert said in err
+    assert not list(tmp_path.iterdir())
+
+
+def test_hosts_that_cannot_be_are_said(fake: FakeExperiment, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = lab(capsys, "run", "--bed", "namespaces")
+    assert (code, err) == (1, "lab: hosts as network namespaces: network namespaces need root\n")
+
+
+def test_the_report_can_be_written_again(
+    fake: FakeExperiment, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    lab(capsys, "run", "--short", "--out", "mine")
+    page = tmp_path / "mine" / "report" / "report.html"
+    before = page.read_bytes()
+    page.unlink()
+    code, out, _ = lab(capsys, "report", "mine")
+    assert code == 0
+    assert "highest rate" in out
+    assert page.read_bytes() == before
+    assert json.loads(lab(capsys, "report", "mine", "--json")[1])["claims"][0]["measured"] == 20.0
+
+
+def test_two_runs_are_compared(fake: FakeExperiment, capsys: pytest.CaptureFixture[str]) -> None:
+    lab(capsys, "run", "--short", "--out", "a")
+    fake.rates = (10, 40)
+    lab(capsys, "run", "--short", "--seed", "2", "--out", "b")
+    code, out, _ = lab(capsys, "compare", "a", "b")
+    assert code == 0
+    (row,) = (line.split() for line in out.splitlines() if line.startswith("fake"))
+    assert row == ["fake", "highest", "rate", "20", "Hz", "40", "Hz", "2"]
+    (differs,) = (line.split() for line in out.splitlines() if "seed" in line)
+    assert differs[-2:] == ["1", "2"]
+    said = json.loads(lab(capsys, "compare", "a", "b", "--json")[1])
+    assert (said["claims"][0]["a"], said["claims"][0]["b"], said["claims"][0]["ratio"]) == (20.0, 40.0, 2.0)
+
+
+PROGRAM = """
+import sys, threading
+from lab.__main__ import main
+from lab.experiments import code
+from lab.bed import stage
+from lab.experiments.registry import EXPERIMENTS
+from tests.lab.experiments import fakes
+
+def wait(cell, attempt):
+    if cell.settings["rate"] == 20:
+        print("waiting", flush=True)
+        threading.Event().wait()
+
+EXPERIMENTS.clear()
+EXPERIMENTS["fake"] = ("tests.lab.experiments.fakes", "nothing")
+fakes.EXPERIMENT.before = wait
+code.code_here = lambda: fakes.CODE
+stage.why_not, stage.make_stage = (lambda plan: "" if plan.bed == "loopback" else "no"), fakes.no_stage
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_leaves_a_run_to_go_on_with(
+    fake: FakeExperiment, capsys: pytest.CaptureFixture[str], tmp_path: Path, number: signal.Signals
+) -> None:
+    words = ["experiment", "run", "fake", "--short", "--out", "a b"]
+    with subprocess.Popen(
+        [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(ROOT)!r})\n{PROGRAM}", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+    ) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line == "waiting\n":
+                break
+        process.send_signal(number)
+        _, err = process.communicate(timeout=DEADLINE)
+    assert process.returncode == 130, err
+    assert err.endswith("! interrupted; go on with: python -m lab experiment run fake --out 'a b'\n")
+    assert "Traceback" not in err
+    assert [session.end for session in Store.load(tmp_path / "a b").manifest.sessions] == ["interrupted"]
+    code, out, _ = lab(capsys, "run", "fake", "--out", "a b")
+    assert code == 0
+    assert "short; 2 cells" in out
+    assert set(fake.tried) == {"system-classic_rate-20_round-1", "system-rmpa_rate-20_round-1"}
+
+
+def test_who_may_write_nothing_is_told(
+    fake: FakeExperiment, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    code, _, err = lab(capsys, "run", "--out", "file/run")
+    assert code == 1
+    assert err.splitlines()[-1].startswith("lab: file/run: cannot be written to")
+
+
+CELLS = [Cell("rates", {"system": "rmpa", "rate": rate}, seconds=10.0) for rate in (10, 20)]
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_one_line_a_cell_where_nobody_looks() -> None:
+    clock, lines = Clock(), list[str]()
+    watcher = Lines(Estimate([10.0, 10.0]), lines.append, clock)
+    watcher.cell_begins(CELLS[0], 1)
+    clock.now += 20
+    watcher.cell_ends(CELLS[0], 20.0)
+    watcher.cell_begins(CELLS[1], 1)
+    watcher.cell_fails(CELLS[1], "BedError: it is gone\n    log", again=True)
+    watcher.cell_begins(CELLS[1], 2)
+    watcher.cell_fails(CELLS[1], "Traceback (most recent call last):\n  File\nKeyError: 'x'", again=False)
+    assert lines == [
+        "[1/2] rates system=rmpa rate=10: 20.0 s, about 20.0 s left",
+        "[1/2] rates system=rmpa rate=20 failed, and is tried again: BedError: it is gone",
+        "[2/2] rates system=rmpa rate=20 failed: KeyError: 'x'",
+    ]
+
+
+def test_two_bars_on_a_terminal() -> None:
+    from rich.console import Console
+
+    clock, console = Clock(), Console(width=120, record=True, file=io.StringIO())
+    bars = Bars(Estimate([10.0, 10.0]), console, clock)
+    bars.cell_begins(CELLS[0], 1)
+    clock.now += 5
+    console.print(bars.render())
+    bars.cell_fails(CELLS[0], "BedError: [red]gone", again=True)
+    bars.cell_begins(CELLS[0], 2)
+    console.print(bars.render())
+    bars.cell_ends(CELLS[0], 5.0)
+    console.print(bars.render())
+    text = console.export_text()
+    assert "0 of 2 cells, 5.0 s, about 15.0 s left" in text
+    assert "5.0 s of about 10.0 s: system=rmpa rate=10" in text
+    assert "! rates system=rmpa rate=10 failed, and is tried again: BedError: [red]gone" in text
+    assert "5.0 s of about 10.0 s, second attempt: system=rmpa rate=10" in text
+    assert "1 of 2 cells, 5.0 s, about 5.0 s left" in text

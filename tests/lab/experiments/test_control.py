@@ -1,0 +1,207 @@
+"""Rounds made by hand: every other message comes late by a stated time, so that each standard deviation is known."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import pytest
+
+from lab.bed.plan import Plan
+from lab.experiments.contenders import CLASSIC, DEFAULTS, RMPA
+from lab.experiments.control import CMD, EXPERIMENT, VEL, evaluate, phases, rounds
+from lab.experiments.model import Cell, Measured, Results
+from lab.frames import frame
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from lab.findings import Claim
+
+MS = 1_000_000
+PERIOD = 100 * MS
+COLUMNS = ("topic", "sequence", "due_ns", "came_ns")
+FULL = Plan(clients=("roscpp",))
+
+
+def made(cmd_ms: float, vel_ms: float, delay_ms: float, *, hop_ms: float = 0.25, count: int = 101) -> Measured:
+    """Every other CMD comes ``cmd_ms`` later and every other VEL ``vel_ms``; the others are ``delay_ms`` apart."""
+    cmd, vel, base = [], [], []
+    for number in range(count):
+        due = number * PERIOD
+        odd = number % 2
+        came = due + round((hop_ms + odd * cmd_ms) * MS)
+        cmd.append((CMD, number, due, came))
+        vel.append((VEL, number, due, due + round((hop_ms + delay_ms + odd * vel_ms) * MS)))
+        base.append((VEL, number, due, vel[-1][3] + MS))
+    sent = frame(("sequence", "late_ns"), [(number, 0) for number in range(count)])
+    return Measured({"pc": frame(COLUMNS, cmd + vel), "base": frame(COLUMNS, base), "sent": sent})
+
+
+def sd(late_ms: float) -> float:
+    """Of 100 periods that are in turn so much longer and so much shorter; seconds."""
+    return late_ms / 1e3 * math.sqrt(100 / 99)
+
+
+def run(plan: Plan, measure: Callable[[Cell], Measured | None]) -> Results:
+    measured = [(cell, measure(cell)) for cell in EXPERIMENT.cells(plan)]
+    return Results(plan, [(cell, one) for cell, one in measured if one is not None])
+
+
+def claim(claims: tuple[Claim, ...], words: str) -> Claim:
+    (found,) = [one for one in claims if words in one.text]
+    return found
+
+
+def by_system(cell: Cell) -> Measured:
+    if cell.settings["system"] == "rmpa":
+        return made(0.6, 0.9, 60.3 if cell.settings["mode"] == "polled" else 0.5)
+    return made(0.3, 1.0, 60.0 if cell.settings["mode"] == "polled" else 0.4)
+
+
+# --- cells ----------------------------------------------------------------------------------------------------------
+
+
+def test_systems_take_turns_and_another_one_begins_each_round() -> None:
+    cells = [cell for cell in EXPERIMENT.cells(FULL) if cell.settings["round"] == 4]
+    pairs = [tuple(cell.settings["system"] for cell in cells[at : at + 2]) for at in range(0, len(cells), 2)]
+    assert set(pairs) == {("classic", "rmpa"), ("rmpa", "classic")}
+    assert pairs[0] != pairs[1]
+
+
+def test_both_systems_get_the_same_phase_in_a_round_and_another_one_in_the_next() -> None:
+    given: dict[object, set[object]] = {}
+    for cell in EXPERIMENT.cells(Plan()):
+        if cell.settings["mode"] == "polled":
+            given.setdefault(cell.settings["round"], set()).add(cell.settings["phase_ms"])
+        else:
+            assert "phase_ms" not in cell.settings
+    assert all(len(phase) == 1 for phase in given.values())
+    assert len(set.union(*given.values())) == len(given) > 1
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_phases_cover_the_period_evenly_and_keep_away_from_its_ends(seed: int) -> None:
+    found = phases(seed, 4)
+    assert [int((phase - 10) // 20) for phase in sorted(found)] == [0, 1, 2, 3]
+    assert found == phases(seed, 4)
+
+
+def test_relays_stand_beside_the_event_driven_node_only() -> None:
+    relayed = [cell.settings for cell in EXPERIMENT.cells(FULL) if cell.settings.get("relays")]
+    assert [(cell["mode"], cell["round"]) for cell in relayed] == [("event", 1), ("event", 2), ("event", 3)]
+
+
+def test_classic_without_nodelay_stands_beside_the_full_run_only() -> None:
+    def without(plan: Plan) -> int:
+        return sum(cell.settings.get("nodelay") is False for cell in EXPERIMENT.cells(plan))
+
+    assert without(Plan()) > 0
+    assert without(Plan(size="short")) == 0
+
+
+# --- findings -------------------------------------------------------------------------------------------------------
+
+
+def test_periods_and_delays_of_a_round() -> None:
+    found = evaluate(made(0.3, 1.0, 60.0))
+    assert found.mean("cmd") == pytest.approx(0.1)
+    assert found.sd("cmd") == pytest.approx(sd(0.3))
+    assert found.sd("vel") == found.sd("base") == pytest.approx(sd(1.0))
+    assert found.sd("source") == pytest.approx(0.0)
+    assert found.mean("delay") == pytest.approx(60.0e-3 + 50 / 101 * 0.7e-3)
+
+
+def test_the_claims_hold_each_round_against_its_neighbour() -> None:
+    claims = EXPERIMENT.findings(run(FULL, by_system)).claims
+    cmd, vel = claim(claims, "CMD at the pc, polled"), claim(claims, "VEL at the pc, polled")
+    assert cmd.value == pytest.approx(2.0)
+    assert vel.value == pytest.approx(0.9)
+    assert (cmd.reached, cmd.paper) == (False, 1.86)
+    assert (vel.reached, vel.paper) == (True, 1.56)
+    later = claim(claims, "control delay, event, roscpp: RMPA less classic")
+    # 0.5 and 0.4 ms at the even messages; at the odd ones VEL is 0.3 ms later than CMD, and 0.7.
+    assert later.value == pytest.approx(0.1 + 50 / 101 * (0.3 - 0.7))
+    assert later.reached
+    polled = claim(claims, "control delay, polled")
+    assert polled.value == pytest.approx((60.3 + 50 / 101 * 0.3) / (60.0 + 50 / 101 * 0.7))
+    assert polled.reached
+    assert polled.paper == pytest.approx(0.59)
+
+
+def test_relays_are_no_classic_ros_and_are_what_rmpa_must_not_be_slower_than() -> None:
+    def measure(cell: Cell) -> Measured:
+        if cell.settings.get("relays"):
+            return made(0.3, 0.3, 0.8)
+        return made(0.3, 0.3, 0.6 if cell.settings["system"] == "rmpa" else 0.2)
+
+    claims = EXPERIMENT.findings(run(FULL, measure)).claims
+    assert claim(claims, "through relays").value == pytest.approx(0.75)
+    assert claim(claims, "event, roscpp: RMPA less classic").value == pytest.approx(0.4)
+
+
+def test_one_bad_round_does_not_decide_a_ratio() -> None:
+    def measure(cell: Cell) -> Measured:
+        bad = cell.settings["round"] == 2 and cell.settings["system"] == "rmpa"
+        return made(30.0, 30.0, 60.0) if bad else made(0.3, 0.3, 60.0)
+
+    claims = EXPERIMENT.findings(run(FULL, measure)).claims
+    assert claim(claims, "CMD at the pc, event").value == pytest.approx(1.0)
+
+
+def test_a_round_that_failed_on_one_side_is_left_out_on_both() -> None:
+    def measure(cell: Cell) -> Measured | None:
+        if cell.settings["round"] == 1:
+            return made(9.0, 9.0, 60.0) if cell.settings["system"] == "classic" else None
+        return by_system(cell)
+
+    claims = EXPERIMENT.findings(run(FULL, measure)).claims
+    assert claim(claims, "CMD at the pc, polled").value == pytest.approx(2.0)
+
+
+def test_two_rounds_say_nothing() -> None:
+    def measure(cell: Cell) -> Measured | None:
+        return by_system(cell) if cell.settings["round"] in {1, 2} else None
+
+    assert {one.reached for one in EXPERIMENT.findings(run(FULL, measure)).claims} == {None}
+
+
+def test_table_1_has_the_papers_figures_beside_ours() -> None:
+    grids = EXPERIMENT.findings(run(FULL, by_system)).grids
+    polled, event = grids
+    assert polled.columns[1:7] == (
+        "mean, RMPA",
+        "mean, classic",
+        "mean, classic, nodelay off",
+        "sd, RMPA",
+        "sd, classic",
+        "sd, classic, nodelay off",
+    )
+    rows = {row[0]: row[1:] for row in polled.rows}
+    assert rows["Command Order"][3:5] == ("0.603", "0.3015")
+    assert rows["Command Order, in the paper"] == ("99.9", "99.9", "", "0.5059", "0.2724", "", "1.86")
+    assert rows["Control Computation Delay, in the paper"][:2] == ("61.3", "103.8")
+    assert all("paper" not in row[0] for row in event.rows)
+    assert all(len(row) == len(grid.columns) for grid in grids for row in grid.rows)
+
+
+def test_the_figures_show_each_round_after_the_other() -> None:
+    polled, event = EXPERIMENT.findings(run(FULL, by_system)).figures
+    assert polled.name != event.name
+    cmd, _, delay = polled.panels
+    assert {series.system for series in cmd.series} == {"classic", "rmpa"}
+    assert [len(series.x) for series in cmd.series] == [400, 400]
+    assert delay.series[0].y[0] == pytest.approx(60.0)
+    assert len(delay.series[0].y) == 404
+
+
+def test_rounds_are_told_apart_by_contender() -> None:
+    results = run(FULL, by_system)
+    assert sorted(rounds(results, RMPA, "roscpp", "event")) == [1, 2, 3, 4]
+    assert sorted(rounds(results, CLASSIC, "roscpp", "event")) == [1, 2, 3, 4]
+    assert sorted(rounds(results, DEFAULTS, "roscpp", "event")) == [1]
+
+
+def test_nothing_measured_says_nothing() -> None:
+    found = EXPERIMENT.findings(Results(FULL, []))
+    assert (found.figures, found.grids, found.claims, found.notes) == ((), (), (), ())

@@ -1,0 +1,142 @@
+"""Latencies made by hand, whose percentiles are known."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from lab.bed.plan import Plan
+from lab.experiments.model import Cell, Measured, Results
+from lab.experiments.rates import EXPERIMENT, PAPER
+from lab.frames import frame
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from lab.findings import Grid
+
+FULL = Plan(clients=("roscpp",))
+US = 1000
+
+
+def made(counts: Mapping[int, int], latency_us: Callable[[int, int], int]) -> Measured:
+    """As many messages of each rate; each comes so many µs after it was due, by rate and number."""
+    came = [
+        (rate, n, n * US, n * US + latency_us(rate, n) * US) for rate, count in counts.items() for n in range(count)
+    ]
+    sent = [(rate, n, 0) for rate, count in counts.items() for n in range(count)]
+    return Measured(
+        {
+            "arrivals": frame(("rate", "sequence", "due_ns", "came_ns"), came),
+            "sent": frame(("rate", "sequence", "late_ns"), sent),
+        }
+    )
+
+
+def run(plan: Plan, measure: Callable[[Cell], Measured]) -> Results:
+    return Results(plan, [(cell, measure(cell)) for cell in EXPERIMENT.cells(plan)])
+
+
+def ramp(step_us: int) -> Callable[[int, int], int]:
+    """1 to 100 steps above 200 µs, over and over: p50 is 50 steps above, p95 is 95, so the width is 45."""
+    return lambda _rate, number: 200 + (number % 100 + 1) * step_us
+
+
+LADDER = dict.fromkeys((*PAPER, 100, 1000), 200)
+
+
+def test_the_full_run_has_the_papers_batches_and_ten_thousand_beyond() -> None:
+    from lab.experiments.rates import _COUNTS, _ROUNDS
+
+    totals = {rate: count * _ROUNDS["full"] for rate, count in _COUNTS["full"].items()}
+    assert all(_COUNTS["full"][rate] == 100 for rate in PAPER)
+    assert totals[500] == totals[1000] == 10_000
+    assert totals[100] >= 1000  # enough for a p99
+
+
+def test_systems_take_turns_and_another_one_begins_each_round() -> None:
+    cells = [cell.settings for cell in EXPERIMENT.cells(FULL)]
+    assert [cell["system"] for cell in cells if cell["round"] == 1][:2] == ["rmpa", "classic"]
+    assert [cell["system"] for cell in cells if cell["round"] == 2] == ["classic", "rmpa"]
+    beside = [cell for cell in cells if cell.get("relays") or cell.get("nodelay") is False]
+    assert [cell["round"] for cell in beside] == [1, 1]
+
+
+@pytest.mark.parametrize(("step", "value", "reached"), [(1, 1.0, True), (2, 2.0, False)])
+def test_widening_is_that_of_rmpa_at_1_khz_against_the_papers_rates(step: int, value: float, reached: bool) -> None:
+    def measure(cell: Cell) -> Measured:
+        if cell.settings["system"] == "classic":
+            return made(LADDER, ramp(3))
+        return made(LADDER, lambda rate, number: ramp(step if rate == 1000 else 1)(rate, number))
+
+    claim = EXPERIMENT.findings(run(FULL, measure)).claims[0]
+    assert claim.value == pytest.approx(value)
+    assert claim.reached is reached
+
+
+def test_too_few_messages_say_nothing_of_the_width() -> None:
+    few = dict.fromkeys((*PAPER, 1000), 50)  # in two rounds 100, and p95 needs 200
+    claim = EXPERIMENT.findings(run(FULL, lambda _: made(few, ramp(1)))).claims[0]
+    assert claim.reached is None
+
+
+def test_relays_are_no_classic_ros_and_are_what_rmpa_must_not_be_slower_than() -> None:
+    def measure(cell: Cell) -> Measured:
+        if cell.settings.get("relays"):
+            return made(LADDER, lambda _rate, _number: 400)
+        return made(LADDER, lambda _rate, _number: 300 if cell.settings["system"] == "rmpa" else 100)
+
+    found = EXPERIMENT.findings(run(FULL, measure))
+    assert found.claims[1].value == pytest.approx(0.75)
+    rows = rows_of(found.grids[0])
+    assert rows["10 Hz", "classic"]["p50"] == "100"
+    assert rows["10 Hz", "classic, two relays"]["p50"] == "400"
+
+
+def rows_of(grid: Grid) -> dict[tuple[str, str], dict[str, str]]:
+    return {(row[0], row[1]): dict(zip(grid.columns, row, strict=True)) for row in grid.rows}
+
+
+def test_the_table_has_all_rounds_together_and_classic_beside_it() -> None:
+    def measure(cell: Cell) -> Measured:
+        return made(LADDER, ramp(4 if cell.settings["system"] == "rmpa" else 2))
+
+    (grid,) = EXPERIMENT.findings(run(FULL, measure)).grids
+    rows = rows_of(grid)
+    ours = rows["100 Hz", "RMPA"]
+    assert (ours["p50"], ours["p95"], ours["p95 - p50"], ours["interquartile range"]) == ("400", "580", "180", "200")
+    assert (ours["messages"], ours["lost"], ours["largest"], ours["p99"]) == ("400", "0", "600", "-")
+    assert ours["p50 / classic"] == "1.33"
+    assert rows["100 Hz", "classic"]["messages"] == "400"
+    assert rows["10 Hz", "classic, nodelay off"]["messages"] == "200"
+
+
+def test_what_never_came_is_counted() -> None:
+    def measure(_: Cell) -> Measured:
+        whole = made(LADDER, ramp(1))
+        arrivals = whole.tables["arrivals"]
+        kept = [row for row in arrivals.itertuples(index=False, name=None) if row[:2] != (10, 7)]
+        return Measured({**whole.tables, "arrivals": frame(arrivals.columns, kept)})
+
+    (grid,) = EXPERIMENT.findings(run(FULL, measure)).grids
+    rows = rows_of(grid)
+    assert rows["10 Hz", "RMPA"]["lost"] == "2"
+    assert rows["20 Hz", "RMPA"]["lost"] == "0"
+
+
+def test_the_figure_has_every_message_the_percentiles_and_both_ends() -> None:
+    (figure,) = EXPERIMENT.findings(run(FULL, lambda _: made(LADDER, ramp(1)))).figures
+    boxes, curves, tails = figure.panels
+    assert {series.system for series in boxes.series} == {"classic", "rmpa"}
+    assert len(boxes.series[0].x) == 400 * len(LADDER)
+    assert sorted(boxes.ticks.values()) == sorted(LADDER)
+    medians = [series for series in curves.series if "p50" in series.label]
+    assert all(series.y == [250.0] * len(LADDER) for series in medians)
+    assert len(tails.series) == 4
+    assert all(max(series.y) == 1.0 for series in tails.series)
+
+
+def test_nothing_measured_says_nothing() -> None:
+    found = EXPERIMENT.findings(Results(FULL, []))
+    assert (found.figures, found.grids, found.claims) == ((), (), ())

@@ -1,0 +1,57 @@
+"""The experiments by name."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from lab.bed.plan import Plan
+from lab.experiments.registry import EXPERIMENTS, find_experiment
+from lab.experiments.store import Store
+from rmpa.core.errors import ConfigError
+from tests.lab.experiments.fakes import CODE, MACHINE
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+PLANS = [
+    Plan(),
+    Plan(size="short"),
+    Plan(bed="loopback", clients=("own",), link=""),
+    Plan("short", "loopback", ("own",), ""),
+]
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_each_has_its_name_and_says_what_it_is(name: str) -> None:
+    found = find_experiment(name)
+    assert found.name == name
+    assert found.title
+    assert found.about
+
+
+@pytest.mark.parametrize("plan", PLANS)
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_the_cells_of_each_plan_are_fit_for_a_run_directory(name: str, plan: Plan, tmp_path: Path) -> None:
+    found = find_experiment(name)
+    cells = found.cells(plan)
+    assert cells
+    assert {cell.experiment for cell in cells} == {name}
+    assert all(cell.settings["system"] in ("classic", "rmpa") for cell in cells)
+    assert all(cell.settings["client"] in plan.clients for cell in cells)
+    assert all(cell.seconds > 0 for cell in cells)
+    assert found.cells(plan) == cells  # by its seed, not by chance
+    Store.create(tmp_path / "run", plan, CODE, MACHINE).expect(name, found.title, cells)
+
+
+def test_a_short_run_is_short() -> None:
+    for name in EXPERIMENTS:
+        assert sum(cell.seconds for cell in find_experiment(name).cells(Plan(size="short"))) <= 60, name
+
+
+def test_a_misspelt_name_is_told_the_nearest() -> None:
+    with pytest.raises(ConfigError, match=r"contol: no such experiment; did you mean control\?"):
+        find_experiment("contol")
+    with pytest.raises(ConfigError, match="there are control, rates"):
+        find_experiment("xyz")

@@ -1,0 +1,108 @@
+"""Experiment 5: what is planned, and what follows from samples whose answers are known."""
+
+from __future__ import annotations
+
+import pytest
+
+from lab.bed.plan import Plan
+from lab.experiments.model import Cell, Measured, Results, Value
+from lab.experiments.scaling import EXPERIMENT
+from lab.findings import Findings
+from lab.frames import frame
+
+
+def cell(system: str, modules: int) -> Cell:
+    return Cell("scaling", {"system": system, "client": "roscpp", "modules": modules, "round": 1})
+
+
+def measured(latency_ms: float, idle: list[float], linked: list[float | None], messages: int = 600) -> Measured:
+    processes: list[tuple[Value, ...]] = [("idle", f"agent@{n}", percent, 1) for n, percent in enumerate(idle)]
+    processes += [("probe", "agent@1", 5.0, 1), ("probe", "nodes: source", 1.0, 1), ("probe", "nodes: sink", 2.0, 1)]
+    arrivals = [(n, n * 10_000_000, n * 10_000_000 + int(latency_ms * 1e6)) for n in range(messages)]
+    traffic = [("pc", 100.0, 300.0, 1.0, 3.0), ("m2", 200.0, 400.0, 2.0, 4.0)]
+    columns = ("host", "tx_bytes_per_s", "rx_bytes_per_s", "tx_packets_per_s", "rx_packets_per_s")
+    return Measured(
+        {
+            "joins": frame(("ready_s", "linked_s", "first_s"), [(0.1, one, 0.5) for one in linked]),
+            "processes": frame(("while", "process", "cpu_percent", "rss_bytes"), processes),
+            "traffic": frame(columns, traffic),
+            "arrivals": frame(("sequence", "due_ns", "came_ns"), arrivals),
+            "sent": frame(("sequence", "late_ns"), [(n, 0) for n in range(messages + 2)]),
+        }
+    )
+
+
+RESULTS = Results(
+    Plan(),
+    [
+        (cell("classic", 2), measured(0.2, [0.3], [None, None])),
+        (cell("rmpa", 2), measured(0.4, [0.5, 0.7], [0.3, 0.5])),
+        (cell("classic", 32), measured(0.4, [0.3], [None, None])),
+        (cell("rmpa", 32), measured(1.2, [30.0, 32.0], [2.5, 1.0])),
+    ],
+)
+
+
+def test_the_number_of_modules_grows_and_the_systems_take_turns() -> None:
+    settings = [one.settings for one in EXPERIMENT.cells(Plan())]
+    assert [one["modules"] for one in settings[::2]] == [2, 4, 8, 16, 32]
+    assert [one["system"] for one in settings] == ["classic", "rmpa"] * 5
+    assert {one["client"] for one in settings} == {"roscpp"}
+    assert {one.settings["client"] for one in EXPERIMENT.cells(Plan(clients=("rospy",)))} == {"rospy"}
+
+
+def test_the_table_says_what_was_measured() -> None:
+    grid = EXPERIMENT.findings(RESULTS).grids[0]
+    row = dict(zip(grid.columns, grid.rows[1], strict=True))
+    assert row["modules"] == "2"
+    assert row["system"] == "RMPA"
+    assert row["p50, ms"] == "0.4"
+    assert row["p99"] == "-"  # of 600 messages nobody can say
+    assert row["lost"] == "2"
+    assert (row["idle: % of a core, mean"], row["most"], row["all"]) == ("0.6", "0.7", "1.2")
+    assert row["its two nodes"] == "3"
+    assert (row["idle: bytes/s"], row["packets/s"]) == ("500", "5.0")
+    assert (row["last start to all linked, s"], row["to its first message"]) == ("0.4", "0.5")
+
+
+def test_master_and_helpers_are_one() -> None:
+    told = measured(0.2, [], [None])
+    processes = told.tables["processes"]
+    rows = [("idle", f"{name}@pc", percent, 1) for name, percent in (("roscore", 0.1), ("master", 0.4))]
+    both = Measured(
+        {**told.tables, "processes": frame(processes.columns, [*processes.itertuples(index=False, name=None), *rows])}
+    )
+    grid = EXPERIMENT.findings(Results(Plan(), [(cell("classic", 2), both)])).grids[0]
+    row = dict(zip(grid.columns, grid.rows[0], strict=True))
+    assert (row["idle: % of a core, mean"], row["most"], row["all"]) == ("0.5", "0.5", "0.5")
+
+
+def test_growth_is_held_against_what_classic_ros_did_on_the_same_machine() -> None:
+    claims = EXPERIMENT.findings(RESULTS).claims
+    growth = next(claim for claim in claims if claim.text.startswith("latency p50 with 32"))
+    assert growth.value == pytest.approx((1.2 / 0.4) / (0.4 / 0.2))
+    assert growth.reached is False
+    linked = [claim for claim in claims if "all linked" in claim.text]
+    assert [claim.value for claim in linked] == [pytest.approx(0.4), pytest.approx(1.75)]
+
+
+def test_of_few_messages_nothing_is_claimed() -> None:
+    few = [(one, measured(1.0, [1.0], [0.1], messages=60)) for one, _ in RESULTS.cells]
+    growth = EXPERIMENT.findings(Results(Plan(), few)).claims[0]
+    assert growth.value is None
+
+
+def test_the_report_says_where_the_agents_together_fill_the_machine() -> None:
+    notes = EXPERIMENT.findings(RESULTS).notes
+    assert any("With 32 modules the agents together use 62 % of a core" in note for note in notes)
+    assert not any("With 2 modules" in note for note in notes)
+
+
+def test_lines_are_drawn_where_there_is_something() -> None:
+    panels = EXPERIMENT.findings(RESULTS).figures[0].panels
+    joined = {series.label: list(series.y) for series in panels[3].series}
+    assert joined == {"classic": [0.5, 0.5], "RMPA": [0.5, 0.5], "RMPA, all agents linked": [0.4, 1.75]}
+
+
+def test_without_any_cell_nothing_is_said() -> None:
+    assert EXPERIMENT.findings(Results(Plan(), [])) == Findings()

@@ -1,0 +1,406 @@
+"""Two link machines back to back."""
+
+from __future__ import annotations
+
+import pytest
+
+from rmpa.core.errors import LimitExceeded, LocalProtocolError, RemoteProtocolError
+from rmpa.core.guid import Guid
+from rmpa.core.identity import Identity
+from rmpa.mesh import limits
+from rmpa.mesh.connection import (
+    ConnectionClosed,
+    ConnectionRole,
+    ConnectionState,
+    ControlReceived,
+    HandshakeDone,
+    HelloReceived,
+    Refused,
+)
+from rmpa.mesh.frames import Frame, FrameKind, pack_data_header, pong
+from rmpa.mesh.handshake import Hello, Refusal, Refuse
+from rmpa.runtime import limits as runtime_limits
+from tests.mesh.worlds import HIGH, LOW, Side, Time, deliver, exchange, pair, pass_time, side
+
+
+@pytest.mark.parametrize("chunk", [1, 7, 24, 1 << 20])
+def test_handshake_control_data_and_bye_in_pieces(chunk: int) -> None:
+    time = Time()
+    dialler = side(ConnectionRole.DIALLER, LOW, time, expected=HIGH.guid)
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
+    deliver(dialler.link.take_output(), acceptor.link, time.now, chunk)
+    assert isinstance(acceptor.events[0], HelloReceived)
+    assert acceptor.events[0].hello.identity == LOW
+    acceptor.link.accept(time.now)
+    exchange(dialler, acceptor, time, chunk)
+    assert isinstance(dialler.events[0], HandshakeDone)
+    assert dialler.events[0].hello.identity == HIGH
+    control = dialler.link.control(b'{"op":"x"}')
+    data = [pack_data_header(n, 7, i, 99) + bytes(n) for i, n in enumerate([3, 1, 300])]
+    deliver(control + b"".join(data), acceptor.link, time.now, chunk)
+    assert acceptor.last() == ControlReceived(b'{"op":"x"}')
+    assert acceptor.data == [(7, 0, 99, bytes(3)), (7, 1, 99, bytes(1)), (7, 2, 99, bytes(300))]
+    dialler.link.close("shutting down", time.now)
+    assert dialler.link.state is ConnectionState.CLOSING
+    deliver(dialler.link.take_output(), acceptor.link, time.now, chunk)
+    assert acceptor.last() == ConnectionClosed("low left: shutting down", orderly=True)
+    dialler.link.drained()
+    assert dialler.last() == ConnectionClosed("shutting down", orderly=True)
+
+
+def test_every_split_of_the_handshake_in_two_is_the_same() -> None:
+    time = Time()
+    whole = side(ConnectionRole.DIALLER, LOW, time).link.take_output()
+    for cut in range(1, len(whole)):
+        acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
+        consumed, wanted = acceptor.link.receive(memoryview(whole[:cut]), time.now)
+        assert consumed == 0
+        assert wanted == (len(whole) if cut >= 24 else 0)
+        assert acceptor.link.receive(memoryview(whole), time.now) == (len(whole), 0)
+        assert isinstance(acceptor.events[0], HelloReceived)
+
+
+def test_data_arrives_as_a_view_without_a_copy() -> None:
+    time = Time()
+    _, acceptor = pair(time)
+    seen: list[memoryview] = []
+    acceptor.link.on_data = lambda _r, _s, _t, view: seen.append(view)
+    whole = bytearray(pack_data_header(3, 1, 1, 1) + b"abc")
+    acceptor.link.receive(memoryview(whole), time.now)
+    whole[24] = ord("X")
+    assert bytes(seen[0]) == b"Xbc"
+
+
+def test_a_refusal_reaches_the_dialler_and_both_end() -> None:
+    time = Time()
+    dialler = side(ConnectionRole.DIALLER, LOW, time)
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
+    deliver(dialler.link.take_output(), acceptor.link, time.now)
+    refuse = Refuse(Refusal.BUSY, "come later")
+    acceptor.link.refuse(refuse, time.now)
+    assert acceptor.last() == Refused(refuse, by_us=True)
+    assert acceptor.link.state is ConnectionState.CLOSING
+    deliver(acceptor.link.take_output(), dialler.link, time.now)
+    assert dialler.events == [
+        Refused(refuse, by_us=False),
+        ConnectionClosed("? refused: busy: come later", orderly=True),
+    ]
+    acceptor.link.drained()
+    assert acceptor.last() == ConnectionClosed("refused: busy: come later", orderly=True)
+
+
+def with_byte(data: bytes, offset: int, value: int) -> bytes:
+    return data[:offset] + bytes([value]) + data[offset + 1 :]
+
+
+@pytest.mark.parametrize(
+    ("offset", "value", "code"),
+    [
+        (0, 0x58, Refusal.MALFORMED),
+        (4, 2, Refusal.VERSION),
+        (48, 60, Refusal.MALFORMED),
+        (49, 0x2F, Refusal.MALFORMED),
+    ],
+)
+def test_an_unreadable_hello_is_refused_with_its_code(offset: int, value: int, code: Refusal) -> None:
+    time = Time()
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
+    payload = Hello.of(LOW, lease=1.0, expected=None).serialize()
+    deliver(Frame(FrameKind.HELLO, with_byte(payload, offset, value)).serialize(), acceptor.link, time.now)
+    frame = Frame.parse(acceptor.link.take_output())
+    assert frame is not None
+    assert frame[0].kind is FrameKind.REFUSE
+    assert Refuse.parse(frame[0].payload).code == code
+    assert acceptor.link.state is ConnectionState.CLOSING
+    assert isinstance(acceptor.events[0], Refused)
+
+
+def test_a_wrong_welcome_ends_the_link_with_a_bye() -> None:
+    time = Time()
+    dialler = side(ConnectionRole.DIALLER, LOW, time, expected=Guid.of("10.0.0.9", 1))
+    dialler.link.take_output()
+    welcome = Hello.of(HIGH, lease=1.0, expected=LOW.guid)
+    deliver(Frame(FrameKind.WELCOME, welcome.serialize()).serialize(), dialler.link, time.now)
+    assert isinstance(dialler.events[0], Refused)
+    assert dialler.events[0].refuse.code == Refusal.WRONG_PEER
+    frame = Frame.parse(dialler.link.take_output())
+    assert frame is not None
+    assert frame[0].kind is FrameKind.BYE
+
+
+@pytest.mark.parametrize("kind", [k for k in FrameKind if k is not FrameKind.HELLO])
+def test_only_hello_opens(kind: FrameKind) -> None:
+    time = Time()
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
+    with pytest.raises(RemoteProtocolError, match="while handshaking"):
+        acceptor.link.receive(memoryview(Frame(kind).serialize()), time.now)
+    assert acceptor.link.state is ConnectionState.CLOSED
+    assert isinstance(acceptor.events[-1], ConnectionClosed)
+
+
+@pytest.mark.parametrize("kind", [k for k in FrameKind if k not in (FrameKind.WELCOME, FrameKind.REFUSE)])
+def test_only_welcome_or_refuse_answer(kind: FrameKind) -> None:
+    time = Time()
+    dialler = side(ConnectionRole.DIALLER, LOW, time)
+    with pytest.raises(RemoteProtocolError, match="while handshaking"):
+        dialler.link.receive(memoryview(Frame(kind).serialize()), time.now)
+
+
+@pytest.mark.parametrize("kind", [FrameKind.HELLO, FrameKind.WELCOME, FrameKind.REFUSE])
+def test_no_handshake_while_up(kind: FrameKind) -> None:
+    time = Time()
+    _, acceptor = pair(time)
+    with pytest.raises(RemoteProtocolError, match="while up"):
+        acceptor.link.receive(memoryview(Frame(kind).serialize()), time.now)
+
+
+def test_a_second_frame_before_the_answer_is_an_error() -> None:
+    time = Time()
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
+    hello = side(ConnectionRole.DIALLER, LOW, time).link.take_output()
+    with pytest.raises(RemoteProtocolError, match="hello frame while handshaking"):
+        acceptor.link.receive(memoryview(hello + hello), time.now)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"GET / HTTP/1.1\r\nHost: x\r\n\r\n",
+        bytes.fromhex("00001001 01 03 0000 00000000 00000000 0000000000000000"),
+        bytes(24),
+    ],
+)
+def test_garbage_on_the_port(header: bytes) -> None:
+    time = Time()
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
+    with pytest.raises(RemoteProtocolError):
+        acceptor.link.receive(memoryview(header), time.now)
+
+
+@pytest.mark.parametrize(
+    "kind", [k for k in FrameKind if k not in (FrameKind.HELLO, FrameKind.WELCOME, FrameKind.REFUSE)]
+)
+def test_a_length_is_refused_before_its_bytes_come(kind: FrameKind) -> None:
+    time = Time()
+    _, acceptor = pair(time)
+    header = (0xFFFFFFFF).to_bytes(4, "big") + bytes([kind, 3]) + bytes(18)
+    with pytest.raises(LimitExceeded):
+        acceptor.link.receive(memoryview(header), time.now)
+
+
+def test_keepalive_holds_an_idle_link_for_ever_and_its_clock_is_known() -> None:
+    time = Time()
+    dialler, acceptor = pair(time)
+    pings = 0
+    while time.now < 200.0:
+        due = min(t for s in (dialler, acceptor) if (t := s.link.next_timer()) is not None)
+        time.now = due
+        for mine in (dialler, acceptor):
+            mine.link.handle_timer(time.now)
+            pings += mine.link.has_output
+        exchange(dialler, acceptor, time)
+    assert dialler.link.state is ConnectionState.UP
+    assert acceptor.link.state is ConnectionState.UP
+    assert pings < 100 * 5.5  # one side pings at 4 Hz, the other's pongs keep it, and it pings once a second
+    estimate = dialler.link.clock.estimate(time.now)
+    assert estimate is not None
+    assert abs(estimate[0]) <= estimate[1]
+
+
+def test_silence_for_the_others_lease_ends_the_link() -> None:
+    time = Time()
+    dialler, _ = pair(time, lease=2.0)
+    pass_time(dialler.link, time, 1.999)
+    assert dialler.link.state is ConnectionState.UP
+    pass_time(dialler.link, time, 0.001)
+    assert dialler.last() == ConnectionClosed("high was silent for its lease of 2 s", orderly=False)
+    assert dialler.link.next_timer() is None
+
+
+def is_up(one: Side) -> bool:
+    return one.link.state is ConnectionState.UP
+
+
+def test_a_pause_of_our_own_is_no_silence_of_the_others() -> None:
+    time = Time()
+    dialler, _ = pair(time)
+    pass_time(dialler.link, time, 0.3)
+    time.now += 5.0  # stopped, or without a processor
+    dialler.link.handle_timer(time.now)
+    assert is_up(dialler)
+    pass_time(dialler.link, time, 0.4)
+    assert is_up(dialler), "who is back looks for as long as was left"
+    dialler.link.heard(time.now)
+    pass_time(dialler.link, time, 0.99)
+    assert is_up(dialler)
+    pass_time(dialler.link, time, 0.01)
+    assert not is_up(dialler), "what was excused is over with the next word"
+
+
+def test_the_reason_names_the_lease_and_our_own_pause_apart() -> None:
+    time = Time()
+    dialler, _ = pair(time, lease=2.0)
+    pass_time(dialler.link, time, 0.3)
+    time.now += 1.5
+    dialler.link.handle_timer(time.now)
+    pass_time(dialler.link, time, 2.0)
+    closed = dialler.last()
+    assert isinstance(closed, ConnectionClosed)
+    assert "silent for its lease of 2 s, our own pauses of 1." in closed.reason
+
+
+def test_a_peer_that_died_in_our_pause_is_given_up_within_its_lease() -> None:
+    time = Time()
+    dialler, _ = pair(time)
+    time.now += 60.0
+    dialler.link.handle_timer(time.now)
+    assert is_up(dialler)
+    pass_time(dialler.link, time, limits.LINK_LEASE)
+    assert not is_up(dialler)
+
+
+def test_bytes_within_a_half_read_frame_renew_the_lease() -> None:
+    time = Time()
+    dialler, _ = pair(time)
+    for _ in range(10):
+        time.now += 0.9
+        dialler.link.heard(time.now)
+        dialler.link.handle_timer(time.now)
+    assert dialler.link.state is ConnectionState.UP
+
+
+@pytest.mark.parametrize("role", list(ConnectionRole))
+def test_a_handshake_that_takes_too_long(role: ConnectionRole) -> None:
+    time = Time()
+    mine = side(role, LOW, time)
+    assert mine.link.next_timer() == time.now + limits.HANDSHAKE_TIMEOUT
+    time.now += limits.HANDSHAKE_TIMEOUT
+    mine.link.handle_timer(time.now)
+    assert isinstance(mine.events[-1], ConnectionClosed)
+    assert "handshake" in mine.events[-1].reason
+
+
+def test_a_pong_that_answers_nothing_is_ignored() -> None:
+    time = Time()
+    dialler, _ = pair(time)
+    before = dialler.link.clock.estimate(time.now)
+    deliver(pong(12345, 1, 2).serialize(), dialler.link, time.now)
+    assert dialler.link.clock.estimate(time.now) == before
+
+
+def test_what_comes_while_leaving_is_ignored_and_the_drain_ends_in_time() -> None:
+    time = Time()
+    dialler, acceptor = pair(time)
+    dialler.link.close("done", time.now)
+    dialler.link.close("again", time.now)
+    deliver(acceptor.link.control(b"{}") + b"\xff" * 40, dialler.link, time.now)
+    assert not any(isinstance(e, ControlReceived) for e in dialler.events)
+    time.now += runtime_limits.DRAIN_TIMEOUT
+    dialler.link.handle_timer(time.now)
+    assert dialler.last() == ConnectionClosed("done", orderly=True)
+
+
+def test_the_driver_loses_the_connection() -> None:
+    time = Time()
+    dialler, _ = pair(time)
+    dialler.link.lost("reset by peer")
+    dialler.link.lost("twice")
+    assert dialler.last() == ConnectionClosed("reset by peer", orderly=False)
+    assert sum(isinstance(e, ConnectionClosed) for e in dialler.events) == 1
+
+
+def test_closing_from_within_the_data_callback_stops_the_reading() -> None:
+    time = Time()
+    _, acceptor = pair(time)
+    got: list[int] = []
+
+    def on_data(_route: int, sequence: int, _stamp: int, _view: memoryview) -> None:
+        got.append(sequence)
+        acceptor.link.lost("closed by its user")
+
+    acceptor.link.on_data = on_data
+    both = pack_data_header(0, 1, 1, 0) + pack_data_header(0, 1, 2, 0)
+    assert acceptor.link.receive(memoryview(both), time.now) == (len(both), 0)
+    assert got == [1]
+
+
+def test_answers_out_of_turn_are_our_own_fault() -> None:
+    time = Time()
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
+    with pytest.raises(LocalProtocolError):
+        acceptor.link.accept(time.now)
+    dialler, _ = pair(time)
+    with pytest.raises(LocalProtocolError):
+        dialler.link.refuse(Refuse(Refusal.BUSY, ""), time.now)
+
+
+@pytest.mark.parametrize("offset_ns", [0, 1_500_000_000, -86_400_000_000_000])
+def test_the_clock_offset_is_within_its_bound(offset_ns: int) -> None:
+    mine, theirs = Time(), Time()
+    theirs.offset_ns = offset_ns
+    dialler = side(ConnectionRole.DIALLER, LOW, mine)
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, theirs)
+
+    def carry(source: Side, target: Side, delay: float) -> None:
+        mine.now += delay
+        theirs.now = mine.now
+        deliver(source.link.take_output(), target.link, mine.now)
+
+    carry(dialler, acceptor, 0.001)
+    acceptor.link.accept(theirs.now)
+    carry(acceptor, dialler, 0.001)
+    for there, back in [(0.03, 0.001), (0.002, 0.004), (0.001, 0.05)]:
+        carry(dialler, acceptor, there)
+        carry(acceptor, dialler, back)
+        mine.now += 0.25
+        dialler.link.handle_timer(mine.now)
+    estimate = dialler.link.clock.estimate(mine.now)
+    assert estimate is not None
+    offset, error = estimate
+    assert error < 0.0041
+    assert abs(offset - offset_ns / 1e9) <= error + 1e-9
+
+
+def test_a_lease_of_a_month_is_cut() -> None:
+    time = Time()
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
+    hello = Hello(LOW.guid, LOW.instance, LOW.name, 0, 0xFFFFFFFF)
+    deliver(Frame(FrameKind.HELLO, hello.serialize()).serialize(), acceptor.link, time.now)
+    acceptor.link.accept(time.now)
+    pass_time(acceptor.link, time, limits.LINK_LEASE_MAX)
+    assert acceptor.link.state is ConnectionState.CLOSED
+
+
+def test_identity_of_the_other_side_comes_with_the_hello() -> None:
+    time = Time()
+    dialler, _ = pair(time)
+    assert dialler.link.remote is not None
+    assert dialler.link.remote.identity == Identity(HIGH.guid, HIGH.instance, "high", 0)
+
+
+@pytest.mark.parametrize("one_way", [0.05, 0.6, 1.4])
+def test_a_link_with_a_long_round_trip_comes_up_and_stays(one_way: float) -> None:
+    """Where a foreign flow fills a slow radio's queue: each side hears the other steadily, only late."""
+    time = Time()
+    dialler = side(ConnectionRole.DIALLER, LOW, time, expected=HIGH.guid)
+    acceptor = side(ConnectionRole.ACCEPTOR, HIGH, time)
+    on_the_way: list[tuple[float, Side, bytes]] = []
+    ends: list[float] = []
+    begin = time.now
+    while time.now < begin + 30.0 and not ends:
+        for one, other in ((dialler, acceptor), (acceptor, dialler)):
+            if one.link.has_output:
+                on_the_way.append((time.now + one_way, other, one.link.take_output()))
+        dues = [due for s in (dialler, acceptor) if (due := s.link.next_timer()) is not None]
+        time.now = max(time.now, min([*dues, *(when for when, _, _ in on_the_way)]))
+        arrived = [packet for packet in on_the_way if packet[0] <= time.now]
+        on_the_way = [packet for packet in on_the_way if packet[0] > time.now]
+        for _, to, data in arrived:
+            deliver(data, to.link, time.now)
+            if isinstance(to.last(), HelloReceived):
+                to.link.accept(time.now)
+        for s in (dialler, acceptor):
+            s.link.handle_timer(time.now)
+            ends += [time.now - begin for event in s.events if isinstance(event, ConnectionClosed)]
+    assert ends == []
+    assert dialler.link.state is acceptor.link.state is ConnectionState.UP
