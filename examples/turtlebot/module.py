@@ -12,8 +12,7 @@ import sys
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from rmpa.ros.node.node import Node
-from rmpa.ros.types.messages import MessageType
+from rmpa.ros import MessageType, Node
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Coroutine

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from rmpa.observe.snapshot import Snapshot
-    from rmpa.ros.node.node import Node, Received
+    from rmpa.ros import Node, Received
 
 PROFILE = "std_msgs/String"
 """The type of a resource's topic that says which profile it runs."""

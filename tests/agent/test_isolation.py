@@ -405,7 +405,7 @@ async def its_master_is_started_anew(world: World) -> None:
     assert isinstance(world.near.core, ExternalCore)
     for _ in range(4):
         world.near.core._drop_writes(UnreachableError("master", "there"))
-        world.near.core._look_soon()
+        world.near.core._poll_soon()
         looks = world.near.core.counters.as_dict()["master.looks"]
         await world.until(lambda looks=looks: world.near.core.counters.as_dict()["master.looks"] > looks)  # type: ignore[misc]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rmpa.ros.master import kept
+from rmpa.ros.master import stored_rows
 from rmpa.ros.master.api import MasterApi
 from rmpa.ros.wire.xmlrpc import response_pieces
 
@@ -29,20 +29,20 @@ def fuzz(data: bytes) -> None:
         (parts[i].decode("latin-1"), parts[i + 1].decode("latin-1"), parts[i + 2])
         for i in range(0, len(parts) - 2, 3)
     ]
-    found = kept.read(rows)
+    found = stored_rows.read(rows)
     again = _rows(found.tree)
-    if again != _rows(kept.read([(*key, value) for key, value in again.items()]).tree):
+    if again != _rows(stored_rows.read([(*key, value) for key, value in again.items()]).tree):
         raise AssertionError("what was taken is not what is kept")
     master = MasterApi("http://h:1/", 1, lambda _: None)
     master.parameters.set("/", found.tree)
     for node, record in found.nodes.items():
-        master.registrations.await_node(node, record)
-        master.registrations.take_up(node)
+        master.registrations.restore(node, record)
+        master.registrations.confirm(node)
     for method, *arguments in (("getSystemState",), ("getParam", "/"), ("getTopicTypes",)):
         for _ in response_pieces(list(master.call(method, ["/x", *arguments]))):
             pass
 
 
-def _rows(tree: Tree) -> dict[kept.Key, bytes]:
-    changed = kept.changed_params({}, tree)
-    return {kept.param_key(path): kept.packed(value) for path, value in changed if value is not None}
+def _rows(tree: Tree) -> dict[stored_rows.Key, bytes]:
+    changed = stored_rows.changed_params({}, tree)
+    return {stored_rows.param_key(path): stored_rows.packed(value) for path, value in changed if value is not None}

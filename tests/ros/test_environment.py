@@ -8,7 +8,7 @@ from rmpa.ros.environment import RosEnvironment, host_of, is_loopback, parse_val
 ADDRESSES = ["127.0.0.1", "192.168.1.7", "10.0.0.2"]
 
 
-def test_with_nothing_given_the_first_outer_address_and_the_usual_master() -> None:
+def test_defaults_are_first_outer_address_and_usual_master() -> None:
     assert RosEnvironment.read({}, [], ADDRESSES) == RosEnvironment("http://localhost:11311", "192.168.1.7")
 
 

@@ -76,7 +76,7 @@ async def _run(host: str, port: int, advertise: str, *, fresh: bool) -> None:
     click.echo(f"ROS_MASTER_URI={core.uri}")
     click.echo(f"setting /run_id to {core.call('getParam', '/rmpa_core', '/run_id').value}")
     click.echo("started core service [/rosout]")
-    if core.memory is not None and (text := core.memory.beginning()):
+    if core.persistence is not None and (text := core.persistence.beginning()):
         click.echo(text)
     sys.stdout.flush()
     await ended.wait()

@@ -106,7 +106,7 @@ def pub(
     try:
         found = find_message_type(kind)
     except UnknownTypeError as error:
-        if not error.learnable:
+        if not error.fetchable:
             raise
         unknown = error
     if found is not None and not found.source:
@@ -160,12 +160,12 @@ async def _version(node: Node, topic: str, found: MessageType | str) -> MessageT
     Raises:
         DefinitionError: It is not known here, and no publisher tells it.
     """
-    from rmpa.ros.node.learn_type import find_or_learn, learn_type
+    from rmpa.ros.node.fetch_type import fetch_type, find_or_fetch
 
     if isinstance(found, str):
-        return await find_or_learn(node.master_uri, node.name, found, topic)
+        return await find_or_fetch(node.master_uri, node.name, found, topic)
     if found.source:
-        there = await learn_type(node.master_uri, node.name, found.name, topic=topic, elsewhere=False)
+        there = await fetch_type(node.master_uri, node.name, found.name, topic=topic, elsewhere=False)
         if there is not None and there.kind.md5sum != found.md5sum:
             warn(
                 f"{there.node} publishes {topic} with another version of {found.name} (md5 {there.kind.md5sum}) "

@@ -1,1 +1,40 @@
-"""The ROS 1 side: master, parameter server, slave API, TCPROS and message types."""
+"""The ROS 1 side: master, parameter server, slave API, TCPROS and message types.
+
+For users: ``Node`` and the classes in ``__all__``. Each is imported when it is first used: the agent starts without
+numpy.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from rmpa.ros.environment import RosEnvironment
+    from rmpa.ros.node.node import Node, Publisher, Received, Service, ServiceClient, Subscriber
+    from rmpa.ros.types.messages import MessageType
+    from rmpa.ros.types.service_types import ServiceType
+
+__all__ = [
+    "MessageType",
+    "Node",
+    "Publisher",
+    "Received",
+    "RosEnvironment",
+    "Service",
+    "ServiceClient",
+    "ServiceType",
+    "Subscriber",
+]
+
+_MODULES: Final = {
+    "MessageType": "rmpa.ros.types.messages",
+    "RosEnvironment": "rmpa.ros.environment",
+    "ServiceType": "rmpa.ros.types.service_types",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_MODULES.get(name, "rmpa.ros.node.node")), name)

@@ -1,7 +1,7 @@
-"""What a node is told from outside: the ROS_* variables and the remapping arguments.
+"""Reads the ROS_* environment variables and the remapping arguments of a node.
 
-Sources: wiki.ros.org/ROS/EnvironmentVariables, wiki.ros.org/Remapping%20Arguments. An argument is stronger than a
-variable. Pure: variables, arguments and the machine's addresses are passed in.
+Sources: wiki.ros.org/ROS/EnvironmentVariables, wiki.ros.org/Remapping%20Arguments. An argument overrides a variable.
+Pure: variables, arguments and the machine's addresses are passed in.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ _PORT_MAX: Final = 65535
 
 @dataclass(frozen=True, slots=True)
 class RosEnvironment:
-    """How a node finds its master and what it is called.
+    """A node's master, address, namespace, name and remappings.
 
     Args:
-        master_uri: Of the master.
-        host: The address that others are told to connect to.
-        host_given: Whether somebody asked for that address; else it is the first that is not a loopback one.
-        namespace: Global; names are resolved in it.
-        name: What replaces the node's own name, or empty.
-        remappings: Names to names, both as they were written.
+        master_uri: The master's URI.
+        host: The address to register.
+        host_given: Whether a variable or argument sets it; else it is the first that is not a loopback address.
+        namespace: A global name, in which names are resolved.
+        name: Replaces the node's own name; empty for none.
+        remappings: From name to name, both as they were written.
         parameters: Private parameters (``_key:=value``) with their values, keys without the underscore.
-        arguments: The arguments that are none of these.
+        arguments: All other arguments.
     """
 
     master_uri: str = DEFAULT_MASTER_URI
@@ -109,20 +109,20 @@ class RosEnvironment:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host, as written in a URI, is this machine only."""
+    """Whether a host, as written in a URI, is a loopback address or name."""
     return host in ("localhost", "::1", "[::1]") or re.fullmatch(r"127(\.[0-9]+){3}", host) is not None
 
 
 def host_of(uri: str) -> str:
-    """The host in a ROS URI, or empty if it is none."""
+    """The host in a ROS URI; empty if the text is not one."""
     match = _URI.fullmatch(uri)
     return match["host"] if match else ""
 
 
 def parse_value(text: str) -> XmlRpcValue:
-    """A parameter's value from the command line: a number, a truth value, a JSON list or object, else the text.
+    """A parameter's value from the command line: a number, a boolean, a JSON list or object, else the text.
 
-    rosparam reads YAML here; this is the part of it that people type.
+    rosparam reads YAML here; this is the usual part of it.
     """
     lowered = text.strip().lower()
     if lowered in ("true", "false"):

@@ -1,7 +1,4 @@
-"""Limits and time-outs of ROS: the core, nodes, XML-RPC, TCPROS and message types.
-
-Each has its reason beside it. Seconds and bytes, unless the name says otherwise.
-"""
+"""Limits and time-outs of cores, nodes, XML-RPC, TCPROS and message types, in seconds and bytes."""
 
 from __future__ import annotations
 
@@ -9,224 +6,236 @@ from typing import Final
 
 from rmpa.core.sizes import KIB, MIB
 
-# --- mesh -------------------------------------------------------------------------------------------------------
 MESSAGE_MAX: Final = 256 * MIB
 """One ROS message with its length; the largest point clouds and images stay below this."""
 
-# --- ROS --------------------------------------------------------------------------------------------------------
+# --- TCPROS and services ------------------------------------------------------------------------------------------
 TCPROS_HEADER_MAX: Final = 4 * MIB
 """A connection header: the longest message definitions are some 100 KB; roscpp would accept 1 GB."""
 TCPROS_MESSAGE_MAX: Final = MESSAGE_MAX - 4
-"""One message, so that it still fits a frame with its length."""
+"""One message without its 4-byte length."""
 TCPROS_LENGTH_MAX: Final = 1_000_000_000
-"""A longer message's length is no length: the stream is out of step, and the connection is closed. It is roscpp's own
-bound. A message between both is read and left out."""
+"""A length above this means that the stream is out of step: the connection is closed. roscpp has the same bound. A
+message between the two limits is read and dropped."""
 TCPROS_HANDSHAKE_TIMEOUT: Final = 10.0
-"""For the other side's header; rospy and roscpp wait for ever, and hang for ever."""
+"""Until the other side's header must have come; rospy and roscpp wait without a limit."""
 TCPROS_CONNECT_TIMEOUT: Final = 3.0
 """For the TCP connect to a local node."""
 TCPROS_CONNECTIONS_MAX: Final = 1024
-"""Accepted connections of one node: as many subscribers, with room for those that reconnect."""
+"""Accepted connections of one node: its subscribers, with room for those that reconnect."""
 TCPROS_HANDSHAKES_MAX: Final = 128
-"""Of these, connections whose header has not come yet (port scanners, stuck nodes)."""
+"""Accepted connections without a header yet (port scanners, stuck nodes)."""
 TCPROS_BACKLOG: Final = 128
-"""Connections that the kernel holds until we accept them: all subscribers of a restarted node come at once."""
+"""Length of the listen queue: all subscribers of a restarted node connect at once."""
 TCPROS_RETRY_FIRST: Final = 0.1
 """Before the second attempt to reach a publisher; roscpp's own value."""
 TCPROS_RETRY_MAX: Final = 2.0
-"""Between attempts at the most, as long as the graph lists the publisher."""
+"""The longest pause between attempts, while the graph lists the publisher."""
 SHARED_BACKLOG: Final = 4096
-"""Connections that the kernel holds for the one socket of all proxies: all subscribers of a restarted agent come at
-once. The kernel lowers it to its own bound (``net.core.somaxconn``)."""
+"""Length of the listen queue of the one socket of all proxies: all subscribers of a restarted agent connect at once.
+The kernel lowers it to ``net.core.somaxconn``."""
 SHARED_PROBE_TIMEOUT: Final = 1.0
-"""For the trial whether addresses of 127/8 other than 127.0.0.1 work here; it takes a millisecond where they do."""
+"""For the test whether addresses of 127/8 other than 127.0.0.1 work here; where they do it takes a millisecond."""
 LOOPBACK_REST: Final = 60.0
-"""Before a freed loopback address is given again: three times the 20 s for which roscpp dials an old one at most."""
+"""Before a freed loopback address is used again: three times the 20 s for which roscpp dials an old one."""
 LOOPBACK_RESTING_MAX: Final = 16_384
-"""Freed addresses that are remembered: all nodes of some large modules that come and go within that minute."""
+"""Freed addresses that are held back: all nodes of some large modules that come and go within that minute."""
 TCP_KEEPALIVE_IDLE: Final = 60
-"""Seconds of silence before the kernel asks whether the other side lives; with the next two roscpp's own values."""
+"""Seconds of silence before the first keepalive probe; this and the next two are roscpp's values."""
 TCP_KEEPALIVE_INTERVAL: Final = 10
-"""Seconds between such questions."""
+"""Seconds between probes."""
 TCP_KEEPALIVE_COUNT: Final = 9
-"""Unanswered questions before the connection is dead."""
+"""Unanswered probes before the connection is dead."""
 SERVICE_MESSAGE_MAX: Final = 64 * MIB
-"""One request or response of a service: maps and point clouds reach some 10 MB, and each is held as a whole."""
+"""One request or response of a service, which is held in memory: maps and point clouds reach some 10 MB."""
 SERVICE_OPEN_TIMEOUT: Final = 5.0
 """For the connection to a server and its header."""
 SERVICE_STALL: Final = 30.0
-"""For the next bytes of a request that has begun, or the first ones of a client that wants to call only once."""
+"""Until the next bytes of a request must come, or the first ones of a client that is not persistent."""
 SUBSCRIBER_QUEUE_MESSAGES: Final = 1000
-"""Messages that wait for one slow local subscriber; the oldest is dropped beyond it."""
+"""Messages queued for one slow local subscriber; above it the oldest is dropped."""
 LATCHED_MAX: Final = 100
-"""Messages of one source that are kept for late subscribers (durability transient_local), whatever the depth."""
+"""Messages of one source kept for late subscribers (durability transient_local), whatever depth is asked for."""
 SUBSCRIBER_QUEUE_BYTES: Final = 32 * MIB
 """The same in bytes; one message always fits."""
+
+# --- message types ------------------------------------------------------------------------------------------------
 DEFINITION_MAX: Final = 1 * MIB
-"""Characters of a message definition that we learn from a publisher; the longest known are some 100 KB."""
+"""Characters of a message definition with all that it embeds; the longest known are some 100 KB."""
 DEFINITION_FIELDS_MAX: Final = 4096
 """Fields and constants of one message type."""
 DEFINITION_DEPTH_MAX: Final = 32
 """Types within types; ROS's own go five deep."""
-LEARNT_TYPES_MAX: Final = 256
-"""Message types learnt from publishers that a process remembers; the one unused for longest is forgotten."""
+RECEIVED_TYPES_MAX: Final = 256
+"""Message types from publishers' headers in the cache of a process; the least recently used is dropped."""
 PACKAGE_DEPTH_MAX: Final = 32
 """Folders within folders below an entry of ROS_PACKAGE_PATH that are searched for packages; usual are four."""
 PACKAGE_FOLDERS_MAX: Final = 20_000
-"""Folders below one entry that are searched, up to 3 s; a workspace has a thousand, 40 ms. Nearer ones come first."""
+"""Folders searched below one entry, nearer ones first: takes up to 3 s; a workspace has a thousand, 40 ms."""
 PACKAGE_ENTRIES_MAX: Final = 200_000
-"""Entries of all these folders: one folder of recordings must not take minutes."""
+"""Directory entries of all these folders: a folder of recordings must not take minutes."""
 PACKAGE_FILE_MAX: Final = 256 * KIB
 """A package.xml; usual ones have 2 KB."""
 TYPES_FOUND_MAX: Final = 256
-"""Types that were found on this machine and that a process remembers; the one unused for longest is forgotten."""
+"""Types found on this machine in the cache of a process; the least recently used is dropped."""
 TYPE_MISSING: Final = 10.0
-"""Seconds that a type which a publisher's header names and nobody knows here is not looked for again: each message
-asks for it, and a look goes through the whole workspace, some 50 ms."""
+"""Before an unknown type of a publisher's header is searched for again: each message asks for it, and a search goes
+through the whole workspace, some 50 ms."""
 TYPES_MISSING_MAX: Final = 64
-"""Such types that a process remembers; the one looked for longest ago is forgotten."""
+"""Unknown types in the cache of a process; the oldest is dropped."""
 SEARCHED_SHOWN: Final = 4
-"""Entries of one variable that the text of an error shows."""
-ASKED_FOR_TYPE_MAX: Final = 8
-"""Publishers of a type that are asked for its definition, one behind the other."""
-ASKED_FOR_TYPE_TIMEOUT: Final = 3.0
-"""For the header of one of them: that of a peer's comes when its route is open."""
+"""Entries of one environment variable that an error shows."""
+FETCH_TYPE_PUBLISHERS: Final = 8
+"""Publishers of a type that are asked for its definition, one after the other."""
+FETCH_TYPE_TIMEOUT: Final = 3.0
+"""For the header of one of them; a peer's publisher answers when its route is open."""
 TYPE_LOOK: Final = 1.0
-"""Between two looks of a resource whether a publisher of a type that it needs has come."""
+"""Between two checks of a resource whether a publisher of a type that it needs has come."""
+
+# --- our nodes ----------------------------------------------------------------------------------------------------
 NODE_MASTER_CHECK: Final = 0.5
-"""Between a node's looks whether its master still knows it: a restarted core has its nodes back within a second."""
+"""Between a node's checks whether its master still knows it: a restarted core has its nodes back within a second."""
 NODE_UNREGISTER_TIMEOUT: Final = 3.0
-"""For an ending node to take all its registrations back; a master that hangs must not keep it from its end."""
+"""For an ending node to unregister everything; a master that hangs must not delay it."""
 NODE_UNREGISTER_AT_ONCE: Final = 16
-"""Of these calls at a time: a connection each."""
+"""Concurrent calls to unregister, each on a connection of its own."""
 RECEIVED_QUEUE: Final = 1000
-"""Messages that wait for an ``async for``; the oldest is dropped beyond it."""
+"""Messages queued for an ``async for``; above it the oldest is dropped."""
+
+# --- XML-RPC over HTTP --------------------------------------------------------------------------------------------
 HTTP_BODY_MAX: Final = 64 * MIB
-"""An XML-RPC call, or an answer that we asked for: URDFs and maps reach some 10 MB, and roslaunch sets all parameters
-of a launch file in one call."""
+"""One XML-RPC call or response: URDFs and maps reach some 10 MB, and roslaunch sets all parameters of a launch file
+in one call."""
 HTTP_BODIES_MAX: Final = 256 * MIB
-"""All large calls that one server has under way: four of the largest."""
+"""All large calls of one server together: four of the largest."""
 HTTP_DISCARDED_MAX: Final = 1024 * MIB
-"""A call that is too large is read to its end, for its caller to read the answer; above this it is only cut off."""
+"""A call that is too large is read to its end, because its caller reads no answer before; above this it is cut
+off."""
 HTTP_PACE_MIN: Final = 64 * KIB
-"""Bytes a second: a call that comes more slowly gives way to others where room is short; loopback carries 1 GB/s."""
+"""Bytes a second: the connection of a slower call is closed where room is short; loopback carries 1 GB/s."""
 HTTP_SLOW_AFTER: Final = 1.0
-"""Before a call is called slow."""
+"""Before the pace of a call is judged."""
 HTTP_BODY_INLINE: Final = 64 * KIB
-"""Bodies above this are read and written over several turns of the loop: 8 MiB of numbers would hold up keepalives
-for seconds. Shorter ones take some 5 ms, in which only data goes first."""
+"""Longer bodies are read and written over several turns of the event loop: 8 MiB of numbers would hold up keepalives
+for seconds. Shorter ones take some 5 ms, in which only pending data goes first."""
 XMLRPC_SLICE: Final = 2 * KIB
-"""What is parsed at once of a body, some 100 microseconds; then data goes first."""
+"""Bytes of XML parsed at once, some 100 microseconds; then pending data goes first."""
 HTTP_ACCEPTS: Final = 4
-"""Connections that are accepted without a pause, 40 microseconds each."""
+"""Connections accepted in one turn of the event loop, 40 microseconds each."""
 HTTP_HEADERS_MAX: Final = 64 * KIB
-"""A request's headers, all together."""
+"""All headers of one request."""
 HTTP_BACKLOG: Final = 1024
-"""Connections that the kernel holds until we accept them: all nodes of a robot register at once. One that finds no
-place comes again after a second."""
+"""Length of the listen queue: all nodes of a robot register at once. A SYN that finds it full is sent again after 1
+s."""
 HTTP_CONNECTIONS_MAX: Final = 512
-"""Open connections to one XML-RPC server: rospy keeps one per thread alive. A new one takes the place of the one that
-is idle for longest, else of the slowest."""
+"""Open connections to one XML-RPC server: rospy keeps one per thread alive. For a new one the longest idle is closed,
+else the slowest (``ros.http.eviction``)."""
 HTTP_IDLE_TIMEOUT: Final = 60.0
-"""A kept-alive connection without a call; rospy and roscpp reconnect without a word."""
+"""A kept-alive connection without a call; rospy and roscpp reconnect by themselves."""
 HTTP_IDLE_MIN: Final = 0.25
-"""Without a call, before a kept-alive connection is closed for one that waits for a file descriptor."""
+"""Idle time before a kept-alive connection may be closed for one that waits for a file descriptor."""
 HTTP_REQUEST_TIMEOUT: Final = 10.0
 """From a request's first byte to its last."""
 XMLRPC_DEPTH_MAX: Final = 256
-"""XML elements inside each other: some eighty arrays in arrays; nobody's parameters come near."""
+"""Nested XML elements: some eighty arrays in arrays, more than any real parameter."""
 XMLRPC_ELEMENTS_MAX: Final = 4_000_000
-"""XML elements in one body, two for each number: at some hundred bytes of memory each."""
+"""XML elements in one body, two for each number; each takes some hundred bytes of memory."""
 PARAM_DEPTH_MAX: Final = 64
-"""Namespaces inside each other in one parameter's name; more is an attack on the recursion."""
+"""Nested namespaces in one parameter's name; more is an attack on the recursion."""
 SLAVE_CALL_TIMEOUT: Final = 3.0
 """For one XML-RPC call to a node; a stopped node must not hold the others up."""
+
+# --- a roscore in place of the embedded core ----------------------------------------------------------------------
 MASTER_LOOK_FIRST: Final = 0.1
-"""Between two looks at a roscore whose graph has just changed: nodes register one thing after the other. An idle look
-at a graph of 50 nodes costs it some milliseconds."""
+"""Between two polls of a roscore whose graph has just changed: nodes register one thing after the other. A poll of a
+graph of 50 nodes costs it some milliseconds."""
 MASTER_LOOK_IDLE: Final = 0.5
-"""Between two looks where nothing changes: a look more would cost more than it finds earlier."""
+"""Between two polls while nothing changes."""
 MASTER_LOOK_MAX: Final = 0.8
-"""Between two looks at the most, so that whatever changes is seen within a second."""
+"""The longest pause between two polls, so that a change is seen within a second."""
 MASTER_LOOK_SHARE: Final = 20
-"""Times what a look took, before the next one: a twentieth of the master's time is ours."""
+"""The pause is at least this many times what the poll took: a twentieth of the master's time is ours."""
 MASTER_LOOK_SOON: Final = 0.02
-"""Before a look that somebody has cause for: what he saw is seldom the only thing."""
+"""Before a poll out of turn, which a suspicion causes: one change is seldom alone."""
 MASTER_RETRY: Final = 0.5
-"""Between two looks for a roscore that does not answer: one that was started again has us back within a second."""
+"""Between two polls of a roscore that does not answer: a restarted one has our registrations within a second."""
 MASTER_TIMEOUT: Final = 3.0
-"""For one look or one write; a roscore on a busy board has answered in 0.3 s."""
+"""For one poll or write; a roscore on a busy board has answered in 0.3 s."""
 MASTER_ASK_TIMEOUT: Final = 10.0
 """For an answer that may be megabytes of parameters."""
 MASTER_WRITES_AT_ONCE: Final = 64
 """Registrations in one call to a roscore, some 10 ms of its work."""
 MASTER_WRITES_MAX: Final = 20_000
-"""Registrations that wait to be told to a roscore: more than a peer may advertise; beyond it a look finds them."""
+"""Registrations queued for a roscore: more than a peer may advertise; above it the next poll finds what is
+missing."""
 MASTER_FAREWELL: Final = 2.0
-"""For what an agent that ends has to tell a roscore."""
+"""For an ending agent to unregister at a roscore."""
+
+# --- cores --------------------------------------------------------------------------------------------------------
 NODE_CHECK_INTERVAL: Final = 5.0
-"""How often the core looks whether a registered node still listens."""
+"""Period in which each registered node is checked: whether it still listens."""
 NODE_RECHECK_DELAY: Final = 0.2
-"""Between the two refused connects that make a node dead: it may be restarting its server."""
+"""Between the two refused connects that prove a node dead: it may be restarting its server."""
 NODE_UNREACHABLE_AFTER: Final = 15.0
-"""Seconds without one connection to a registered node until peers are not offered it any more: a cable that is pulled
-and put back, or an access point that is changed, takes less."""
+"""Seconds for which connections to a registered node fail until peers are no longer offered it: a cable that is
+pulled and put back, or a change of the access point, takes less."""
 NODE_UNREACHABLE_CHECKS: Final = 4
-"""Unreachable nodes that are tried at once: each attempt may hold a thread of the resolver for seconds."""
+"""Concurrent attempts to reach unreachable nodes: each may hold a thread of the resolver for seconds."""
 NOTIFY_QUEUE_MAX: Final = 4096
-"""Topics and parameters that wait to be told to one slow node; of one topic only the latest waits."""
+"""Updates of topics and parameters queued for one slow node; of one topic only the latest is queued."""
 NOTIFY_COALESCE: Final = 64
-"""From this many on, of one parameter too only the latest waits; before, a node hears each as from rosmaster."""
+"""Above this many, only the latest update of one parameter is queued too; below, a node gets each, as from
+rosmaster."""
 NOTIFY_RETRY_FIRST: Final = 0.2
-"""Before a node that did not answer is told again."""
+"""Before an update is sent again to a node that did not answer."""
 NOTIFY_RETRY_MAX: Final = 3.0
-"""Between attempts at the most, for as long as the node is registered."""
+"""The longest pause between attempts, while the node is registered."""
 ROSOUT_QUEUE: Final = 1000
-"""Log messages waiting for a slow reader of /rosout_agg."""
+"""Log messages queued for a slow reader of /rosout_agg."""
 ROSOUT_RESPAWN: Final = 0.5
 """Seconds from the end of /rosout (`rosnode kill`) to its next start; roscore takes about as long."""
 ROSOUT_LOOK: Final = 1.0
-"""Seconds between two looks whether the name /rosout is free again, and between attempts to start."""
+"""Seconds between two checks whether the name /rosout is free again, and between attempts to start."""
 CORE_STATE_BYTES: Final = 64 * MIB
-"""What a core keeps over its end, over all rows: a robot's parameters with its description are some MB."""
+"""A core's state file, all rows together: a robot's parameters with its description are some MB."""
 CORE_STATE_NAME_MAX: Final = 4096
-"""Characters of a name that is taken from such a file: rosmaster has no limit, and the longest seen have 200."""
+"""Characters of a name that is read from a state file: rosmaster has no limit, and the longest seen have 200."""
 CORE_STATE_GATHER: Final = 0.3
-"""Changes of the graph are gathered this long before they are kept: what a kill -9 loses, with the write itself half
-a second at the most. Nodes that start register a dozen things each."""
+"""Changes of the graph are gathered this long before they are written; with the write, a kill -9 loses up to 0.5 s. A
+starting node registers a dozen things."""
 CORE_STATE_RETRY: Final = 5.0
-"""Before a file that could not be written is tried again: the disk is full, or not there yet."""
+"""Before a failed write is tried again: the disk is full, or not mounted yet."""
 CORE_STATE_LOCKED: Final = 1.0
-"""For the file's lock: the process before may still be ending."""
+"""For the lock of the state file: the previous process may still be ending."""
 CORE_STATE_OPEN: Final = 3.0
-"""For reading the file at the start; a disk that hangs must not keep the core from its start."""
+"""For reading the state file at the start; a disk that hangs must not delay the core."""
 CORE_STATE_WRITE: Final = 10.0
-"""For one write; then the disk is said not to answer. The first one after a start may be 64 MiB on a slow card."""
+"""For one write; then the disk is reported as not answering. The first one after a start may be 64 MiB on a slow
+card."""
 CORE_STATE_CLOSE: Final = 3.0
-"""For the last write of a core that ends; a disk that hangs is left behind."""
+"""For the last write of an ending core, even if the disk hangs."""
 CORE_STATE_UNFIT_SHOWN: Final = 3
-"""Names of what did not fit that a text for the user has."""
-TAKE_UP_AT_ONCE: Final = 32
-"""Nodes of the run before that are asked at the same time: a connection each, and who asks the core meanwhile comes
-behind that many."""
-TAKE_UP_PROMPT: Final = 0.25
-"""A node that has not answered after this long does not count among these: who hangs delays nobody else."""
-TAKE_UP_RETRY_FIRST: Final = 0.5
-"""Before a node that did not answer is asked again."""
-TAKE_UP_RETRY_MAX: Final = 10.0
-"""Between two questions at the most."""
-TAKE_UP_PATIENCE: Final = 600.0
-"""A node that did not answer for this long is given up: one that a debugger stopped may be on again by then."""
-TAKE_UP_LISTS: Final = 8
-"""Nodes that are asked at the same time what they publish and subscribe to, once all have been asked who they are."""
-TAKE_UP_COMPARED: Final = 3
-"""Times that a node is asked so; one that registers something each time is busy, and tells everything itself."""
-TAKE_UP_ANNOUNCE: Final = 3.0
-"""What was taken up is told to subscribers when all have answered or hang, or after this long: to ask 500 nodes takes
-a second, and what follows from each (connections to it, the aggregator's among them) would come between."""
-
-# --- bridge -----------------------------------------------------------------------------------------------------
+"""Names of rows that did not fit, in a text for the user."""
+VERIFY_AT_ONCE: Final = 32
+"""Restored nodes that are verified concurrently, each on a connection of its own: calls to the core queue behind
+these."""
+VERIFY_PROMPT: Final = 0.25
+"""A node that has not answered after this long no longer counts among these, so that one that hangs delays no
+other."""
+VERIFY_RETRY_FIRST: Final = 0.5
+"""Before a node that did not answer is verified again."""
+VERIFY_RETRY_MAX: Final = 10.0
+"""The longest pause between two attempts."""
+VERIFY_PATIENCE: Final = 600.0
+"""A node that did not answer for this long is discarded: one that a debugger stopped may have continued by then."""
+VERIFY_LISTS: Final = 8
+"""Nodes whose own lists of publications and subscriptions are compared concurrently, once all have been verified."""
+VERIFY_COMPARED: Final = 3
+"""Attempts to compare a node's lists; a node that registers something during each registers everything by itself."""
+VERIFY_ANNOUNCE: Final = 3.0
+"""Subscribers are notified of verified publishers when all nodes have answered or hang, or after this long. To verify
+500 nodes takes a second, and connections that follow from each would slow the rest."""
 NODE_KILL_WAIT: Final = 3.0
-"""Seconds that a node has to end after it was asked to; a node with much to put away takes a second or two."""
+"""Seconds for a node to end after it was asked to; one with much to save takes a second or two."""
 NODE_KILL_LOOK: Final = 0.2
-"""Seconds between two looks whether it has ended."""
+"""Seconds between two checks whether it has ended."""

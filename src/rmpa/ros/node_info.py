@@ -1,4 +1,4 @@
-"""What can be said of one node, as ``rmpa node`` shows it and agents tell each other."""
+"""Records about nodes, as ``rmpa node`` shows them and agents send them to each other."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class NodeLine(msgspec.Struct, kw_only=True, frozen=True):
 
     Attributes:
         name: Its name in its own graph.
-        uri: Its slave API; empty where the master does not know it.
-        publications: How many topics it publishes.
-        subscriptions: How many it subscribes to.
-        services: How many services it provides.
-        problem: Why its core cannot connect to it, ready to read; empty where it can, or has not tried.
+        uri: Its slave API; empty if the master does not have it.
+        publications: Number of topics that it publishes.
+        subscriptions: Number of topics that it subscribes to.
+        services: Number of services that it provides.
+        problem: Why its core cannot connect to it, for people; empty if it can, or has not tried.
     """
 
     name: str
@@ -31,15 +31,15 @@ class NodeLine(msgspec.Struct, kw_only=True, frozen=True):
 
 
 class NodeFacts(msgspec.Struct, kw_only=True, frozen=True):
-    """All that is known of one node.
+    """Everything known of one node.
 
     Attributes:
         name: Its name in its own graph.
         uri: Its slave API.
-        pid: Its process; ``None`` where it did not answer.
-        problem: Why it did not answer, ready to read; empty where it did.
-        publications: Types by topic; ``*`` where nobody has told the type.
-        subscriptions: Likewise.
+        pid: Its process id; ``None`` if it did not answer.
+        problem: Why it did not answer, for people; empty if it did.
+        publications: Types by topic; ``*`` for an unknown type.
+        subscriptions: Types by topic.
         services: The names of its services.
     """
 
@@ -53,12 +53,12 @@ class NodeFacts(msgspec.Struct, kw_only=True, frozen=True):
 
 
 class NodePing(msgspec.Struct, kw_only=True, frozen=True):
-    """One answer of a node.
+    """One answer of a node to a ping.
 
     Attributes:
         uri: Its slave API.
-        time: From the call to the answer, in seconds, measured on the node's machine.
-        pid: Its process.
+        time: Seconds from the call to the answer, measured on the node's machine.
+        pid: Its process id.
     """
 
     uri: str
@@ -67,7 +67,7 @@ class NodePing(msgspec.Struct, kw_only=True, frozen=True):
 
 
 class NodeEnd(msgspec.Struct, kw_only=True, frozen=True):
-    """What became of a node that was asked to end.
+    """The result of a request to shut a node down.
 
     Attributes:
         gone: Whether nothing listens at its slave API any more.
@@ -82,7 +82,7 @@ class PeerNodes(msgspec.Struct, kw_only=True, frozen=True):
     Attributes:
         peer: The peer's name.
         nodes: Its own nodes.
-        problem: Why it did not tell, ready to read; ``nodes`` are those that stand in this graph then.
+        problem: Why it did not answer, for people; then ``nodes`` are its proxies in this graph.
     """
 
     peer: str
@@ -96,21 +96,21 @@ def list_nodes(
     services: Mapping[str, Collection[str]],
     uris: Mapping[str, str],
     problems: Mapping[str, str],
-    breathing: Callable[[Iterable[Collection[str]]], Iterable[Collection[str]]] = iter,
+    yielder: Callable[[Iterable[Collection[str]]], Iterable[Collection[str]]] = iter,
 ) -> tuple[NodeLine, ...]:
     """Every node of a graph, by name.
 
     Args:
         publishers: Nodes by topic.
-        subscribers: Likewise.
+        subscribers: Nodes by topic.
         services: Nodes by service.
-        uris: Slave APIs by node, as far as they are known.
-        problems: By node: why it cannot be connected to.
-        breathing: For graphs of thousands of topics.
+        uris: Known slave APIs by node.
+        problems: By node: why connecting to it fails.
+        yielder: Lets pending data go first in graphs of thousands of topics.
     """
     counts: dict[str, list[int]] = {}
     for index, table in enumerate((publishers, subscribers, services)):
-        for nodes in breathing(list(table.values())):
+        for nodes in yielder(list(table.values())):
             for node in nodes:
                 counts.setdefault(node, [0, 0, 0])[index] += 1
     return tuple(
@@ -134,15 +134,15 @@ def describe_node(
     services: Mapping[str, Collection[str]],
     types: Mapping[str, str],
 ) -> NodeFacts:
-    """What the graph says of one node; whether it answers is not asked.
+    """The registrations of one node; the node itself is not asked.
 
     Args:
         node: Its name.
         uri: Its slave API.
         publishers: Nodes by topic.
-        subscribers: Likewise.
+        subscribers: Nodes by topic.
         services: Nodes by service.
-        types: By topic, as far as they are known.
+        types: Known types by topic.
     """
     return NodeFacts(
         name=node,

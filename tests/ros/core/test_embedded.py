@@ -89,7 +89,7 @@ async def core() -> AsyncIterator[RosCore]:
 
 
 @pytest.mark.trap(35)
-async def test_it_says_what_roscore_says(core: RosCore) -> None:
+async def test_it_answers_as_roscore_does(core: RosCore) -> None:
     assert core.uri == f"http://127.0.0.1:{core.port}/"
     assert await call_api(core.uri, "getUri", "/x") == (1, "", core.uri)
     run_id = (await call_api(core.uri, "getParam", "/x", "/run_id")).value
@@ -118,9 +118,7 @@ async def test_changes_are_reported_before_the_reply_leaves(core: RosCore) -> No
     assert core.state().publishers == {"/t": {"/p": "http://127.0.0.1:1/"}}
 
 
-async def test_a_listener_that_fails_or_registers_harms_nobody(
-    core: RosCore, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_failing_or_registering_listener_does_no_harm(core: RosCore, caplog: pytest.LogCaptureFixture) -> None:
     async with Slave() as slave:
         core.call("registerSubscriber", "/s", "/t", STRING, slave.uri)
 
@@ -161,7 +159,7 @@ async def test_notifications_never_wait_in_the_reply_and_one_goes_at_a_time(core
         assert slow.most_at_once == 1
 
 
-async def test_a_node_that_does_not_answer_is_told_again(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_silent_node_is_notified_again(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rmpa.ros.core.notifier.call", _with_timeout(0.05))
     async with Slave() as slave:
         slave.go.clear()
@@ -181,7 +179,7 @@ def _with_timeout(seconds: float) -> Callable[..., object]:
     return quick
 
 
-async def test_parameters_are_told_in_order(core: RosCore) -> None:
+async def test_parameter_updates_are_in_order(core: RosCore) -> None:
     async with Slave() as slave:
         slave.go.clear()
         core.call("subscribeParam", "/s", slave.uri, "/p")
@@ -224,7 +222,7 @@ async def test_another_node_at_a_stale_uri_is_not_shut_down(core: RosCore) -> No
         assert innocent.calls == []
 
 
-async def test_a_registered_node_that_tells_no_name_is_not_shut_down_for_another(core: RosCore) -> None:
+async def test_unnamed_registered_node_is_not_shut_down(core: RosCore) -> None:
     async with Slave(None) as roscpp:
         core.call("registerPublisher", "/twin", "/t", STRING, roscpp.uri)
         core.call("registerPublisher", "/innocent", "/u", STRING, roscpp.uri)
@@ -242,7 +240,7 @@ async def test_a_nameless_node_at_its_own_uri_is_shut_down(core: RosCore) -> Non
 
 
 @pytest.mark.trap(29)
-async def test_a_node_without_get_name_tells_its_name_in_its_header(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_node_without_get_name_is_identified_by_its_header(monkeypatch: pytest.MonkeyPatch) -> None:
     node = SlaveNode("/like_roscpp", "127.0.0.1", "http://127.0.0.1:11311/")
     await node.start()
     node.add_publication(Publication("/rosout", "/like_roscpp", TopicDescription(LOG_TYPE, LOG_MD5, "")))

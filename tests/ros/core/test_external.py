@@ -127,7 +127,7 @@ async def test_a_master_that_is_not_there_yet_is_waited_for() -> None:
     await master.close()
 
 
-async def test_a_master_that_was_started_anew_gets_everything_and_the_living_stay(
+async def test_restarted_master_gets_all_registrations(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     master = await a_master()
@@ -150,7 +150,7 @@ async def test_a_master_that_was_started_anew_gets_everything_and_the_living_sta
     await master.close()
 
 
-async def test_a_stopped_master_holds_up_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_stopped_master_holds_up_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "MASTER_TIMEOUT", 0.2)
     stopped = asyncio.Event()
     master = await a_master()
@@ -183,7 +183,7 @@ async def test_a_stopped_master_holds_up_nobody(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize("wrong", ["fault", "text", "empty", "short", "state"])
-async def test_a_master_that_talks_nonsense_is_told_of_and_asked_again(master: RosCore, wrong: str) -> None:
+async def test_malformed_master_is_reported_and_polled_again(master: RosCore, wrong: str) -> None:
     nonsense: dict[str, Any] = {
         "text": "no",
         "empty": [],
@@ -213,7 +213,7 @@ async def test_a_master_that_talks_nonsense_is_told_of_and_asked_again(master: R
     await server.close()
 
 
-async def test_what_the_master_refuses_is_said_and_not_tried_for_ever(
+async def test_refused_registration_is_reported_and_dropped(
     master: RosCore, core: ExternalCore, caplog: pytest.LogCaptureFixture
 ) -> None:
     core.call("registerPublisher", "/rmpa", "/good", STRING, OURS)
@@ -232,9 +232,7 @@ async def test_what_the_master_refuses_is_said_and_not_tried_for_ever(
     assert core.call("getParam", "/rmpa", "/good").code == -1, "only the master knows"
 
 
-async def test_a_service_of_a_node_that_no_look_has_shown_yet_is_not_pushed_out(
-    master: RosCore, core: ExternalCore
-) -> None:
+async def test_service_no_poll_has_shown_is_not_replaced(master: RosCore, core: ExternalCore) -> None:
     pushed: list[GraphChange] = []
     async with a_node() as api:
         master.call("registerService", "/n", "/srv", "rosrpc://127.0.0.1:1", api)
@@ -256,7 +254,7 @@ async def test_writes_beyond_the_bound_are_found_by_the_next_look(
     await until(lambda: len(master.state().publishers) == 10)
 
 
-async def test_another_agent_there_is_refused_at_the_start_and_waited_for_later(master: RosCore) -> None:
+async def test_second_agent_is_refused_at_start_and_waits_later(master: RosCore) -> None:
     node = SlaveNode("/rmpa", "127.0.0.1", master.uri)
     await node.start()
     first, second = external(master.uri), external(master.uri)
@@ -291,7 +289,7 @@ async def test_what_a_killed_agent_left_is_taken_away(master: RosCore) -> None:
         await core.close()
 
 
-async def test_a_node_that_died_is_hidden_and_shown_again_if_it_lives_after_all(
+async def test_dead_node_is_hidden_and_shown_again_if_alive(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(limits, "NODE_CHECK_INTERVAL", 0.1)

@@ -25,9 +25,7 @@ def listening() -> Iterator[socket.socket]:
 
 
 @pytest.mark.parametrize("look", [listening_ports, ask_listening_ports, read_tables])
-def test_ports_that_somebody_listens_at_are_seen_and_others_are_not(
-    listening: socket.socket, look: Callable[[], set[int] | None]
-) -> None:
+def test_listening_ports_are_found(listening: socket.socket, look: Callable[[], set[int] | None]) -> None:
     port = listening.getsockname()[1]
     with socket.create_connection(("127.0.0.1", port)) as client:
         ports = look()

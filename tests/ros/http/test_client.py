@@ -140,7 +140,7 @@ def test_uris_are_split() -> None:
     assert split_uri("http://host:5/RPC2") == ("host", 5, "/RPC2")
 
 
-async def test_what_cannot_be_said_is_not_sent() -> None:
+async def test_unwritable_values_are_not_sent() -> None:
     with pytest.raises(LocalProtocolError):
         await call("http://127.0.0.1:1/", "m", None)
 

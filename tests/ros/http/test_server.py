@@ -158,7 +158,7 @@ async def test_an_awaited_answer_holds_up_its_own_connection_only(server: XmlRpc
         assert parse_response((await slow.response())[1]) == [1, "127.0.0.1", [1, "two"]]
 
 
-async def test_faults_bugs_and_what_cannot_be_said(server: XmlRpcServer, caplog: pytest.LogCaptureFixture) -> None:
+async def test_faults_bugs_and_unwritable_values(server: XmlRpcServer, caplog: pytest.LogCaptureFixture) -> None:
     uri = f"http://127.0.0.1:{server.port}/"
     for method, code, text in (("fault", 7, "as asked"), ("bug", 1, "KeyError"), ("unsayable", 1, "cannot be said")):
         with pytest.raises(RosFault, match=text) as caught:
@@ -200,7 +200,7 @@ async def test_refusals_are_answered_counted_and_closed(
 
 
 @pytest.mark.parametrize("chunked", [False, True])
-async def test_a_call_beyond_the_limit_is_read_to_its_end_and_its_caller_told(
+async def test_oversized_call_is_read_whole_and_answered_with_a_fault(
     server: XmlRpcServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, *, chunked: bool
 ) -> None:
     """A client reads no answer before it has sent its call; rospy shows the text of a fault, and of nothing else."""
@@ -254,7 +254,7 @@ async def test_large_calls_have_a_bound_together_and_the_slow_one_gives_way(
 
 
 @pytest.mark.parametrize("begin", [b"POST / HTTP/1.1\r\n", post(CALL)[:-30], post(b"x" * 5000)[:300]])
-async def test_slow_connections_keep_nobody_out(
+async def test_slow_connections_block_no_other_client(
     server: XmlRpcServer, monkeypatch: pytest.MonkeyPatch, begin: bytes
 ) -> None:
     """Seven hundred that send a byte a second took every place: nobody was answered for 10 s."""
@@ -263,7 +263,7 @@ async def test_slow_connections_keep_nobody_out(
         slow = [await stack.enter_async_context(client(server)) for _ in range(12)]
         for c in slow:
             c.writer.write(begin)
-        while sum(one._receiving for one in server._connections) < 8:
+        while sum(one.receiving for one in server._connections) < 8:
             await asyncio.sleep(0)
         for one in server._connections:
             one.begun -= 5.0
@@ -279,14 +279,12 @@ async def test_slow_connections_keep_nobody_out(
         assert server.counters["http.evicted.slow"] + server.counters["http.evicted"] >= 5
 
 
-async def test_answers_that_nobody_reads_keep_nobody_out(
-    server: XmlRpcServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_unread_answers_block_no_other_client(server: XmlRpcServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "HTTP_CONNECTIONS_MAX", 2)
     async with client(server) as one, client(server) as other:
         for c in (one, other):
             c.writer.write(post(serialize_call("echo", ["x" * 8_000_000])))
-        while server.counters["xmlrpc.calls"] < 2 or not all(c._pending() for c in server._connections):
+        while server.counters["xmlrpc.calls"] < 2 or not all(c.pending for c in server._connections):
             await asyncio.sleep(0.001)
         assert await call(f"http://127.0.0.1:{server.port}/", "echo", 1) == [1, "127.0.0.1", [1]]
     assert server.counters["http.evicted.slow"] == 1
@@ -328,7 +326,7 @@ async def test_large_calls_and_answers_take_many_turns_of_the_loop(server: XmlRp
     assert turns > 1.2 * size / limits.XMLRPC_SLICE
 
 
-async def test_a_caller_that_hangs_up_while_its_large_call_is_read_does_no_harm(server: XmlRpcServer) -> None:
+async def test_caller_may_disconnect_while_its_large_call_is_read(server: XmlRpcServer) -> None:
     async with client(server) as c:
         c.writer.write(post(serialize_call("echo", ["x" * (16 * limits.HTTP_BODY_INLINE)])))
         await c.writer.drain()
@@ -409,7 +407,7 @@ async def test_closing_lets_an_answer_leave(echo: Echo) -> None:
     assert server.connections == 0
 
 
-async def test_a_port_in_use_is_said_with_a_remedy(echo: Echo) -> None:
+async def test_port_in_use_has_a_remedy(echo: Echo) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

@@ -52,7 +52,7 @@ def master() -> Master:
     return Master()
 
 
-def test_a_publisher_is_told_its_subscribers_and_they_of_it(master: Master) -> None:
+def test_publisher_and_subscribers_are_notified(master: Master) -> None:
     assert master.value("registerSubscriber", "/s", "/t", "*", B) == []
     assert master.effects == []
     assert master.value("registerPublisher", "/p", "/t", STRING, A) == [B]
@@ -68,7 +68,7 @@ def test_the_reply_to_a_subscriber_contains_the_publishers(master: Master) -> No
 
 
 @pytest.mark.trap(14)
-def test_a_repeated_registration_is_told_again_but_is_no_change(master: Master) -> None:
+def test_repeated_registration_notifies_but_is_no_change(master: Master) -> None:
     """Rospy connects again only because of it."""
     master("registerSubscriber", "/s", "/t", "*", B)
     master("registerPublisher", "/p", "/t", STRING, A)
@@ -108,7 +108,7 @@ def test_uris_are_kept_as_they_are(master: Master) -> None:
     ]  # fmt: skip
 
 
-def test_nodelets_with_one_uri_are_told_once(master: Master) -> None:
+def test_nodelets_with_one_uri_are_notified_once(master: Master) -> None:
     master("registerSubscriber", "/n1", "/t", "*", B)
     master("registerSubscriber", "/n2", "/t", "*", B)
     assert master.value("registerPublisher", "/p", "/t", STRING, A) == [B, B]
@@ -182,7 +182,7 @@ def test_an_evicted_node_does_not_take_its_name_back_by_a_parameter(master: Mast
     assert master.value("lookupNode", "/x", "/twin") == C
 
 
-def test_a_dead_node_is_purged_and_its_subscribers_told(master: Master) -> None:
+def test_dead_node_is_purged_and_subscribers_notified(master: Master) -> None:
     master("registerSubscriber", "/s", "/t", "*", B)
     master("registerPublisher", "/dead", "/t", STRING, A)
     master("registerService", "/dead", "/srv", RPC, A)
@@ -203,7 +203,7 @@ def test_a_dead_node_is_purged_and_its_subscribers_told(master: Master) -> None:
     assert not registrations.purge("/dead", A)
 
 
-def test_a_purged_node_that_lost_its_service_to_another_does_not_take_it_along(master: Master) -> None:
+def test_purge_leaves_a_service_of_another_node(master: Master) -> None:
     master("registerService", "/old", "/s", RPC, A)
     master("registerService", "/new", "/s", RPC + "1", B)
     assert [(change.node, change.added) for change in master.changes] == [("/old", False), ("/new", True)]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rmpa.core.errors import RemoteProtocolError
 from rmpa.ros.master.api import MasterApi
 from rmpa.ros.master.effects import GraphChange, RegistrationKind
-from rmpa.ros.master.mirror import Call, Mirror, leftovers
+from rmpa.ros.master.mirror import Call, Mirror, stale_registrations
 from rmpa.ros.master.survey import lookup_calls, read_lookups, read_survey, survey_calls
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class Pair:
     def look(self) -> list[Call]:
         """Look at the master and learn; what must be registered again is written."""
         seen = self.mirror.asked
-        again = self.mirror.learn(self.survey(), seen, {})
+        again = self.mirror.update(self.survey(), seen, {})
         self.writes += again
         return again
 
@@ -81,7 +81,7 @@ def pair() -> Pair:
     return Pair()
 
 
-def test_what_others_registered_is_learnt_with_types_and_places(pair: Pair) -> None:
+def test_registrations_of_others_come_with_types_and_uris(pair: Pair) -> None:
     pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
     pair.theirs("registerSubscriber", "/s", "/t", "*", MOVED)
     pair.theirs("registerService", "/p", "/srv", "rosrpc://h:9", THEIRS)
@@ -119,7 +119,7 @@ def test_a_node_that_restarts_between_two_looks_went_and_came(pair: Pair) -> Non
     assert pair.mirror.state() == pair.master.registrations.state()
 
 
-def test_a_type_that_comes_later_is_told_but_each_publisher_keeps_its_own(pair: Pair) -> None:
+def test_later_type_is_a_change_but_publishers_keep_theirs(pair: Pair) -> None:
     pair.theirs("registerSubscriber", "/s", "/t", "*", MOVED)
     pair.look()
     pair.theirs("registerSubscriber", "/s2", "/t", STRING, MOVED)
@@ -134,7 +134,7 @@ def test_a_type_that_comes_later_is_told_but_each_publisher_keeps_its_own(pair: 
     assert [(change.node, change.type) for change in changes] == [("/other", "std_msgs/Int8")]
 
 
-def test_a_type_that_is_said_again_otherwise_is_a_change(pair: Pair) -> None:
+def test_other_type_of_a_topic_is_a_change(pair: Pair) -> None:
     pair.theirs("registerPublisher", "/p", "/t", "*", THEIRS)
     pair.theirs("registerSubscriber", "/s", "/u", "*", MOVED)
     pair.look()
@@ -153,7 +153,7 @@ def test_a_provider_that_a_look_from_before_saw_does_not_take_ours(pair: Pair) -
     pair.theirs("unregisterService", "/n", "/srv", "rosrpc://h:9")
     pair.call("registerService", "/rmpa/b/n", "/srv", "rosrpc://h:10", OURS)
     pair.flush()
-    pair.mirror.learn(survey, seen, {})
+    pair.mirror.update(survey, seen, {})
     assert pair.mirror.state().services == {"/srv": {"/rmpa/b/n": "rosrpc://h:10"}}
     assert pair.look() == []
 
@@ -165,15 +165,15 @@ def test_ours_counts_at_once_and_a_look_from_before_takes_nothing_back(pair: Pai
     assert pair.call("registerPublisher", "/rmpa", "/t", STRING, OURS) == [THEIRS]
     assert pair.call("registerSubscriber", "/rmpa", "/t", STRING, OURS) == [OURS]
     assert pair.mirror.publishers("/t") == {"/rmpa": OURS}
-    assert pair.mirror.learn(survey, seen, {}) == []
+    assert pair.mirror.update(survey, seen, {}) == []
     assert pair.mirror.publishers("/t") == {"/rmpa": OURS}
     pair.flush()
     assert pair.look() == []
     seen, survey = pair.mirror.asked, pair.survey()
     assert pair.call("unregisterPublisher", "/rmpa", "/t", OURS) == 1
     assert pair.call("unregisterPublisher", "/rmpa", "/t", OURS) == 0
-    assert pair.mirror.strangers(survey, "/rmpa", seen) == {}
-    assert pair.mirror.learn(survey, seen, {}) == []
+    assert pair.mirror.foreign_agents(survey, "/rmpa", seen) == {}
+    assert pair.mirror.update(survey, seen, {}) == []
     assert pair.mirror.publishers("/t") == {}
 
 
@@ -194,13 +194,13 @@ def test_what_the_master_lacks_of_ours_is_registered_again(pair: Pair) -> None:
     pair.flush()
     assert pair.look() == []
     assert pair.mirror.state() == pair.master.registrations.state()
-    for method, params in pair.mirror.undo_all():
+    for method, params in pair.mirror.unregister_calls():
         pair.call(method, *params)
     pair.flush()
     assert pair.master.registrations.nodes() == {}
 
 
-def test_nodes_of_a_master_that_is_no_more_stay_until_they_die_or_come_back(pair: Pair) -> None:
+def test_nodes_of_a_former_master_stay_until_they_die_or_return(pair: Pair) -> None:
     for node, api in (("/dies", THEIRS), ("/returns", MOVED)):
         pair.theirs("registerPublisher", node, "/t", STRING, api)
     pair.look()
@@ -208,29 +208,29 @@ def test_nodes_of_a_master_that_is_no_more_stay_until_they_die_or_come_back(pair
     pair.look()
     assert pair.mirror.publishers("/t") == {"/dies": THEIRS, "/returns": MOVED}
     pair.theirs("registerPublisher", "/returns", "/other", STRING, "http://127.0.0.1:4/")
-    pair.mirror.buried("/dies", THEIRS)
+    pair.mirror.mark_dead("/dies", THEIRS)
     pair.look()
     assert pair.mirror.publishers("/t") == {}
     assert pair.mirror.state().nodes == {"/returns": "http://127.0.0.1:4/"}
 
 
-def test_a_dead_node_counts_no_more_until_it_is_somewhere_else_or_lives_after_all(pair: Pair) -> None:
+def test_dead_node_is_ignored_until_it_moves_or_revives(pair: Pair) -> None:
     pair.theirs("registerPublisher", "/p", "/t", STRING, THEIRS)
     pair.look()
     pair.changes()
-    pair.mirror.buried("/p", THEIRS)
+    pair.mirror.mark_dead("/p", THEIRS)
     pair.look()
     assert pair.changes() == {("-", "/t", "/p")}
-    pair.mirror.risen("/p")
+    pair.mirror.mark_alive("/p")
     pair.look()
     assert pair.mirror.publishers("/t") == {"/p": THEIRS}
-    pair.mirror.buried("/p", THEIRS)
+    pair.mirror.mark_dead("/p", THEIRS)
     pair.theirs("registerPublisher", "/p", "/t", STRING, MOVED)
     pair.look()
     assert (pair.mirror.publishers("/t"), dict(pair.mirror.dead)) == ({"/p": MOVED}, {})
 
 
-def test_what_the_master_did_not_hear_is_told_again(pair: Pair) -> None:
+def test_missing_registrations_are_sent_again(pair: Pair) -> None:
     pair.call("registerPublisher", "/rmpa", "/t", STRING, OURS)
     pair.call("registerPublisher", "/rmpa", "/u", STRING, OURS)
     pair.flush()
@@ -242,7 +242,7 @@ def test_what_the_master_did_not_hear_is_told_again(pair: Pair) -> None:
     assert pair.mirror.state() == pair.master.registrations.state()
 
 
-def test_a_local_provider_takes_a_service_from_us_and_it_is_not_taken_back(pair: Pair) -> None:
+def test_local_provider_replaces_our_service_for_good(pair: Pair) -> None:
     pair.call("registerService", "/rmpa/b/n", "/srv", "rosrpc://h:9", OURS)
     pair.flush()
     pair.look()
@@ -259,21 +259,21 @@ def test_a_proxy_that_left_since_the_look_began_is_no_stranger(pair: Pair) -> No
     pair.look()
     seen, survey = pair.mirror.asked, pair.survey()
     pair.call("unregisterPublisher", "/rmpa/b/n", "/t", OURS)
-    assert pair.mirror.strangers(survey, "/rmpa", seen) == {}
-    assert set(pair.mirror.strangers(survey, "/rmpa", pair.mirror.asked)) == {"/rmpa/b/n"}
+    assert pair.mirror.foreign_agents(survey, "/rmpa", seen) == {}
+    assert set(pair.mirror.foreign_agents(survey, "/rmpa", pair.mirror.asked)) == {"/rmpa/b/n"}
 
 
-def test_names_of_an_agent_that_are_not_ours_are_strangers_and_leave_nothing(pair: Pair) -> None:
+def test_foreign_agents_are_found_and_unregistered(pair: Pair) -> None:
     pair.theirs("registerPublisher", "/rmpa", "/diagnostics", STRING, THEIRS)
     pair.theirs("registerSubscriber", "/rmpa", "/t", STRING, THEIRS)
     pair.theirs("registerService", "/rmpa/b/n", "/srv", "rosrpc://h:9", MOVED)
     pair.theirs("registerPublisher", "/rmpaint", "/t", STRING, THEIRS)
     survey = pair.survey()
-    strangers = pair.mirror.strangers(survey, "/rmpa", pair.mirror.asked)
+    strangers = pair.mirror.foreign_agents(survey, "/rmpa", pair.mirror.asked)
     assert strangers == {"/rmpa": THEIRS, "/rmpa/b/n": MOVED}
-    assert pair.mirror.learn(survey, 0, strangers) == []
+    assert pair.mirror.update(survey, 0, strangers) == []
     assert set(pair.mirror.state().nodes) == {"/rmpaint"}
-    for (method, params), _ in leftovers(survey, strangers):
+    for (method, params), _ in stale_registrations(survey, strangers):
         pair.theirs(method, *map(str, params))
     assert set(pair.master.registrations.nodes()) == {"/rmpaint"}
 
@@ -312,7 +312,7 @@ def test_whatever_a_master_answers_is_a_survey_or_an_error(answer: list[XmlRpcVa
     except RemoteProtocolError:
         return
     mirror = Mirror()
-    mirror.learn(survey, 0, mirror.strangers(survey, "/rmpa", 0))
+    mirror.update(survey, 0, mirror.foreign_agents(survey, "/rmpa", 0))
     assert set(mirror.state().nodes) <= set(survey.uris)
 
 
@@ -350,8 +350,8 @@ def test_whatever_happened_the_next_look_shows_what_the_master_has(steps: list[t
     pair.flush()
     pair.look()
     pair.flush()
-    strangers = pair.mirror.strangers(pair.survey(), "/rmpa", pair.mirror.asked)
-    for (method, params), _ in leftovers(pair.survey(), strangers):
+    strangers = pair.mirror.foreign_agents(pair.survey(), "/rmpa", pair.mirror.asked)
+    for (method, params), _ in stale_registrations(pair.survey(), strangers):
         pair.theirs(method, *map(str, params))
     assert pair.look() == []
     mirror, master = pair.mirror.state(), pair.master.registrations.state()

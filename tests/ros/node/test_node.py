@@ -66,7 +66,7 @@ async def test_messages_go_from_one_node_to_another(core: RosCore) -> None:
     assert "/chatter" not in state.subscribers
 
 
-async def test_any_type_is_learnt_from_its_publisher_and_iterated(core: RosCore) -> None:
+async def test_any_type_comes_from_its_publisher(core: RosCore) -> None:
     kind = MessageType.learn("my_msgs/Pair", "int32 a\nint32 b\n")
     async with node(core, "talker") as talker, node(core, "echo", anonymous=True) as echo:
         subscriber = await echo.subscribe("/pair")
@@ -150,7 +150,7 @@ async def test_a_bad_message_is_one_error_and_the_next_is_read(
     assert caplog.text.count("bytes are not a std_msgs/String") == 4
 
 
-async def test_another_md5_sum_is_told_to_both_sides(core: RosCore, caplog: pytest.LogCaptureFixture) -> None:
+async def test_another_md5_sum_is_reported_at_both_sides(core: RosCore, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING)
     async with node(core, "talker") as talker, node(core, "listener") as listener:
         publisher = await talker.advertise("/t", "std_msgs/String")
@@ -184,7 +184,7 @@ async def test_parameters(core: RosCore) -> None:
         assert not await one.has_param("~gains")
 
 
-async def test_nodes_survive_a_master_that_is_started_anew(core: RosCore) -> None:
+async def test_nodes_survive_a_restarted_master(core: RosCore) -> None:
     async with node(core, "talker") as talker, node(core, "listener") as listener:
         publisher = await talker.advertise("/t", "std_msgs/String")
         got: list[Received] = []
@@ -390,7 +390,7 @@ async def test_the_core_and_its_loggers(core: RosCore) -> None:
         raw.close()
 
 
-async def test_a_core_that_was_started_anew_has_the_services_again(core: RosCore) -> None:
+async def test_restarted_core_gets_the_services_again(core: RosCore) -> None:
     async with node(core, "server") as server:
         await server.advertise_service("/empty", "std_srvs/Empty", lambda _request: None)
         core.call("unregisterService", "/server", "/empty", server.slave.service_uri)

@@ -87,7 +87,7 @@ async def test_a_subscriber_gets_the_header_and_then_every_message(known: Owner)
     link.close()
 
 
-async def test_demand_is_told_once_each_way(known: Owner) -> None:
+async def test_demand_is_reported_once_each_way(known: Owner) -> None:
     one, two = await known.subscriber(), await known.subscriber()
     one.close()
     await until(lambda: known.publication.subscribers == 1)
@@ -143,7 +143,7 @@ async def test_any_md5_sum_gets_the_real_one(known: Owner) -> None:
 
 
 @pytest.mark.trap(10)
-async def test_the_latched_message_goes_to_each_new_connection_once_and_first(latched: Owner) -> None:
+async def test_latched_message_is_first_on_each_connection(latched: Owner) -> None:
     early = await latched.subscriber()
     latched.publication.publish_framed(memoryview(bytearray(frame_message(b"old"))))
     latched.publication.publish_framed(memoryview(bytearray(frame_message(b"kept"))))
@@ -167,7 +167,7 @@ async def test_the_latched_message_can_be_forgotten(latched: Owner) -> None:
     link.close()
 
 
-async def test_without_latching_nothing_is_kept(known: Owner) -> None:
+async def test_without_latching_no_message_is_kept(known: Owner) -> None:
     known.publication.publish_framed(frame_message(b"old"))
     link = await known.subscriber()
     await link.header()
@@ -176,7 +176,7 @@ async def test_without_latching_nothing_is_kept(known: Owner) -> None:
     link.close()
 
 
-async def test_another_definition_closes_those_who_were_promised_the_old_one(latched: Owner) -> None:
+async def test_another_definition_disconnects_subscribers(latched: Owner) -> None:
     link = await latched.subscriber(md5sum="*")
     latched.publication.publish_framed(frame_message(b"old"))
     latched.publication.describe(LATCHED)
@@ -241,7 +241,7 @@ async def test_a_reset_is_gone_too(known: Owner) -> None:
 
 
 @pytest.mark.trap(19)
-async def test_a_slow_subscriber_loses_the_oldest_and_delays_nobody() -> None:
+async def test_slow_subscriber_loses_the_oldest_and_delays_no_other() -> None:
     owner = Owner(STRING, queue_messages=10, queue_bytes=1 << 30)
     slow = await owner.subscriber(callerid="/slow", buffer=4096)
     fast = await owner.subscriber(callerid="/fast")
@@ -281,7 +281,7 @@ async def test_a_slow_subscriber_holds_no_more_than_its_bytes() -> None:
 
 
 @pytest.mark.trap(16)
-async def test_withdrawn_all_connections_are_closed_and_nothing_is_said(known: Owner) -> None:
+async def test_withdrawal_closes_all_connections_silently(known: Owner) -> None:
     link = await known.subscriber()
     await link.header()
     known.publication.withdraw()
@@ -367,7 +367,7 @@ async def test_parts_go_on_as_they_come_and_make_the_message(known: Owner) -> No
     link.close()
 
 
-async def test_what_nobody_hears_is_counted_all_the_same(known: Owner) -> None:
+async def test_messages_without_subscribers_are_counted(known: Owner) -> None:
     begin(known.publication)
     extend(known.publication, *PARTS)
     assert (known.publication.messages, known.publication.bytes) == (1, 4 + len(WHOLE))
@@ -404,7 +404,7 @@ async def test_a_slow_subscriber_among_fast_ones_gets_whole_messages_or_none() -
     owner.close()
 
 
-async def test_a_slow_subscriber_holds_no_more_than_its_bytes_of_parts_either() -> None:
+async def test_slow_subscriber_is_bounded_for_parts_too() -> None:
     owner = Owner(STRING, queue_messages=1000, queue_bytes=1_000_000)
     slow = await owner.subscriber(buffer=4096)
     for _ in range(20):
@@ -430,7 +430,7 @@ async def test_who_comes_in_the_middle_begins_with_the_next_one(known: Owner) ->
 
 
 @pytest.mark.trap(10)
-async def test_who_comes_in_the_middle_of_a_latched_one_gets_it_whole_behind_the_one_before(latched: Owner) -> None:
+async def test_late_subscriber_gets_latched_message_whole(latched: Owner) -> None:
     """A map is published once: there is no next one to begin with."""
     early = await latched.subscriber(callerid="/early")
     latched.publication.publish_framed(frame_message(b"old map"))
@@ -446,7 +446,7 @@ async def test_who_comes_in_the_middle_of_a_latched_one_gets_it_whole_behind_the
         link.close()
 
 
-async def test_an_abort_hangs_up_on_those_who_have_the_beginning_and_on_nobody_else() -> None:
+async def test_abort_disconnects_only_subscribers_with_the_beginning() -> None:
     owner = Owner(STRING, queue_messages=100)
     half = await owner.subscriber(callerid="/half")
     stuck = await owner.subscriber(callerid="/stuck", buffer=4096)
@@ -477,7 +477,7 @@ async def test_an_abort_hangs_up_on_those_who_have_the_beginning_and_on_nobody_e
     owner.close()
 
 
-async def test_an_abort_that_leaves_nobody_ends_the_demand(known: Owner) -> None:
+async def test_abort_of_the_last_subscriber_ends_the_demand(known: Owner) -> None:
     link = await known.subscriber()
     begin(known.publication)
     assert known.publication.abort() == 1
@@ -502,7 +502,7 @@ async def test_what_was_aborted_is_not_latched(latched: Owner) -> None:
     link.close()
 
 
-async def test_a_subscriber_that_leaves_in_the_middle_does_not_disturb_the_others(known: Owner) -> None:
+async def test_subscriber_leaving_midway_disturbs_no_other(known: Owner) -> None:
     leaves, stays = await known.subscriber(callerid="/leaves"), await known.subscriber(callerid="/stays")
     begin(known.publication)
     extend(known.publication, *PARTS[:2])
@@ -524,7 +524,7 @@ async def test_withdrawn_in_the_middle_nothing_is_left(latched: Owner) -> None:
     link.close()
 
 
-async def test_as_many_are_kept_as_was_said_and_each_new_subscriber_gets_them_in_order(latched: Owner) -> None:
+async def test_new_subscriber_gets_latched_depth_in_order(latched: Owner) -> None:
     latched.publication.publish_framed(frame_message(b"0"))
     latched.publication.keep(3)
     for n in range(1, 3):
@@ -550,7 +550,7 @@ def test_no_contract_keeps_more_than_the_limit() -> None:
 
 
 @pytest.mark.trap(19)
-async def test_a_contracts_depth_bounds_what_waits_for_each_subscriber_old_and_new() -> None:
+async def test_contract_depth_bounds_each_subscribers_queue() -> None:
     owner = Owner(STRING)
     early = await owner.subscriber(callerid="/early", buffer=4096)
     owner.publication.bound(3)

@@ -60,7 +60,7 @@ async def server() -> AsyncIterator[RawServer]:
         yield made
 
 
-async def test_the_servers_description_is_learnt(server: RawServer) -> None:
+async def test_servers_description_is_read(server: RawServer) -> None:
     connection, link = await server.serve()
     assert connection.description.type == ADD.type
     assert connection.description.md5sum == MD5
@@ -110,7 +110,7 @@ async def test_a_server_that_dies_in_the_middle_of_a_call(server: RawServer) -> 
     assert connection.closed
 
 
-async def test_a_server_that_left_before_is_told_apart(server: RawServer) -> None:
+async def test_server_that_closed_before_the_call_is_distinguished(server: RawServer) -> None:
     told: list[bool] = []
     connection, link = await server.serve()
     connection._on_closed = lambda: told.append(True)
@@ -172,7 +172,7 @@ async def test_a_server_that_breaks_the_protocol(server: RawServer, sent: bytes,
     link.close()
 
 
-async def test_bytes_that_nobody_asked_for(server: RawServer) -> None:
+async def test_unrequested_bytes_break_the_protocol(server: RawServer) -> None:
     connection, link = await server.serve()
     await link.send(b"\x01\x00\x00\x00\x00")
     await until(lambda: connection.closed)

@@ -142,7 +142,7 @@ async def test_a_call_under_way_when_its_node_closes_is_not_left_open(listener: 
     link.close()
 
 
-async def test_without_the_right_to_bind_the_device_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_missing_right_to_bind_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     class Forbidden(socket.socket):
         def setsockopt(self, level: int, option: int, value: int | bytes) -> None:  # type: ignore[override]
             if option == socket.SO_BINDTODEVICE:
@@ -154,7 +154,7 @@ async def test_without_the_right_to_bind_the_device_it_says_so(monkeypatch: pyte
         await SharedListener(SALT).start()
 
 
-async def test_without_the_device_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_missing_device_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shared_listener, "_DEVICE", b"no_such_device")
     with pytest.raises(StartError, match="No such device"):
         await SharedListener(SALT).start()

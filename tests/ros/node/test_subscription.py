@@ -249,7 +249,7 @@ async def test_a_message_beyond_the_limit_takes_no_memory(
 
 
 @pytest.mark.trap(17)
-async def test_a_publisher_that_goes_in_the_middle_of_such_a_message_is_found_again(
+async def test_publisher_lost_within_an_oversized_message_is_found_again(
     publisher: RawPublisher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "TCPROS_MESSAGE_MAX", 1000)
@@ -335,7 +335,7 @@ async def test_a_subscription_follows_the_list_of_publishers() -> None:
 
 
 @pytest.mark.trap(15)
-async def test_a_publisher_that_refused_is_asked_again_when_it_is_named_again() -> None:
+async def test_refusing_publisher_is_tried_again_when_listed_again() -> None:
     followed = Followed()
     async with RawPublisher() as one:
         followed.subscription.update([one.uri])
@@ -353,7 +353,7 @@ async def test_a_publisher_that_refused_is_asked_again_when_it_is_named_again() 
 
 
 @pytest.mark.trap(18)
-async def test_half_a_message_holds_nobody_else_up_and_the_kernel_watches(publisher: RawPublisher) -> None:
+async def test_half_a_message_holds_up_no_other(publisher: RawPublisher) -> None:
     async with RawPublisher() as other:
         stuck, fine = Said(publisher.uri), Said(other.uri)
         half, _ = await publisher.serve()
@@ -482,7 +482,7 @@ async def test_large_messages_in_one_read_with_small_ones_around_them(publisher:
 
 
 @pytest.mark.trap(14, 17)
-async def test_a_publisher_lost_in_the_middle_of_parts_is_an_abort_and_found_again(publisher: RawPublisher) -> None:
+async def test_publisher_lost_within_parts_aborts_and_reconnects(publisher: RawPublisher) -> None:
     said = InParts(publisher.uri)
     link, _ = await publisher.serve()
     await link.send(frame_message(LARGE) + frame_message(LARGE)[:5000])

@@ -110,7 +110,7 @@ async def test_leaving_before_the_header_is_no_error(served: Served, caplog: pyt
 
 
 @pytest.mark.trap(6, 11, 18)
-async def test_one_that_says_nothing_blocks_nobody_and_is_closed(
+async def test_silent_connection_blocks_no_other_and_is_closed(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "TCPROS_HANDSHAKE_TIMEOUT", 0.2)

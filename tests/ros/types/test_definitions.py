@@ -118,6 +118,6 @@ def test_any_text_is_a_definition_or_an_error(text: str) -> None:
     assert len(md5sum("p/T", known)) == 32
 
 
-def test_an_unknown_type_says_what_to_do() -> None:
+def test_unknown_type_has_a_remedy() -> None:
     with pytest.raises(DefinitionError, match="its definition is learnt from a publisher"):
         known_specifications("my_msgs/Unknown")

@@ -168,11 +168,11 @@ def test_a_workspace_goes_before_what_comes_with_us(tmp_path: Path) -> None:
     assert find_message_type("std_msgs/String", STRING, {"ROS_PACKAGE_PATH": str(tmp_path / "src")}).md5sum == STRING
 
 
-def test_an_unknown_type_says_where_was_looked(tmp_path: Path) -> None:
+def test_unknown_type_names_the_searched_places(tmp_path: Path) -> None:
     environ = {"ROS_PACKAGE_PATH": ":".join(f"/r{n}" for n in range(7)), "PYTHONPATH": str(tmp_path)}
     with pytest.raises(UnknownTypeError) as caught:
         find_message_type("my_msgs/Foo", environ=environ)
-    assert caught.value.learnable
+    assert caught.value.fetchable
     assert str(caught.value) == (
         "message type my_msgs/Foo: is not known here; looked in ROS_PACKAGE_PATH (/r0, /r1, /r2, /r3 and 3 more), "
         f"CMAKE_PREFIX_PATH (not set), PYTHONPATH ({tmp_path}), and at what comes with rmpa; source the workspace "
@@ -180,7 +180,7 @@ def test_an_unknown_type_says_where_was_looked(tmp_path: Path) -> None:
     )
     with pytest.raises(UnknownTypeError, match=r"did you mean sensor_msgs/Image\?") as caught:
         find_message_type("sensor_msgs/Imagge", environ={})
-    assert not caught.value.learnable
+    assert not caught.value.fetchable
     for name in ("../x", "String", "std_msgs/msg/String", "a/b\0", "x" * 1000):
         with pytest.raises(DefinitionError, match=r"is not a type's name; write it like std_msgs/String"):
             find_message_type(name, environ=environ)

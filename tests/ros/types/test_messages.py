@@ -26,7 +26,7 @@ def test_these_bytes() -> None:
     assert kind.to_plain(kind.deserialize(JOY_BYTES)) == JOY
 
 
-def test_a_learnt_type_reads_the_same() -> None:
+def test_received_type_reads_the_same() -> None:
     known = MessageType("sensor_msgs/Joy")
     learnt = MessageType.learn(known.name, known.definition, known.md5sum)
     assert learnt.to_plain(learnt.deserialize(JOY_BYTES)) == JOY
@@ -34,7 +34,7 @@ def test_a_learnt_type_reads_the_same() -> None:
     assert MessageType.learn(known.name, known.definition) is learnt
 
 
-def test_a_learnt_type_with_all_there_is() -> None:
+def test_received_type_with_all_features() -> None:
     definition = (
         "int32 lower=1\nstring TEXT=a'\"\\ # no comment\ntime[] times\nduration d\nbyte b\nchar c\nbool[2] flags\n"
         f"string[] texts\nInner[] inner\nuint8[] data\nint64 class\nint8 self\n{SEPARATOR}\nMSG: my_msgs/Inner\n"

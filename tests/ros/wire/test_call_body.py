@@ -21,7 +21,7 @@ from rmpa.ros.wire.xmlrpc import serialize_call
         ("registerPublisher", ["/n", "/t", "std_msgs/String", "http://x:1/"], "registerPublisher"),
     ],
 )
-def test_the_beginning_says_what_it_was(method: str, params: list[object], name: str) -> None:
+def test_call_is_named_by_its_beginning(method: str, params: list[object], name: str) -> None:
     assert call_name(serialize_call(method, params)[: 4 * KIB]) == name  # type: ignore[arg-type]
 
 
@@ -32,7 +32,7 @@ def test_roscpps_untyped_strings_are_read_too() -> None:
 
 
 @pytest.mark.parametrize("begin", [b"", b"<methodName>", b"\xff" * 100, b"<methodName>a b</methodName>"])
-def test_what_tells_nothing_is_a_call(begin: bytes) -> None:
+def test_unclear_beginning_is_a_call(begin: bytes) -> None:
     assert call_name(begin) == "a call"
 
 

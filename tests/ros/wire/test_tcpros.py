@@ -156,7 +156,7 @@ def test_a_message_beyond_the_limit_is_refused_behind_those_before_it() -> None:
 
 
 @pytest.mark.parametrize("size", [limits.TCPROS_LENGTH_MAX + 1, (1 << 32) - 1])
-def test_what_cannot_be_a_length_is_told_from_a_message_that_is_too_long(size: int) -> None:
+def test_impossible_length_differs_from_too_long_message(size: int) -> None:
     with pytest.raises(MalformedStream, match=f"{size} bytes cannot be.*corrupt"):
         split_messages(memoryview(struct.pack("<I", size)))
     with pytest.raises(LimitExceeded):

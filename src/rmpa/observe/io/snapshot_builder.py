@@ -159,7 +159,7 @@ class SnapshotBuilder:
             proxies=proxies,
             proxy_sockets=bridge.proxy_nodes.sockets(proxies),
             proxy_listening=bridge.proxy_nodes.listening,
-            core_memory=core.remembered(),
+            core_memory=core.restored(),
         )
 
     def _cpu_share(self) -> float | None:

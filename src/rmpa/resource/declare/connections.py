@@ -43,7 +43,7 @@ class TopicType:
         try:
             self.known = find_message_type(name)
         except UnknownTypeError as error:
-            if not error.learnable:
+            if not error.fetchable:
                 raise
             self.problem = error
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from rmpa.core.errors import UnreachableError
 from rmpa.ros import limits
-from rmpa.ros.node.learn_type import learn_type
+from rmpa.ros.node.fetch_type import fetch_type
 from rmpa.ros.wire.tcpros import printable
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ async def learn_outputs(resource: Resource, master_uri: str, caller_id: str) -> 
 
 async def _learn(output: Output, master_uri: str, caller_id: str) -> bool:
     try:
-        learnt = await learn_type(master_uri, caller_id, output.kind.name)
+        learnt = await fetch_type(master_uri, caller_id, output.kind.name)
     except UnreachableError as error:
         _log.debug("! %s: %s", caller_id, error)  # the start that follows reports it
         return False

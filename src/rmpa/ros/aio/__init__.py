@@ -1,1 +1,1 @@
-"""Former place of ``rmpa.ros.node``; only ``rmpa.ros.aio.node``, which the documentation named, is still found."""
+"""The former place of ``rmpa.ros.Node``."""

@@ -1,12 +1,11 @@
-"""Former place of ``Node``, now ``rmpa.resource.Node``."""
+"""The former place of ``rmpa.ros.Node``, for programs that import it from here."""
 
 from __future__ import annotations
 
 import warnings
 
-from rmpa.ros.node.node import Node
-from rmpa.ros.node.topics import Received
+from rmpa.ros.node.node import Node, Publisher, Received, Service, ServiceClient, Subscriber
 
-__all__ = ["Node", "Received"]
+__all__ = ["Node", "Publisher", "Received", "Service", "ServiceClient", "Subscriber"]
 
-warnings.warn("rmpa.ros.aio.node is deprecated: import Node from rmpa.resource", DeprecationWarning, stacklevel=2)
+warnings.warn("rmpa.ros.aio.node is deprecated: use `from rmpa.ros import Node`", DeprecationWarning, stacklevel=2)

@@ -1,6 +1,6 @@
 """The ROS core of this machine: master, parameter server and /rosout, for nodes as they are.
 
-Every call is answered at once, in the loop: what follows from it (notifications) leaves later, in tasks of its own.
+Every call is answered at once, in the event loop; the notifications that follow from it are sent by other tasks.
 """
 
 from __future__ import annotations
@@ -12,9 +12,11 @@ import uuid
 from typing import TYPE_CHECKING, Final
 
 from rmpa.core.counters import Counters
+from rmpa.ros.core.api import Core
+from rmpa.ros.core.listeners import GraphListeners
 from rmpa.ros.core.liveness import Liveness
-from rmpa.ros.core.memory import CoreMemory
 from rmpa.ros.core.notifier import Notifier
+from rmpa.ros.core.persistence import CorePersistence
 from rmpa.ros.core.rosout import NODE, Rosout
 from rmpa.ros.http.server import XmlRpcServer
 from rmpa.ros.master.api import MasterApi
@@ -37,24 +39,24 @@ DEFAULT_PORT: Final = 11311
 CALLER_ID: Final = "/rmpa_core"
 _LOOPBACK: Final = "127.0.0.1"
 ROS_DISTRO: Final = "noetic\n"
-"""With the line break that roscore's ``rosversion -d`` leaves in it; programs strip it."""
+"""With the line break that roscore's ``rosversion -d`` has; programs strip it."""
 ROS_VERSION: Final = "1.15.15\n"
-"""Of ros_comm, whose master this one stands in for."""
+"""The version of ros_comm whose master this core replaces."""
 
 
-class RosCore:
+class RosCore(Core):
     """A drop-in for ``roscore``.
 
     Args:
-        host: The address to listen at; loopback unless the whole network shall see this core.
+        host: The address to listen at; loopback unless the network shall reach this core.
         port: 0 lets the system choose.
         advertised_host: What ``uri`` says; default: ``host``, or this machine's name where ``host`` is 0.0.0.0.
         rosout: Whether to aggregate ``/rosout``.
         counters: Where refusals, calls and notifications are counted.
         on_shutdown: ``(reason)``: a client called ``shutdown``; the owner closes the core then.
-        state: The file that keeps registrations and parameters over the core's end; ``None`` keeps nothing.
-        fresh: Begin empty, whatever the file says.
-        temporary: Whether a node of this name is not to be kept: who makes it makes it anew.
+        state: The file that stores registrations and parameters for the next run; ``None`` stores nothing.
+        fresh: Begin empty, whatever the file holds.
+        temporary: Whether a node of this name is not stored, because its owner registers it anew.
     """
 
     def __init__(
@@ -74,18 +76,18 @@ class RosCore:
         self._host = host
         self._advertised = advertised_host or (os.uname().nodename if host in {"", "0.0.0.0"} else host)  # noqa: S104
         self._on_shutdown = on_shutdown
-        self._api = MasterApi("", os.getpid(), self._asked_to_end, breathing=yielding_to_data)
+        self._api = MasterApi("", os.getpid(), self._shutdown_requested, yielder=yielding_to_data)
         self._server = XmlRpcServer(self._answer, host, port, counters=self.counters, name="ROS core", use=Use.CORE)
         self._notifier: Notifier | None = None
         self._liveness: Liveness | None = None
         self._with_rosout = rosout
         self._rosout: Rosout | None = None
-        self._callbacks: list[Callable[[GraphChange], None]] = []
-        self.memory: CoreMemory | None = None
-        """What it keeps over its end, if it keeps anything."""
+        self._listeners = GraphListeners()
+        self.persistence: CorePersistence | None = None
+        """Stores the state for the next run, if ``state`` is given."""
         if state is not None:
             own = {NODE, CALLER_ID}
-            self.memory = CoreMemory(
+            self.persistence = CorePersistence(
                 state,
                 self._api,
                 fresh=fresh,
@@ -97,7 +99,7 @@ class RosCore:
     # --- its life ---------------------------------------------------------------------------------------------
 
     async def start(self) -> None:
-        """Take up what was kept; listen; set ``/run_id``, ``/rosdistro`` and ``/rosversion``; start ``/rosout``.
+        """Restore the stored state; listen; set ``/run_id``, ``/rosdistro`` and ``/rosversion``; start ``/rosout``.
 
         Raises:
             StartError: The port is taken, or the address cannot be used.
@@ -107,8 +109,8 @@ class RosCore:
             nodes_at=registrations.nodes_at, on_unreachable=self._unreachable, counters=self.counters
         )
         self._liveness = Liveness(nodes=registrations.nodes, on_dead=self._dead)
-        if self.memory is not None:
-            await self.memory.open()
+        if self.persistence is not None:
+            await self.persistence.open()
         try:
             await self._server.start()
         except BaseException:
@@ -121,8 +123,8 @@ class RosCore:
         self.call("setParam", CALLER_ID, "/rosversion", ROS_VERSION)
         self.call("setParam", CALLER_ID, "/rosdistro", ROS_DISTRO)
         self._liveness.start()
-        if self.memory is not None:
-            self.memory.start()
+        if self.persistence is not None:
+            self.persistence.start()
         if self._with_rosout:
             self._rosout = Rosout(self._host, self._advertised, self.uri, self.call, registrations, self.counters)
             self.on_change(self._rosout.graph_changed)
@@ -134,23 +136,22 @@ class RosCore:
                 raise
 
     async def close(self) -> None:
-        """End: /rosout first, then what calls the nodes, then the server; what was last is kept."""
+        """End: /rosout first, then what calls the nodes, then the server; then write the last state."""
         rosout, self._rosout = self._rosout, None
         if rosout is not None:
             await rosout.close()
-        if self.memory is not None:
-            await self.memory.ask_no_more()
+        if self.persistence is not None:
+            await self.persistence.stop_verification()
         if self._notifier is not None:
             await self._notifier.close()
         if self._liveness is not None:
             await self._liveness.close()
         await self._server.close()
-        if self.memory is not None:
-            await self.memory.close()
+        if self.persistence is not None:
+            await self.persistence.close()
 
     @property
     def uri(self) -> str:
-        """``http://127.0.0.1:11311/``; empty before ``start()``."""
         return self._api.uri
 
     @property
@@ -160,12 +161,10 @@ class RosCore:
 
     @property
     def node_host(self) -> str:
-        """Loopback: only nodes of this machine may reach the agent's."""
         return _LOOPBACK
 
     @property
     def node_address(self) -> str:
-        """Likewise."""
         return _LOOPBACK
 
     # --- asking it --------------------------------------------------------------------------------------------
@@ -173,7 +172,7 @@ class RosCore:
     def call(self, method: str, *params: XmlRpcValue) -> RosReply:
         """Call a method of the Master or Parameter Server API, as over XML-RPC but at once.
 
-        It breathes before it does: who registers hundreds of topics in a row gives way to data between them.
+        Pending data goes first, so that hundreds of registrations in a row do not hold it up.
 
         Returns:
             ``(code, status, value)``; the value must not be changed, nor may ``params`` be afterwards.
@@ -187,46 +186,34 @@ class RosCore:
         return reply
 
     async def ask(self, method: str, *params: XmlRpcValue) -> RosReply:
-        """The same as ``call``, for who can wait: a real roscore's answer takes its time."""
         return self.call(method, *params)
 
     def state(self) -> GraphState:
-        """All registrations at this moment; the same object until one changes."""
         return self._api.state()
 
     def publishers(self, topic: str) -> Mapping[str, str]:
-        """Who publishes a topic now, and their slave APIs; never changed afterwards."""
         return self._api.registrations.at(RegistrationKind.PUBLISHER, topic)
 
     def type_of(self, topic: str) -> str:
-        """The type that was last said for a topic; ``*`` for none."""
         return self._api.registrations.types().get(topic, ANY_TYPE)
 
     def on_change(self, callback: Callable[[GraphChange], None]) -> None:
-        """Call ``callback`` in the loop after each change of a registration, before the reply to it leaves.
-
-        A callback may call the core; an exception of one is logged and does not reach the node.
-        """
-        self._callbacks.append(callback)
+        self._listeners.add(callback)
 
     def notes(self) -> tuple[str, ...]:
-        """What is wrong with what it keeps: it is there itself as long as the agent is."""
-        return self.memory.notes() if self.memory is not None else ()
+        """Problems with storing its state; the core itself runs as long as the agent."""
+        return self.persistence.notes() if self.persistence is not None else ()
 
-    def remembered(self) -> str:
-        """Its file, and what became of the nodes and parameters in it."""
-        return self.memory.told() if self.memory is not None else ""
+    def restored(self) -> str:
+        return self.persistence.summary() if self.persistence is not None else ""
 
-    def awaited(self, topic: str) -> Mapping[str, str]:
-        """Nodes that published a topic in the run before and have not answered since, and their slave APIs."""
-        return self._api.registrations.awaited.publishers_of(topic)
+    def unverified(self, topic: str) -> Mapping[str, str]:
+        return self._api.registrations.unverified.publishers_of(topic)
 
     def unreachable(self) -> Mapping[str, Unreachable]:
-        """The registered nodes that nothing can connect to; not to be changed."""
         return self._liveness.unreachable if self._liveness is not None else {}
 
     def suspect(self, node: str) -> None:
-        """Say that this node may be dead: it is checked now, and purged if it is."""
         if self._liveness is not None:
             self._liveness.suspect(node)
 
@@ -240,20 +227,13 @@ class RosCore:
 
     def _carry_out(self) -> None:
         effects, changes = self._api.take()
-        if self.memory is not None:
-            self.memory.look_soon()
-        # Queued before anybody hears of the change: a callback that registers something must not be overtaken by
-        # the list as it was before.
+        if self.persistence is not None:
+            self.persistence.schedule_write()
+        # Queued before the callbacks run: the notification of what a callback registers must come later than these.
         if self._notifier is not None:
             for effect in effects:
                 self._notifier.add(effect)
-        for change in changes:
-            _log.info("= %s %s %s of %s", "+" if change.added else "-", change.kind.value, change.name, change.node)
-            for callback in self._callbacks:
-                try:
-                    callback(change)
-                except Exception:  # noqa: BLE001 - a stranger's code within a call
-                    _log.exception("! a listener failed at %s", change)
+        self._listeners.notify(changes)
 
     def _unreachable(self, api: str) -> None:
         for node in self._api.registrations.nodes_at(api):
@@ -264,7 +244,7 @@ class RosCore:
             self.counters.add("node.dead")
             self._carry_out()
 
-    def _asked_to_end(self, reason: str) -> None:
+    def _shutdown_requested(self, reason: str) -> None:
         if self._on_shutdown is not None:
-            # Behind the reply, which the caller waits for.
+            # Behind the reply, for which the caller waits.
             asyncio.get_running_loop().call_soon(self._on_shutdown, reason)

@@ -1,8 +1,8 @@
-"""A real roscore (or any other master) in place of the embedded core: looked at, written to, never in the way.
+"""A real roscore (or any other master) in place of the embedded core.
 
-A ROS master tells nobody what changes in its graph, so this one asks it, a few times a second and in one call. What
-the agent registers leaves in order, many at once. One task does both in turn: what it sees is never older than what
-it wrote. A master that does not answer stops nothing: what is known of the graph stays until it answers again.
+A ROS master does not notify of changes in its graph, so it is polled, a few times a second and in one call. The
+agent's registrations are sent in order, many in one call. One task does both in turn, so a poll is never older than
+the writes before it. While the master does not answer, the last known graph stays.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core.counters import Counters
 from rmpa.core.errors import LocalProtocolError, RemoteProtocolError, RmpaError, StartError, UnreachableError
 from rmpa.ros import limits
+from rmpa.ros.core.api import Core
 from rmpa.ros.core.identify import name_at
+from rmpa.ros.core.listeners import GraphListeners
 from rmpa.ros.core.liveness import Liveness, refuses
 from rmpa.ros.http.client import call, call_api, exchange, read_response
-from rmpa.ros.master.mirror import REGISTRATIONS, Mirror, leftovers
+from rmpa.ros.master.mirror import REGISTRATIONS, Mirror, stale_registrations
 from rmpa.ros.master.survey import Survey, lookup_calls, one_call, read_lookups, read_survey, survey_calls
 from rmpa.ros.wire.xmlrpc import RosFault, RosReply, XmlRpcValue, brief, call_pieces
 from rmpa.runtime.descriptors import Use
@@ -41,33 +43,33 @@ _LOOPBACK: Final = "127.0.0.1"
 
 @dataclass(slots=True, eq=False)
 class _Write:
-    """One call that waits to leave.
+    """One call in the queue to the master.
 
     Args:
-        method: Its method.
-        params: What it is called with.
-        done: For who waits for its answer.
-        seen: Whether it follows from a look at the master.
+        method: A method of the Master API.
+        params: Its parameters, the caller id included.
+        done: Gets the answer, where a caller waits for it.
+        from_poll: Whether the call follows from a poll, which has shown the state of the master.
     """
 
     method: str
     params: tuple[XmlRpcValue, ...]
     done: asyncio.Future[RosReply] | None = None
-    seen: bool = False
+    from_poll: bool = False
 
     def fail(self, error: Exception) -> None:
         if self.done is not None and not self.done.done():
             self.done.set_exception(error)
 
 
-class ExternalCore:
+class ExternalCore(Core):
     """The graph of a master that is another program.
 
     Args:
-        uri: The master's.
-        own_node: The agent's own node: it and the nodes below its name are an agent's, ours or another's.
-        node_host: The address that our nodes listen at.
-        node_address: What the nodes of this graph are told to connect to.
+        uri: The master's URI.
+        own_node: The agent's own node. It and the nodes below its name belong to an agent: this one or another.
+        node_host: The address at which the agent's nodes listen.
+        node_address: The address of the agent's nodes that is registered.
         counters: ``master.looks``, ``master.writes``, ``master.lost``, ``master.leftovers``, ``node.dead``.
     """
 
@@ -85,9 +87,9 @@ class ExternalCore:
         self._own_node = own_node
         self._node_host = node_host
         self._node_address = node_address
-        self._mirror = Mirror(breathing=yielding_to_data)
+        self._mirror = Mirror(yielder=yielding_to_data)
         self._liveness = Liveness(nodes=self._mirror.others, on_dead=self._dead)
-        self._callbacks: list[Callable[[GraphChange], None]] = []
+        self._listeners = GraphListeners()
         self._writes: deque[_Write] = deque()
         self._written = asyncio.Event()
         self._written.set()
@@ -96,8 +98,8 @@ class ExternalCore:
         self._revival: asyncio.Task[None] | None = None
         self._ending = False
         self._problem = "it was not asked yet"
-        self._rival = ""
-        # What the next look asks about, as bytes: mostly it is the same again, and so is the answer.
+        self._other_agent = ""
+        # What the next poll looks up, and the request as bytes: mostly both the request and the answer are unchanged.
         self._nodes: tuple[str, ...] = ()
         self._services: tuple[str, ...] = ()
         self._request = b""
@@ -107,18 +109,18 @@ class ExternalCore:
     # --- its life ---------------------------------------------------------------------------------------------
 
     async def start(self) -> None:
-        """Look at the master for the first time; one that is not there yet is waited for, behind this.
+        """Poll the master for the first time; one that does not answer is polled again in the background.
 
         Raises:
-            StartError: Another agent is at work there.
+            StartError: Another agent is connected to it.
         """
         self._loop = asyncio.get_running_loop()
-        self._next_look = self._loop.time()
-        await self._look()
-        if self._rival:
+        self._next_poll = self._loop.time()
+        await self._poll()
+        if self._other_agent:
             raise StartError(
                 f"core {self._uri}",
-                f"another agent ({self._rival}) joins this roscore's graph with the others already",
+                f"another agent ({self._other_agent}) joins this roscore's graph with the others already",
                 "end that one, or give this one a roscore of its own",
             )
         await self._flush()
@@ -126,10 +128,10 @@ class ExternalCore:
         self._liveness.start()
 
     async def close(self) -> None:
-        """Take all that is ours out of the master's graph, if it answers; it itself goes on."""
+        """Unregister everything of the agent's at the master, if it answers."""
         self._ending = True
-        if self._usable:
-            for method, params in self._mirror.undo_all():
+        if self._writable:
+            for method, params in self._mirror.unregister_calls():
                 self.call(method, *params)
         self._wake.set()
         if self._task is not None:
@@ -147,23 +149,20 @@ class ExternalCore:
 
     @property
     def uri(self) -> str:
-        """The master's, as the user wrote it."""
         return self._uri
 
     @property
     def node_host(self) -> str:
-        """The address that the agent's nodes listen at."""
         return self._node_host
 
     @property
     def node_address(self) -> str:
-        """What the nodes of this graph are told to connect to."""
         return self._node_address
 
     def notes(self) -> tuple[str, ...]:
-        """That the master does not answer, or that another agent is there."""
-        if self._rival:
-            where = f"another agent ({self._rival}) is at work at the roscore {self._uri}"
+        """Whether the master does not answer, or another agent is connected to it."""
+        if self._other_agent:
+            where = f"another agent ({self._other_agent}) is at work at the roscore {self._uri}"
             return (f"{where}: this one stands by until that one ends",)
         if self._problem:
             where = f"the roscore at {self._uri} does not answer ({self._problem})"
@@ -173,32 +172,31 @@ class ExternalCore:
     # --- asking it --------------------------------------------------------------------------------------------
 
     def call(self, method: str, *params: XmlRpcValue) -> RosReply:
-        """Register, unregister, or write a parameter; it leaves a moment later, behind what was called before."""
+        """Queue a registration or a write of a parameter, behind all previous calls."""
         yield_to_data()
         if method in REGISTRATIONS:
             reply = self._mirror.apply(method, params)
-            self._tell()
+            self._report_changes()
             if reply.code == 1:
                 self._write(_Write(method, params))
             return reply
         if method not in _PARAM_WRITES:
             return RosReply(-1, f"{method} is for the master itself to answer: it has to be asked", 0)
-        if not self._usable:
+        if not self._writable:
             return RosReply(0, self.notes()[0], 0)
         self._write(_Write(method, params))
         return RosReply(1, "will be written", 0)
 
     async def ask(self, method: str, *params: XmlRpcValue) -> RosReply:
-        """Call any method and wait for the master's own answer; see ``core_api.Core``."""
         writes = method in REGISTRATIONS
         if writes:
             reply = self._mirror.apply(method, params)
-            self._tell()
+            self._report_changes()
             if reply.code != 1:
                 return reply
         if writes or method in _PARAM_WRITES:
-            if not self._usable:
-                raise UnreachableError("ROS master", self._uri, self._rival or self._problem)
+            if not self._writable:
+                raise UnreachableError("ROS master", self._uri, self._other_agent or self._problem)
             done: asyncio.Future[RosReply] = asyncio.get_running_loop().create_future()
             self._write(_Write(method, params, done))
             return await done
@@ -206,38 +204,30 @@ class ExternalCore:
         return await call_api(self._uri, method, *params, timeout=limits.MASTER_ASK_TIMEOUT, use=Use.CORE)
 
     def state(self) -> GraphState:
-        """All registrations that are known; the same object until one changes."""
         return self._mirror.state()
 
     def publishers(self, topic: str) -> Mapping[str, str]:
-        """Who publishes a topic, and their slave APIs; never changed afterwards."""
         return self._mirror.publishers(topic)
 
     def type_of(self, topic: str) -> str:
-        """The type that the master knows for a topic; ``*`` for none."""
         return self._mirror.type_of(topic)
 
     def on_change(self, callback: Callable[[GraphChange], None]) -> None:
-        """Call ``callback`` in the loop after each change that was made here or was seen."""
-        self._callbacks.append(callback)
+        self._listeners.add(callback)
 
     def unreachable(self) -> Mapping[str, Unreachable]:
-        """The registered nodes that nothing can connect to; not to be changed."""
         return self._liveness.unreachable
 
-    def remembered(self) -> str:
-        """Nothing of ours: what a roscore forgets is its own."""
+    def restored(self) -> str:
         return ""
 
-    def awaited(self, topic: str) -> Mapping[str, str]:  # noqa: ARG002 - of ``Core``
-        """None, likewise."""
+    def unverified(self, topic: str) -> Mapping[str, str]:  # noqa: ARG002 - of ``Core``
         return {}
 
     def suspect(self, node: str) -> None:
-        """A node may be dead, or may have moved: look at it and at the master now."""
         if not self._mirror.is_ours(node):
             self._liveness.suspect(node)
-        self._look_soon()
+        self._poll_soon()
 
     # --- the one task -----------------------------------------------------------------------------------------
 
@@ -248,41 +238,41 @@ class ExternalCore:
                 await self._flush()
                 if self._ending:
                     return
-                if self._loop.time() >= self._next_look:
-                    await self._look()
-            except Exception:  # noqa: BLE001 - the task's top: the graph must be followed on
+                if self._loop.time() >= self._next_poll:
+                    await self._poll()
+            except Exception:  # noqa: BLE001 - a task's top: polling must go on
                 _log.exception("! looking at the roscore %s failed", self._uri)
                 self._seen = b""
-                self._next_look = self._loop.time() + limits.MASTER_LOOK_MAX
+                self._next_poll = self._loop.time() + limits.MASTER_LOOK_MAX
             if self._loop.time() - checked > limits.NODE_CHECK_INTERVAL:
                 checked = self._loop.time()
-                self._check_the_dead()
-            if not (self._writes and self._usable):
+                self._recheck_dead()
+            if not (self._writes and self._writable):
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout_at(self._next_look):
+                    async with asyncio.timeout_at(self._next_poll):
                         await self._wake.wait()
             self._wake.clear()
 
     @property
-    def _usable(self) -> bool:
-        return not self._problem and not self._rival
+    def _writable(self) -> bool:
+        return not self._problem and not self._other_agent
 
-    def _look_soon(self) -> None:
-        if self._task is not None and self._usable:
-            self._next_look = min(self._next_look, self._loop.time() + limits.MASTER_LOOK_SOON)
+    def _poll_soon(self) -> None:
+        if self._task is not None and self._writable:
+            self._next_poll = min(self._next_poll, self._loop.time() + limits.MASTER_LOOK_SOON)
             self._pace = limits.MASTER_LOOK_FIRST
             self._wake.set()
 
     def _write(self, write: _Write) -> None:
-        """Queue a call. While the master is gone nothing waits: what is missing there is seen when it is back."""
-        if not self._usable:
+        """Queue a call, unless the master is gone: the first poll of one that is back shows what it lacks."""
+        if not self._writable:
             return
         self._queue(write)
         if len(self._writes) > limits.MASTER_WRITES_MAX:
-            # The next look finds what is missing; it costs less than to know what could be left out.
+            # The next poll finds what is missing, more cheaply than choosing what could be left out.
             _log.warning("! the roscore at %s is slow: %d changes are told anew", self._uri, len(self._writes))
             self._drop_writes(UnreachableError("ROS master", self._uri, "it is too slow"))
-            self._look_soon()
+            self._poll_soon()
 
     def _queue(self, write: _Write) -> None:
         self._writes.append(write)
@@ -296,11 +286,11 @@ class ExternalCore:
         self._written.set()
 
     async def _flush(self) -> None:
-        while self._writes and self._usable:
+        while self._writes and self._writable:
             batch = [self._writes.popleft() for _ in range(min(len(self._writes), limits.MASTER_WRITES_AT_ONCE))]
-            self._seen = b""  # whether it came to pass is to be seen
+            self._seen = b""  # the next answer must be read
             try:
-                if services := [one for one in batch if one.method == "registerService" and not one.seen]:
+                if services := [one for one in batch if one.method == "registerService" and not one.from_poll]:
                     taken = await self._taken(services)
                     batch = [one for one in batch if one not in taken]
                 if batch:
@@ -316,12 +306,12 @@ class ExternalCore:
         self._written.set()
 
     async def _taken(self, services: list[_Write]) -> list[_Write]:
-        """Those that would push another provider out, which no look has shown yet: the next one decides."""
+        """Services of which the master has another provider, which no poll has shown yet; the next poll decides."""
         try:
             names = [str(one.params[1]) for one in services]
             answers = await self._many(lookup_calls(self._own_node, (), names))
         except (LocalProtocolError, RemoteProtocolError, RosFault):
-            return []  # what is wrong with them is said when they are sent
+            return []  # sending them shows what is wrong
         found = []
         for one, answer in zip(services, answers, strict=True):
             match answer:
@@ -329,13 +319,13 @@ class ExternalCore:
                     found.append(one)
                     one.fail(UnreachableError("room", str(one.params[1]), f"{uri} provides that service"))
         if found:
-            self._next_look = self._loop.time()
+            self._next_poll = self._loop.time()
         return found
 
     async def _send(self, batch: list[_Write]) -> None:
-        """Send calls as one; if that cannot be said or read, one by one."""
+        """Send calls as one ``system.multicall``; if that fails as a whole, one by one."""
         try:
-            # Parameters may be megabytes, which take a master long to read.
+            # A master needs long to read parameters of megabytes.
             large = any(write.method in _PARAM_WRITES for write in batch)
             timeout = limits.MASTER_ASK_TIMEOUT if large else limits.MASTER_TIMEOUT
             answers = await self._many([one_call(write.method, write.params) for write in batch], timeout)
@@ -370,12 +360,12 @@ class ExternalCore:
         self.counters.add("master.refused")
         _log.error("! the roscore at %s does not take %s%s: %s", self._uri, write.method, brief(write.params), error)
         self._mirror.forget((write.method, write.params))
-        self._tell()
+        self._report_changes()
 
-    # --- looking ----------------------------------------------------------------------------------------------
+    # --- polling ----------------------------------------------------------------------------------------------
 
-    async def _look(self) -> None:
-        """Look at the master once, and say when next."""
+    async def _poll(self) -> None:
+        """Poll the master once, and schedule the next poll."""
         begin = self._loop.time()
         try:
             changed = await self._survey()
@@ -387,21 +377,21 @@ class ExternalCore:
             self.counters.add("master.looks")
             self._pace = limits.MASTER_LOOK_FIRST if changed else min(self._pace * 1.5, limits.MASTER_LOOK_IDLE)
         took = self._loop.time() - begin
-        # A large graph takes its master long to tell: it must have time for its own work.
+        # A large graph takes its master long to report: it must have time for its own work.
         pause = min(max(self._pace, limits.MASTER_LOOK_SHARE * took), limits.MASTER_LOOK_MAX)
-        self._next_look = self._loop.time() + (pause if self._usable else limits.MASTER_RETRY)
+        self._next_poll = self._loop.time() + (pause if self._writable else limits.MASTER_RETRY)
 
     async def _survey(self) -> bool:
-        """Ask for everything; return whether there was anything new."""
+        """Ask for the whole graph; return whether the answer differs from the last one."""
         seen = self._mirror.asked
         if not self._request:
             calls = survey_calls(self._own_node, self._nodes, self._services)
             self._request = b"".join(yielding_to_data(call_pieces(_MULTICALL, [calls]), every=1))
         body = await exchange(self._uri, _MULTICALL, self._request, timeout=limits.MASTER_TIMEOUT, use=Use.CORE)
-        if body == self._seen and self._usable:
+        if body == self._seen and self._writable:
             return False
         answer = await read_response(body)
-        survey = read_survey(answer, self._nodes, self._services, breathing=yielding_to_data)
+        survey = read_survey(answer, self._nodes, self._services, yielder=yielding_to_data)
         self._seen = body
         survey = await self._completed(survey)
         if self._ending:
@@ -411,45 +401,45 @@ class ExternalCore:
         return True
 
     async def _completed(self, survey: Survey) -> Survey:
-        """Look up what is new in it, and ask for it from now on."""
+        """Look up the nodes and services that are new in it; the next polls look them up too."""
         nodes, services = survey.nodes(), survey.holders_of_services()
         new_nodes = [node for node in nodes if node not in survey.uris]
         new_services = [service for service in services if service not in survey.services]
         if new_nodes or new_services:
             answer = await self._many(lookup_calls(self._own_node, new_nodes, new_services))
-            survey = survey.with_more(*read_lookups(answer, new_nodes, new_services, breathing=yielding_to_data))
+            survey = survey.with_more(*read_lookups(answer, new_nodes, new_services, yielder=yielding_to_data))
         if tuple(nodes) != self._nodes or tuple(services) != self._services:
             self._nodes, self._services = tuple(nodes), tuple(services)
             self._request, self._seen = b"", b""
         return survey
 
     async def _take(self, survey: Survey, seen: int) -> None:
-        strangers = self._mirror.strangers(survey, self._own_node, seen)
-        rival = await self._find_rival(strangers) if strangers else ""
-        if rival != self._rival:
-            self._rival_is(rival)
-        if strangers:
+        foreign = self._mirror.foreign_agents(survey, self._own_node, seen)
+        other = await self._find_other_agent(foreign) if foreign else ""
+        if other != self._other_agent:
+            self._other_agent_changed(other)
+        if foreign:
             self._seen = b""
-        again = self._mirror.learn(survey, seen, strangers)
-        self._tell()
-        if self._rival:
+        again = self._mirror.update(survey, seen, foreign)
+        self._report_changes()
+        if self._other_agent:
             return
-        rests = [write for write, _ in leftovers(survey, strangers)]
-        if rests:
-            self.counters.add("master.leftovers", len(rests))
+        stale = [write for write, _ in stale_registrations(survey, foreign)]
+        if stale:
+            self.counters.add("master.leftovers", len(stale))
             _log.warning(
-                "= %d registrations of an agent that was killed are taken away from %s", len(rests), self._uri
+                "= %d registrations of an agent that was killed are taken away from %s", len(stale), self._uri
             )
         if again:
             _log.info("= %d registrations are made, or ended, anew at %s", len(again), self._uri)
-        for method, params in (*rests, *again):
-            self._queue(_Write(method, params, seen=True))
+        for method, params in (*stale, *again):
+            self._queue(_Write(method, params, from_poll=True))
 
-    async def _find_rival(self, strangers: Mapping[str, str]) -> str:
-        """Whether another agent is alive at the master: what to call it, or nothing."""
-        for node in sorted(strangers, key=len):  # the agent's own node first: it has the shortest name
+    async def _find_other_agent(self, foreign: Mapping[str, str]) -> str:
+        """Another agent that is alive at this master, as a text for people; empty for none."""
+        for node in sorted(foreign, key=len):  # the agent's own node first: it has the shortest name
             yield_to_data()
-            api = strangers[node]
+            api = foreign[node]
             if await refuses(api):
                 continue
             try:
@@ -469,16 +459,10 @@ class ExternalCore:
             raise RemoteProtocolError(f"{len(calls)} calls were answered with {brief(answers)}")
         return answers
 
-    # --- what becomes of it -----------------------------------------------------------------------------------
+    # --- changes of the graph and of the master ---------------------------------------------------------------
 
-    def _tell(self) -> None:
-        for change in yielding_to_data(self._mirror.take_changes()):
-            _log.info("= %s %s %s of %s", "+" if change.added else "-", change.kind.value, change.name, change.node)
-            for callback in self._callbacks:
-                try:
-                    callback(change)
-                except Exception:  # noqa: BLE001 - a stranger's code
-                    _log.exception("! a listener failed at %s", change)
+    def _report_changes(self) -> None:
+        self._listeners.notify(yielding_to_data(self._mirror.take_changes()))
 
     def _found(self) -> None:
         if self._problem:
@@ -494,27 +478,27 @@ class ExternalCore:
         self._problem = problem
         self._drop_writes(error)
 
-    def _rival_is(self, rival: str) -> None:
-        self._rival = rival
-        if rival:
-            _log.error("! another agent is at work at the roscore %s (%s): standing by", self._uri, rival)
-            self._drop_writes(UnreachableError("ROS master", self._uri, f"another agent is there: {rival}"))
+    def _other_agent_changed(self, other: str) -> None:
+        self._other_agent = other
+        if other:
+            _log.error("! another agent is at work at the roscore %s (%s): standing by", self._uri, other)
+            self._drop_writes(UnreachableError("ROS master", self._uri, f"another agent is there: {other}"))
         else:
             _log.warning("= the other agent at the roscore %s is gone: this one goes on", self._uri)
 
     def _dead(self, node: str, api: str) -> None:
         self.counters.add("node.dead")
-        self._mirror.buried(node, api)
-        self._tell()
+        self._mirror.mark_dead(node, api)
+        self._report_changes()
 
-    def _check_the_dead(self) -> None:
+    def _recheck_dead(self) -> None:
         if self._mirror.dead and (self._revival is None or self._revival.done()):
             self._revival = self._loop.create_task(self._revive(dict(self._mirror.dead)), name="the dead")
 
     async def _revive(self, dead: Mapping[str, str]) -> None:
-        """Look whether somebody listens again where a node was thought dead."""
+        """Check whether nodes that were taken for dead listen again."""
         for node, api in dead.items():
             if not await refuses(api) and self._mirror.dead.get(node) == api:
                 _log.info("= node %s at %s lives after all", node, api)
-                self._mirror.risen(node)
+                self._mirror.mark_alive(node)
                 self._seen = b""

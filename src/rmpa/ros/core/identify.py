@@ -1,4 +1,4 @@
-"""Which node is at an address: a URI may be stale, and its port taken by another node (ros_comm#2018, #2241)."""
+"""Finds out which node is at an address: its port may be another node's by now (ros_comm#2018, #2241)."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ _CHUNK: Final = 64 * KIB
 async def name_at(api: str, topics: Sequence[str] = ()) -> str | None:
     """Ask the node with this slave API for its name.
 
-    rospy has ``getName``. roscpp has not, but says its name in the header of every topic that it publishes, and
+    rospy has ``getName``. roscpp has not, but sends its name in the header of every topic that it publishes, and
     every node publishes ``/rosout``.
 
     Args:
         api: The slave API's URI.
-        topics: Others that the node might publish.
+        topics: Other topics that the node may publish.
 
     Returns:
         Its name, or ``None`` if it cannot be found out.
 
     Raises:
-        UnreachableError: Nobody answers there.
+        UnreachableError: The slave API does not answer.
     """
     try:
         reply = await call_api(api, "getName", _CALLER_ID, use=Use.CORE)

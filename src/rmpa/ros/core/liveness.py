@@ -1,9 +1,9 @@
-"""Notices nodes that died without a word, so that their registrations can go.
+"""Detects nodes that died without unregistering.
 
-A killed node leaves its registrations behind, and roscpp does so even on SIGTERM. Whether a node still listens is
-read from the kernel's own table where the node is on this machine, because rospy starts a thread for everybody who
-only knocks; others are connected to. Only a refused connect, twice, is death: a network that is down is none. What
-cannot be connected to for another reason is unreachable (``ros.master.reachability``).
+A killed node leaves its registrations behind, and roscpp does so even on SIGTERM. For a node on this machine the
+kernel's table says whether it still listens, because rospy starts a thread for each connection; others are connected
+to. Only two refused connects prove a node dead: a network that is down does not. A node to which connecting fails for
+another reason is unreachable (``ros.master.reachability``).
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ _LISTENING: Final = re.compile(rb"^ *\d+: [0-9A-F]+:([0-9A-F]{4}) [0-9A-F]+:[0-9
 
 
 def listening_ports() -> set[int] | None:
-    """TCP ports that somebody listens at in this network namespace, or ``None`` where the kernel does not tell.
+    """TCP ports in state LISTEN in this network namespace, or ``None`` where the kernel does not report them.
 
-    For a thread: the kernel may take milliseconds.
+    Call it in a thread: the kernel may take milliseconds.
     """
     ports = ask_listening_ports()
     return ports if ports is not None else read_tables()
 
 
 def read_tables() -> set[int] | None:
-    """The same from ``/proc``, where it cannot be asked for.
+    """The same from ``/proc``, where sock_diag is not available.
 
-    The kernel takes milliseconds where there are thousands of sockets. Between two short pieces the interpreter is
-    left to others.
+    The kernel takes milliseconds where there are thousands of sockets. The files are read in short pieces, between
+    which other threads can run.
     """
     ports: set[int] = set()
     try:
@@ -66,12 +66,12 @@ def read_tables() -> set[int] | None:
 
 
 class Liveness:
-    """Looks after the nodes of one master.
+    """Checks the nodes of one master.
 
     Args:
         nodes: All nodes with their slave APIs.
         on_dead: ``(node, api)`` of a node that refused two connects.
-        interval: Seconds in which every node is looked at once; ``limits.NODE_CHECK_INTERVAL`` by default.
+        interval: Seconds in which every node is checked once; ``limits.NODE_CHECK_INTERVAL`` by default.
     """
 
     def __init__(
@@ -84,10 +84,10 @@ class Liveness:
         self._nodes = nodes
         self._on_dead = on_dead
         self._interval = limits.NODE_CHECK_INTERVAL if interval is None else interval
-        self._rounds: asyncio.Task[None] | None = None
+        self._task: asyncio.Task[None] | None = None
         self._checks: dict[str, asyncio.Task[None]] = {}
-        self._look: asyncio.Future[set[int] | None] | None = None
-        """The look in a thread that was begun last."""
+        self._ports: asyncio.Future[set[int] | None] | None = None
+        """The latest call of ``listening_ports`` in a thread."""
         self._closed = False
         self._reachability = Reachability()
         self._slow = asyncio.Semaphore(limits.NODE_UNREACHABLE_CHECKS)
@@ -98,23 +98,23 @@ class Liveness:
         return self._reachability.unreachable
 
     def start(self) -> None:
-        """Look from now on."""
-        self._rounds = asyncio.get_running_loop().create_task(self._go_round(), name="node liveness")
+        """Begin to check."""
+        self._task = asyncio.get_running_loop().create_task(self._check_all(), name="node liveness")
 
     async def close(self) -> None:
-        """Look no longer; later suspicions are not heard.
+        """Stop checking; ``suspect`` does nothing from now on.
 
-        A look that is under way in its thread cannot be stopped; it is waited for, because it holds a socket.
+        A call of ``listening_ports`` cannot be stopped in its thread; it is waited for, because it has a socket open.
         """
         self._closed = True
         tasks = [*self._checks.values()]
-        if self._rounds is not None:
-            tasks.append(self._rounds)
+        if self._task is not None:
+            tasks.append(self._task)
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        if self._look is not None:
-            await asyncio.wait([self._look], timeout=runtime_limits.DRAIN_TIMEOUT)
+        if self._ports is not None:
+            await asyncio.wait([self._ports], timeout=runtime_limits.DRAIN_TIMEOUT)
 
     def suspect(self, node: str) -> None:
         """Check one node now."""
@@ -125,10 +125,10 @@ class Liveness:
         self._checks[node] = task
         task.add_done_callback(lambda _: self._checks.pop(node, None))
 
-    async def _go_round(self) -> None:
+    async def _check_all(self) -> None:
         while True:
-            self._look = asyncio.get_running_loop().run_in_executor(None, listening_ports)
-            ports = await asyncio.shield(self._look)
+            self._ports = asyncio.get_running_loop().run_in_executor(None, listening_ports)
+            ports = await asyncio.shield(self._ports)
             nodes = self._nodes()
             self._reachability.keep(nodes)
             pause = self._interval / max(1, len(nodes))
@@ -155,7 +155,7 @@ class Liveness:
                 self._on_dead(node, api)
             return
         except OutOfDescriptors:
-            return  # our own want: nothing is known of the node
+            return  # our own shortage says nothing of the node
         if self._nodes().get(node) != api:
             return
         if not problem:
@@ -173,16 +173,16 @@ def _listens(api: str, ports: set[int] | None) -> bool:
     try:
         host, port, _ = split_uri(api)
     except UnreachableError:
-        return False  # the attempt to connect says why
+        return False  # the attempt to connect reports the reason
     return ports is not None and (is_own_name(host) or host.startswith("127.")) and port in ports
 
 
 def is_gone(api: str, ports: set[int] | None, addresses: Container[str]) -> bool:
-    """Whether a slave API is at an address of this machine and nobody listens there; ``False`` where nothing tells.
+    """Whether a slave API is at an address of this machine where nothing listens; ``False`` where that is unknown.
 
     Args:
         api: Its URI.
-        ports: That somebody listens at (``listening_ports``).
+        ports: From ``listening_ports``.
         addresses: This machine's.
     """
     try:
@@ -194,7 +194,7 @@ def is_gone(api: str, ports: set[int] | None, addresses: Container[str]) -> bool
 
 
 async def refuses(api: str) -> bool:
-    """Whether nobody listens at a slave API's address; ``False`` where that cannot be found out."""
+    """Whether connects to a slave API are refused; ``False`` where that cannot be found out."""
     try:
         await try_connect(api)
     except ConnectionRefusedError:
@@ -205,10 +205,10 @@ async def refuses(api: str) -> bool:
 
 
 async def try_connect(api: str) -> str:
-    """Connect to a slave API, and hang up; why it cannot be reached, or empty.
+    """Connect to a slave API and close the connection; return why it cannot be reached, or empty.
 
     Raises:
-        ConnectionRefusedError: Its machine answers that nobody listens there.
+        ConnectionRefusedError: Nothing listens there.
         OutOfDescriptors: It could not be tried.
     """
     try:

@@ -1,4 +1,4 @@
-"""Calls to one node's slave API: is it there, and please end."""
+"""Calls to one node's slave API: ping and shut down."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rmpa.ros.wire.xmlrpc import RosFault, RosReply
 
 
 async def ping_node(node: str, uri: str, caller_id: str) -> NodePing:
-    """Ask a node for its process, and measure how long it takes.
+    """Ask a node for its process id, and measure the time of the call.
 
     Args:
         node: Its name, for errors.
@@ -23,7 +23,7 @@ async def ping_node(node: str, uri: str, caller_id: str) -> NodePing:
     Raises:
         UnreachableError: It does not answer.
         PeerRefused: It answers with an error.
-        RemoteProtocolError: Its answer is none.
+        RemoteProtocolError: Its answer is malformed.
     """
     loop = asyncio.get_running_loop()
     begin = loop.time()
@@ -46,14 +46,14 @@ async def end_node(node: str, uri: str, caller_id: str, reason: str) -> bool:
         Whether nothing listens at its slave API any more.
 
     Raises:
-        UnreachableError: It cannot be asked.
-        PeerRefused: It says no.
-        RemoteProtocolError: Its answer is none.
+        UnreachableError: It does not answer.
+        PeerRefused: It refuses.
+        RemoteProtocolError: Its answer is malformed.
     """
     try:
         reply = await _call(node, uri, "shutdown", caller_id, reason)
     except (UnreachableError, RemoteProtocolError):
-        # A node may end before it has answered; one that was not there has not ended.
+        # A node may end before it answers.
         if not await refuses(uri):
             raise
         return True

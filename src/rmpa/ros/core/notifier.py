@@ -1,8 +1,8 @@
-"""Carries the master's notifications to the slaves: in order, one call at a time to each URI, none for another.
+"""Sends the master's notifications to slave APIs: in order and one at a time to each, independently of the others.
 
-rosmaster gives all slaves three threads together, so that three stopped nodes stop every notification; here each
-URI has a queue of its own. Of one topic only the latest list of publishers waits; parameters are told one by one
-until many wait.
+rosmaster has three threads for all slaves, so that three stopped nodes stop every notification; here each URI has its
+own queue. Of one topic only the latest list of publishers is queued; parameter updates are sent one by one until many
+wait.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 MASTER_ID = "/master"
-"""The caller id that slaves know masters by."""
+"""The caller id of masters in calls to slaves."""
 
 _Key: TypeAlias = tuple[type[Effect], str, int]
 
 
 class Notifier:
-    """One queue a slave URI, each emptied by a task that lives while there is something in it.
+    """One queue for each slave API, emptied by a task that runs while there is something in it.
 
     Args:
-        nodes_at: The nodes that are registered with a slave URI; a URI without any is not told again.
-        on_unreachable: Called with a URI that did not answer: its nodes may be dead.
+        nodes_at: The nodes that are registered with a slave API; without any, nothing is sent again.
+        on_unreachable: Called with a slave API that did not answer: its nodes may be dead.
         counters: ``notify.sent``, ``notify.failed``, ``notify.dropped``.
     """
 
@@ -60,16 +60,16 @@ class Notifier:
 
     @property
     def waiting(self) -> int:
-        """Notifications that have not been sent."""
+        """Notifications in the queues."""
         return sum(map(len, self._queues.values()))
 
     def add(self, effect: Effect) -> None:
-        """Queue a notification; it leaves in a task, never within this call."""
+        """Queue a notification; a task sends it, never this call."""
         if self._closed:
             return
         queue = self._queues.setdefault(effect.api, {})
         key = self._key(effect, len(queue))
-        # Behind what waits: parameters' updates overlap, so one that is newer must also come later.
+        # Last in the queue: parameters' updates overlap, so a newer one must also come later.
         queue.pop(key, None)
         queue[key] = effect
         if len(queue) > limits.NOTIFY_QUEUE_MAX:
@@ -81,7 +81,7 @@ class Notifier:
             )
 
     def _key(self, effect: Effect, waiting: int) -> _Key:
-        """What a newer notification replaces an older one by."""
+        """The key by which a newer notification replaces an older one."""
         match effect:
             case PublisherUpdate(topic=name) | Shutdown(node=name):
                 return type(effect), name, 0
@@ -90,7 +90,7 @@ class Notifier:
                 return ParamUpdate, name, self._serial if waiting < limits.NOTIFY_COALESCE else 0
 
     async def close(self) -> None:
-        """Stop at once; what waits is not sent."""
+        """Stop at once; queued notifications are not sent."""
         self._closed = True
         tasks = list(self._tasks.values())
         for task in tasks:
@@ -121,11 +121,11 @@ class Notifier:
             del self._queues[api], self._tasks[api]
 
     async def _sent(self, effect: Effect) -> bool:
-        """Send one; whether it need not be sent again."""
+        """Send one; return whether it need not be sent again."""
         try:
             await self._send(effect)
         except OutOfDescriptors as error:
-            # Our own fault, told by who counts the descriptors: the node may be well.
+            # Our own shortage, which is reported elsewhere: the node may be well.
             self._counters.add("notify.failed")
             _log.debug("! %s", error)
             return False
@@ -135,7 +135,7 @@ class Notifier:
             self._on_unreachable(effect.api)
             return False
         except (RosFault, RemoteProtocolError, LocalProtocolError) as error:
-            # It was heard, or will never be: again would not help.
+            # The node got it, or never will: sending again would not help.
             self._counters.add("notify.failed")
             _log.info("! %s: %s", effect.api, error)
         else:
@@ -154,7 +154,7 @@ class Notifier:
                 await self._shut_down(effect)
 
     async def _shut_down(self, effect: Shutdown) -> None:
-        """Ask a node whose name was taken to end, unless another one lives at its address by now."""
+        """Ask a node whose name was taken to end, unless another node has its address by now."""
         found = await name_at(effect.api, effect.topics)
         if found is None and self._nodes_at(effect.api):
             found = self._nodes_at(effect.api)[0]

@@ -1,6 +1,6 @@
-"""The node ``/rosout``: what every node logs, joined on ``/rosout_agg`` (wiki.ros.org/rosout).
+"""The node ``/rosout``: forwards the log messages of all nodes to ``/rosout_agg`` (wiki.ros.org/rosout).
 
-The messages are passed on as they come, never decoded.
+The messages are never decoded.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ NODE: Final = "/rosout"
 TOPIC: Final = "/rosout"
 AGGREGATED: Final = "/rosout_agg"
 _LOGGERS: Final = {"ros": "rmpa.ros", "ros.rosout": "rmpa.ros.core.rosout"}
-"""By the names that a roscore's rosout has for the like."""
+"""By the names that the rosout of a roscore has for these."""
 LOG_TYPE: Final = "rosgraph_msgs/Log"
 LOG_MD5: Final = "acffd30cd6b6de30f120938c17c593fb"
 _DEFINITION: Final = (
@@ -66,16 +66,15 @@ _DEFINITION: Final = (
 class Rosout:
     """Keeps the node ``/rosout`` in the graph, as users and tools expect it.
 
-    roscore starts its rosout anew when it ends (``rosnode kill /rosout``); so does this one, under a new address,
-    after ``limits.ROSOUT_RESPAWN``. While another node has the name, this one is away: it comes back when that node
-    leaves.
+    Like roscore it restarts the node when it ends (``rosnode kill /rosout``), at a new address, after
+    ``limits.ROSOUT_RESPAWN``. While another node has the name, this one does not run.
 
     Args:
         host: The address to listen at.
-        advertised_host: What nodes are told to connect to.
+        advertised_host: The address that is registered.
         master_uri: The core's URI.
-        call: The core's own API.
-        registrations: The core's tables, to see which node has the name.
+        call: Calls the core's master.
+        registrations: The core's tables, which say which node has the name.
         counters: Where refusals are counted, and ``rosout.restarted``.
     """
 
@@ -101,7 +100,7 @@ class Rosout:
 
     @property
     def uri(self) -> str:
-        """The node's slave API; empty while it is away."""
+        """The node's slave API; empty while it does not run."""
         return self._aggregator.uri if self._aggregator is not None else ""
 
     async def start(self) -> None:
@@ -121,7 +120,7 @@ class Rosout:
         await self._end()
 
     def graph_changed(self, change: GraphChange) -> None:
-        """Hear of a change in the graph: the name may be free now, or taken."""
+        """Note a change in the graph: the name may be free now, or taken."""
         if change.node == NODE and not change.added:
             self._changed.set()
 
@@ -155,18 +154,18 @@ class Rosout:
         while True:
             await self._changed.wait()
             self._changed.clear()
-            if self._asked_to_end or not self._stands():
+            if self._asked_to_end or not self._is_registered():
                 await self._end()
                 await asyncio.sleep(limits.ROSOUT_RESPAWN)
-                await self._come_back()
+                await self._restart()
 
-    def _stands(self) -> bool:
-        """Whether the graph has all that the aggregator needs."""
+    def _is_registered(self) -> bool:
+        """Whether both registrations of the aggregator are in the graph."""
         at = self._registrations.at
         publisher, subscriber = at(RegistrationKind.PUBLISHER, AGGREGATED), at(RegistrationKind.SUBSCRIBER, TOPIC)
         return publisher.get(NODE) == subscriber.get(NODE) == self.uri
 
-    async def _come_back(self) -> None:
+    async def _restart(self) -> None:
         told = False
         while self._aggregator is None:
             if (holder := self._registrations.node_api(NODE)) is not None:
@@ -174,7 +173,7 @@ class Rosout:
                     _log.warning("= another node is %s now, at %s; ours waits until it leaves", NODE, holder)
                     told = True
                 with contextlib.suppress(TimeoutError):
-                    # A name that is only kept by a followed parameter is not reported when it goes.
+                    # The end of a node with subscriptions to parameters alone is not reported.
                     async with asyncio.timeout(limits.ROSOUT_LOOK):
                         await self._changed.wait()
                 self._changed.clear()
@@ -193,7 +192,7 @@ class _Aggregator:
 
     Args:
         node: Not started yet.
-        call: The core's own API.
+        call: Calls the core's master.
     """
 
     def __init__(self, node: SlaveNode, call: Callable[..., RosReply]) -> None:
@@ -238,7 +237,7 @@ class _Aggregator:
         self._loggers.start()
 
     async def close(self) -> None:
-        """Unregister what is still ours, and close."""
+        """Unregister, and close."""
         self._loggers.close()
         self._call("unregisterSubscriber", NODE, TOPIC, self._node.uri)
         self._call("unregisterPublisher", NODE, AGGREGATED, self._node.uri)

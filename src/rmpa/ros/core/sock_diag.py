@@ -1,7 +1,7 @@
-"""Asks the kernel which TCP ports somebody listens at (sock_diag(7)): it looks at listening sockets alone.
+"""Asks the kernel for TCP ports in state LISTEN (sock_diag(7)).
 
-``/proc/net/tcp`` tells it too, and walks through every socket that could be there: some 10 ms of the processor on an
-ordinary machine, however few there are, where this takes a tenth of one.
+``/proc/net/tcp`` has them too, but the kernel walks its whole socket table for it: some 10 ms on an ordinary machine,
+however few sockets there are, where this takes 0.1 ms.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ _FOUND: Final = struct.Struct("=BBBB")
 _PORT: Final = struct.Struct("!H")
 _BUFFER: Final = 1 << 16
 _TIMEOUT: Final = 1.0
-"""Seconds for an answer that is there at once, or never."""
+"""Seconds for an answer, which comes at once or never."""
 
 
 def ask_listening_ports() -> set[int] | None:
-    """TCP ports of this network namespace that somebody listens at; ``None`` where the kernel does not say."""
+    """Listening TCP ports of this network namespace; ``None`` where the kernel does not report them."""
     ports: set[int] = set()
     try:
         with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_CLOEXEC, _NETLINK_SOCK_DIAG) as sock:
@@ -41,10 +41,10 @@ def ask_listening_ports() -> set[int] | None:
 
 
 def read_ports(data: bytes, ports: set[int]) -> bool:
-    """Add the ports of one answer; whether more answers follow.
+    """Add the ports of one answer; return whether more answers follow.
 
     Raises:
-        ValueError: It is an error, or none of what was asked for.
+        ValueError: It is an error, or not an answer to this request.
     """
     while len(data) >= _HEADER.size:
         length, kind, *_ = _HEADER.unpack_from(data)

@@ -1,8 +1,8 @@
-"""The file in which a core keeps its registrations and parameters: SQLite, written in threads.
+"""The state file of a core: SQLite, accessed in threads.
 
-One table, ``kept(kind, name, value)``; ``ros.master.kept`` says what is in it. A commit is one transaction in a
-write-ahead log, which survives the end of the process, however it ends, without a wait for the disk; a loss of power
-may take the last seconds. A file that is damaged, of another program or of a newer release is set aside under
+One table, ``kept(kind, name, value)``; ``ros.master.stored_rows`` says what is in it. A commit is one transaction in
+a write-ahead log, which survives the end of the process, however it ends, without a wait for the disk; a loss of
+power may take the last seconds. A file that is damaged, of another program or of a newer release is set aside under
 ``.damaged``.
 """
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from rmpa.ros.master.kept import Key, Row
+    from rmpa.ros.master.stored_rows import Key, Row
 
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 _VERSION: Final = 1
 _APPLICATION: Final = 0x524D5041
-"""``RMPA`` in a file's header: which program's it is."""
+"""``RMPA`` in the file's header identifies the program."""
 _PAGE: Final = 4096
 _SCHEMA: Final = f"""
 CREATE TABLE IF NOT EXISTS kept (kind TEXT NOT NULL, name TEXT NOT NULL, value BLOB NOT NULL, UNIQUE (kind, name));
@@ -46,19 +46,19 @@ _REMEDIES: Final = {
 
 
 def is_locked(error: OSError) -> bool:
-    """Whether a store's error says that another process holds the file."""
+    """Whether an error of a store means that another process has locked the file."""
     return getattr(error.__cause__, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_BUSY
 
 
 class _DamagedError(Exception):
-    """The file is no store of ours."""
+    """The file is not a state file."""
 
 
 class CoreStore:
     """One file; its methods do not overlap.
 
     Args:
-        path: Made if it is not there, with its folders, for this user alone.
+        path: Created if it does not exist, with its folders, for this user alone.
     """
 
     def __init__(self, path: Path) -> None:
@@ -71,27 +71,27 @@ class CoreStore:
         """Open it and read everything, in order.
 
         Raises:
-            OSError: It cannot be used; the text says why, and what to do.
+            OSError: It cannot be used; the text has the reason and a remedy.
         """
         return await self._run(self._open, limits.CORE_STATE_OPEN)
 
     async def write(self, rows: Mapping[Key, bytes | None], *, anew: bool = False) -> None:
-        """Put rows, or take away those that are ``None``: all or nothing.
+        """Write rows and delete those that are ``None``, in one transaction.
 
         Args:
-            rows: Not to be changed meanwhile.
-            anew: Take away everything else.
+            rows: Must not change meanwhile.
+            anew: Delete all other rows.
 
         Raises:
-            OSError: As for ``open``; nothing of it is written.
+            OSError: As for ``open``; nothing was written.
         """
         await self._run(lambda: self._write(rows, anew=anew), limits.CORE_STATE_WRITE)
 
     async def copy_aside(self) -> Path | None:
-        """Copy a file that was not read to one under ``.before``, in place of an older copy.
+        """Copy a file that was not read to ``.before``, in place of an older copy.
 
         Returns:
-            The copy, or ``None`` if the file holds nothing.
+            The copy, or ``None`` if the file is empty.
 
         Raises:
             OSError: As for ``open``.
@@ -103,7 +103,7 @@ class CoreStore:
         return await self._run(self._replaced, limits.CORE_STATE_WRITE)
 
     async def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         with contextlib.suppress(OSError):
             await self._run(self._disconnect, limits.CORE_STATE_CLOSE)
 
@@ -111,17 +111,17 @@ class CoreStore:
 
     async def _run(self, function: Callable[[], _T], seconds: float | None = None) -> _T:
         silent = f"{self.path}: the disk does not answer"
-        if self._busy:  # what was asked before still hangs there
+        if self._busy:  # the previous access still hangs
             raise OSError(silent)
         self._busy = True
         try:
             async with asyncio.timeout(seconds):
-                return await in_thread(lambda: self._told(function), "core state")
+                return await in_thread(lambda: self._call(function), "core state")
         except TimeoutError:
             raise OSError(silent) from None
 
-    def _told(self, function: Callable[[], _T]) -> _T:
-        """Call it; whatever SQLite says is an ``OSError`` with its remedy."""
+    def _call(self, function: Callable[[], _T]) -> _T:
+        """Call a function; errors of SQLite become an ``OSError`` with a remedy."""
         try:
             return function()
         except sqlite3.Error as error:
@@ -163,7 +163,7 @@ class CoreStore:
             raise _DamagedError("it is larger than a core's file can be")
         connection = sqlite3.connect(self.path, timeout=limits.CORE_STATE_LOCKED, check_same_thread=False)
         self._connection = connection
-        # The lock is held until the end: it keeps others away, and needs no memory that is shared with them.
+        # The lock is held until the end: it keeps other processes away, and SQLite needs no shared memory.
         connection.execute("PRAGMA locking_mode = EXCLUSIVE")
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")

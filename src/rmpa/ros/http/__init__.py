@@ -1,1 +1,1 @@
-"""TODO room."""
+"""XML-RPC over HTTP: one server for each node and core, and calls to others."""

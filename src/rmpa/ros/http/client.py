@@ -1,7 +1,6 @@
 """XML-RPC calls to nodes and masters, each on a connection of its own.
 
-A kept-alive connection costs a Python node a thread and blocks nothing for roscpp, so none is kept; a connection on
-loopback is made in 50 microseconds.
+No connection is kept alive: each costs a Python node a thread, and to open one on loopback takes 50 microseconds.
 """
 
 from __future__ import annotations
@@ -16,14 +15,14 @@ import socket
 from typing import Final
 from urllib.parse import urlsplit
 
-import h11
-
-from rmpa.core.errors import LimitExceeded, OutOfDescriptors, RemoteProtocolError, UnreachableError
+from rmpa.core.errors import OutOfDescriptors, UnreachableError
 from rmpa.core.sizes import KIB
 from rmpa.ros import limits
+from rmpa.ros.http.documents import read_large, slices
+from rmpa.ros.wire.http import ResponseParser, post_request
 from rmpa.ros.wire.xmlrpc import ResponseReader, RosFault, RosReply, XmlRpcValue, brief, call_pieces
 from rmpa.runtime.descriptors import DESCRIPTORS, OUT_OF_DESCRIPTORS, Use
-from rmpa.runtime.event_loop import yield_to_data, yielding_to_data
+from rmpa.runtime.event_loop import yielding_to_data
 
 __all__ = ["RosFault", "call", "call_api", "connect", "exchange", "is_own_name", "read_response", "split_uri"]
 
@@ -38,7 +37,7 @@ def split_uri(uri: str) -> tuple[str, int, str]:
     """``http://host:port/path`` to ``(host, port, path)``; the path is at least ``/``.
 
     Raises:
-        UnreachableError: The text is not such a URI: ROS wants the port said.
+        UnreachableError: The text is not such a URI; ROS requires the port.
     """
     try:
         parts = urlsplit(uri)
@@ -51,12 +50,12 @@ def split_uri(uri: str) -> tuple[str, int, str]:
 
 
 def is_own_name(host: str) -> bool:
-    """Whether a host's name is this machine's, so that loopback will do."""
+    """Whether a host name is this machine's, which is reached by loopback."""
     return host in {"localhost", socket.gethostname()}
 
 
 async def _addresses(host: str, port: int) -> list[tuple[str, int]]:
-    """Where to connect, best first: names of this machine and numbers without asking the resolver."""
+    """Addresses of a host, best first; the resolver is not asked for numbers and names of this machine."""
     if is_own_name(host):
         return [(_LOOPBACK, port)]
     try:
@@ -81,9 +80,9 @@ async def _connect_one(address: tuple[str, int], use: Use) -> socket.socket:
     try:
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         await asyncio.get_running_loop().sock_connect(sock, address)
-        # This raises too, where the other side hung up at once.
+        # This raises too, if the other side closed at once.
         if sock.getsockname() == sock.getpeername():
-            # A port of the ephemeral range that nobody listens at can connect to itself.
+            # A port of the ephemeral range where nothing listens can connect to itself.
             raise ConnectionRefusedError(errno.ECONNREFUSED, "connected to itself")  # noqa: TRY301 - see below
     except BaseException:
         sock.close()
@@ -95,13 +94,13 @@ async def connect(host: str, port: int, use: Use = Use.DATA) -> socket.socket:
     """Connect by TCP, non-blocking and with TCP_NODELAY.
 
     Args:
-        host: A number, a name of this machine (connected on loopback, without the resolver) or any other name.
+        host: An address, a name of this machine (connected on loopback, without the resolver) or any other name.
         port: The port.
-        use: What for: whether it may take one of the last file descriptors.
+        use: The purpose, which decides whether the connection may take one of the last file descriptors.
 
     Raises:
         UnreachableError: The name does not resolve.
-        OSError: Nobody listens there (``ConnectionRefusedError``), the network says no, or no file descriptor is
+        OSError: The connection is refused (``ConnectionRefusedError``), the network fails, or no file descriptor is
             left (``EMFILE``).
     """
     error: OSError = ConnectionRefusedError(errno.ECONNREFUSED, f"no address for {host}")
@@ -122,44 +121,6 @@ async def connect(host: str, port: int, use: Use = Use.DATA) -> socket.socket:
     raise error
 
 
-def _request(host: str, port: int, path: str, body: bytes) -> tuple[h11.Connection, bytes]:
-    http = h11.Connection(h11.CLIENT, max_incomplete_event_size=limits.HTTP_HEADERS_MAX)
-    headers = [
-        (b"Host", f"{host}:{port}".encode("idna" if not host.isascii() else "ascii")),
-        (b"User-Agent", b"rmpa"),
-        (b"Content-Type", b"text/xml"),
-        (b"Content-length", str(len(body)).encode("ascii")),
-        (b"Connection", b"close"),
-    ]
-    parts = [
-        http.send(h11.Request(method=b"POST", target=path.encode("ascii", "replace"), headers=headers)),
-        http.send(h11.Data(data=body)),
-        http.send(h11.EndOfMessage()),
-    ]
-    return http, b"".join(part or b"" for part in parts)
-
-
-async def _response_body(sock: socket.socket, http: h11.Connection) -> bytes:
-    loop = asyncio.get_running_loop()
-    body = bytearray()
-    while True:
-        event = http.next_event()
-        match event:
-            case h11.Data(data=data):
-                if len(body) + len(data) > limits.HTTP_BODY_MAX:
-                    raise LimitExceeded("XML-RPC response", len(body) + len(data), limits.HTTP_BODY_MAX)
-                body += data
-            case h11.EndOfMessage():
-                return bytes(body)
-            case h11.ConnectionClosed():
-                raise RemoteProtocolError("the connection was closed before the response")
-            case h11.InformationalResponse() | h11.Response():
-                # XmlRpc++ and its copies put anything into the status; the body says what happened.
-                pass
-            case _:
-                http.receive_data(await loop.sock_recv(sock, _CHUNK))
-
-
 async def call(
     uri: str,
     method: str,
@@ -171,17 +132,17 @@ async def call(
 
     Args:
         uri: ``http://host:port/``.
-        method: Its name.
-        params: What it is called with.
-        timeout: Seconds for everything: connecting, the call and its response.
-        use: What for: whether it may take one of the last file descriptors.
+        method: The method's name.
+        params: The parameters.
+        timeout: Seconds for everything: the connection, the call and its response.
+        use: The purpose, which decides whether the connection may take one of the last file descriptors.
 
     Raises:
-        UnreachableError: Nobody answers there, or not in time.
-        OutOfDescriptors: No file descriptor is left here to ask.
-        RosFault: The answer is a fault.
-        RemoteProtocolError: The answer is not XML-RPC, or too large.
-        LocalProtocolError: A parameter cannot be said in XML-RPC.
+        UnreachableError: The server does not answer, or not in time.
+        OutOfDescriptors: No file descriptor is left for the call.
+        RosFault: The response is a fault.
+        RemoteProtocolError: The response is not XML-RPC, or too large.
+        LocalProtocolError: A parameter cannot be written in XML-RPC.
     """
     if _log.isEnabledFor(logging.DEBUG):
         _log.debug("> %s %s%s", uri, method, brief(params))
@@ -197,19 +158,22 @@ async def exchange(
     timeout: float,  # noqa: ASYNC109 - the message names it
     use: Use = Use.DATA,
 ) -> bytes:
-    """Send a ``methodCall`` document and return the response's, which nobody has looked at.
+    """Send a ``methodCall`` document and return that of the response, unread.
 
-    For who asks the same again and again, and need not read the same answer twice. Arguments and errors as of
-    ``call``; ``read_response`` reads it.
+    A caller that polls compares the bytes with those of the last response, and need not read the same one twice.
+    Arguments and errors are those of ``call``; ``read_response`` reads the document.
     """
     host, port, path = split_uri(uri)
-    http, request = _request(host, port, path, document)
+    loop = asyncio.get_running_loop()
+    response = ResponseParser(uri)
     try:
         async with asyncio.timeout(timeout):
             sock = await connect(host, port, use)
             try:
-                await asyncio.get_running_loop().sock_sendall(sock, request)
-                return await _response_body(sock, http)
+                await loop.sock_sendall(sock, post_request(host, port, path, document))
+                while (body := response.feed(await loop.sock_recv(sock, _CHUNK))) is None:
+                    pass
+                return body
             finally:
                 sock.close()
     except TimeoutError as error:
@@ -221,28 +185,15 @@ async def exchange(
             raise OutOfDescriptors("XML-RPC server", uri, "`rmpa doctor` says what to do") from error
         problem = os.strerror(error.errno) if error.errno else str(error)
         raise UnreachableError("XML-RPC server", uri, f"{problem}; is that program running?") from error
-    except h11.RemoteProtocolError as error:
-        raise RemoteProtocolError(f"{uri} does not speak HTTP: {error}") from error
 
 
 async def read_response(body: bytes) -> XmlRpcValue:
-    """Read a response, a little at a time.
+    """Read a response, with turns for others in between.
 
     Raises:
         RosFault, RemoteProtocolError: As for ``call``.
     """
-    reader = ResponseReader()
-    try:
-        for begin in range(0, len(body), limits.XMLRPC_SLICE):
-            reader.feed(body[begin : begin + limits.XMLRPC_SLICE])
-            if begin >= limits.HTTP_BODY_INLINE:
-                await asyncio.sleep(0)
-            else:
-                yield_to_data()
-    except asyncio.CancelledError:
-        reader.abandon()
-        raise
-    return reader.close()
+    return await read_large(ResponseReader(), slices(body))
 
 
 async def call_api(
@@ -252,7 +203,7 @@ async def call_api(
     timeout: float = limits.SLAVE_CALL_TIMEOUT,  # noqa: ASYNC109 - handed to ``call``
     use: Use = Use.DATA,
 ) -> RosReply:
-    """Call a method of a ROS API, all of which answer ``[code, status, value]``.
+    """Call a method of a ROS API, which answers ``[code, status, value]``.
 
     Raises:
         RemoteProtocolError: The answer is not such a triple (roscpp's ``getBusStats`` is none).

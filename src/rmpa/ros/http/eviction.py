@@ -1,8 +1,8 @@
-"""Which connection of an XML-RPC server gives way when there are too many, or too many bytes of calls are held.
+"""Chooses the connection of an XML-RPC server to close when there are too many, or too many bytes of calls.
 
-All clients are of this machine, so addresses tell nothing. What tells a well-behaved one is its pace: it sends its
-call at once and reads the answer, while a port scanner, a stuck or stopped program or a hostile one sends a byte now
-and then. The slowest gives way, so that ``rostopic list`` is answered beside any number of these.
+All clients are on this machine, so addresses do not tell them apart. A well-behaved client is fast: it sends its call
+at once and reads the answer, while a port scanner or a stuck, stopped or hostile program sends a byte now and then.
+The slowest is closed, so that ``rostopic list`` is answered beside any number of these.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 _MOMENT: Final = 1e-3
-"""Seconds; the first bytes of a call are never slow."""
+"""Seconds; the least duration in the pace of a call."""
 
 
 class Client(Protocol):
-    """One connection, as far as the choice needs it."""
+    """One connection."""
 
     @property
     def idle(self) -> bool:
@@ -27,19 +27,19 @@ class Client(Protocol):
 
     @property
     def answering(self) -> bool:
-        """Whether a call has come and is being answered: it is not the client that is slow."""
+        """Whether a call is being answered: then the client is not the slow side."""
 
     @property
     def reserved(self) -> int:
-        """Bytes set aside for its call."""
+        """Bytes reserved for its call."""
 
     @property
     def received(self) -> int:
-        """Bytes of an unfinished call that have come."""
+        """Received bytes of an unfinished call."""
 
     @property
     def begun(self) -> float:
-        """When the call that is unfinished, or whose answer is not read, began, monotonic seconds."""
+        """The start of the call that is unfinished, or whose answer is not read, monotonic seconds."""
 
 
 _C = TypeVar("_C", bound=Client)
@@ -48,8 +48,8 @@ _C = TypeVar("_C", bound=Client)
 def for_newcomer(connections: Iterable[_C], now: float) -> _C | None:
     """The connection to close for a new one; ``None`` if all are being answered.
 
-    The slowest of those that are slow beyond doubt; else the one that is idle for longest, whose client connects anew
-    without a word; else the slowest of all.
+    The slowest of those below ``limits.HTTP_PACE_MIN``; else the one that is idle for longest, whose client
+    reconnects by itself; else the slowest of all.
 
     Args:
         connections: In the order of their last use.

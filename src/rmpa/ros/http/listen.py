@@ -1,4 +1,4 @@
-"""Opens the listening socket of an XML-RPC server, and says in plain words why that cannot be."""
+"""Opens the listening socket of an XML-RPC server; errors have a remedy."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ async def listen(name: str, host: str, port: int, use: Use) -> socket.socket:
     """A socket that listens.
 
     Args:
-        name: What listens, for the text of errors.
+        name: The server, for the text of errors.
         host: Numeric address or name; empty: all addresses.
         port: 0 lets the system choose.
-        use: What its connections are for.
+        use: The purpose of its connections.
 
     Raises:
         StartError: The address is in use, not ours, or not allowed.

@@ -31,7 +31,7 @@ ERROR: Final = -1
 
 @dataclass(frozen=True, slots=True)
 class _Method:
-    """One method of the API: its parameters behind ``caller_id``, and the value of a reply that says no."""
+    """One method of the API: its parameters behind ``caller_id``, and the value of an error's reply."""
 
     function: Callable[..., RosReply]
     parameters: tuple[tuple[str, v.Validator], ...]
@@ -44,12 +44,12 @@ class MasterApi:
     Args:
         uri: What ``getUri`` answers.
         pid: What ``getPid`` answers.
-        on_shutdown: Called with the reason when somebody asks the master to end.
-        breathing: For what takes long in a graph of thousands, or with large parameters.
+        on_shutdown: Called with the reason when a client calls ``shutdown``.
+        yielder: Lets pending data go first in a graph of thousands, and for large parameters.
     """
 
-    def __init__(self, uri: str, pid: int, on_shutdown: Callable[[str], None], *, breathing: Yielder = iter) -> None:
-        self._breathing = breathing
+    def __init__(self, uri: str, pid: int, on_shutdown: Callable[[str], None], *, yielder: Yielder = iter) -> None:
+        self._yielder = yielder
         self.uri = uri
         self._pid = pid
         self._on_shutdown = on_shutdown
@@ -68,8 +68,8 @@ class MasterApi:
         """Call a method of the Master or Parameter Server API.
 
         Args:
-            method: Its name.
-            arguments: What it is called with, the caller id first.
+            method: The method's name.
+            arguments: The parameters, the caller id first.
 
         Returns:
             Code 1 with the value; or 0 or -1 with text and a value of the same kind.
@@ -127,7 +127,7 @@ class MasterApi:
         return {"faultCode": problem.code, "faultString": problem.text}
 
     def take(self) -> tuple[list[Effect], list[GraphChange]]:
-        """Take what is to be done and what has changed since the last time, in order."""
+        """Take the effects and changes since the last time, in order."""
         taken = self.registrations.effects, self.registrations.changes
         self.registrations.effects, self.registrations.changes = [], []
         return taken
@@ -160,7 +160,7 @@ class MasterApi:
         return RosReply(SUCCESS, f"deleted {key}", 0)
 
     def _set_param(self, caller_id: str, key: str, value: XmlRpcValue) -> RosReply:
-        if params.holds_nil(value, self._breathing):
+        if params.holds_nil(value, self._yielder):
             text = "value is nil or contains one, which ROS does not have"
             _log.info("! %s: setParam: %s", caller_id, text)
             return RosReply(ERROR, text, 0)
@@ -169,7 +169,7 @@ class MasterApi:
         except TypeError as error:
             return RosReply(ERROR, str(error), 0)
         subscribers = self.registrations.param_subscribers()
-        self.registrations.effects += params.updates(subscribers, key, value, caller_id, self._breathing)
+        self.registrations.effects += params.updates(subscribers, key, value, caller_id, self._yielder)
         return RosReply(SUCCESS, f"set {key}", 0)
 
     def _get_param(self, _caller_id: str, key: str) -> RosReply:
@@ -194,15 +194,15 @@ class MasterApi:
 
     def _unsubscribe_param(self, caller_id: str, api: str, key: str) -> RosReply:
         self.registrations.unregister(RegistrationKind.PARAM, with_slash(key), caller_id, api)
-        # Whether it was subscribed or not: rosmaster says 1.
+        # rosmaster answers 1 whether it was subscribed or not.
         return RosReply(SUCCESS, f"not subscribed to parameter {key}", 1)
 
     def _has_param(self, _caller_id: str, key: str) -> RosReply:
-        # The name is the status: clients of old look there.
+        # rosmaster puts the name into the status, and old clients read it.
         return RosReply(SUCCESS, key, self.parameters.has(key))
 
     def _get_param_names(self, _caller_id: str) -> RosReply:
-        return RosReply(SUCCESS, "the names of all parameters", list(self._breathing(self.parameters.names())))
+        return RosReply(SUCCESS, "the names of all parameters", list(self._yielder(self.parameters.names())))
 
     # --- services ---------------------------------------------------------------------------------------------
 
@@ -251,18 +251,18 @@ class MasterApi:
     def _get_published_topics(self, _caller_id: str, subgraph: str) -> RosReply:
         prefix = subgraph if not subgraph or subgraph.endswith("/") else f"{subgraph}/"
         types = self.registrations.types()
-        published = self._breathing(self.registrations.published())
+        published = self._yielder(self.registrations.published())
         found = [[topic, types[topic]] for topic in published if topic.startswith(prefix)]
         return RosReply(SUCCESS, "the topics that somebody publishes", found)
 
     def _get_topic_types(self, _caller_id: str) -> RosReply:
-        types = self._breathing(list(self.registrations.types().items()))
+        types = self._yielder(list(self.registrations.types().items()))
         return RosReply(SUCCESS, "the topics and their types", [list(item) for item in types])
 
     def _get_system_state(self, _caller_id: str) -> RosReply:
         tables: list[XmlRpcValue] = []
         for kind in (RegistrationKind.PUBLISHER, RegistrationKind.SUBSCRIBER, RegistrationKind.SERVICE):
-            providers = self._breathing(self.registrations.providers(kind))
+            providers = self._yielder(self.registrations.providers(kind))
             tables.append([[key, list(nodes)] for key, nodes in providers])
         return RosReply(SUCCESS, "publishers, subscribers and services", tables)
 

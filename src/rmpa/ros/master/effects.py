@@ -1,4 +1,4 @@
-"""What the master asks to be done, and what it reports to have changed."""
+"""Calls to slave APIs that follow from a change in the master's tables, and reports of changes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PublisherUpdate:
-    """Tell the slave API at ``api`` who publishes ``topic`` now (API URIs, in order of registration)."""
+    """``publisherUpdate`` for the slave API at ``api``: the publishers of ``topic``, in order of registration."""
 
     api: str
     topic: str
@@ -21,7 +21,7 @@ class PublisherUpdate:
 
 @dataclass(frozen=True, slots=True)
 class ParamUpdate:
-    """Tell the slave API at ``api`` that ``key``, which ends in ``/``, now is ``value``; deleted is ``{}``."""
+    """``paramUpdate`` for the slave API at ``api``: ``key``, which ends in ``/``, is ``value``; ``{}`` if deleted."""
 
     api: str
     key: str
@@ -30,9 +30,9 @@ class ParamUpdate:
 
 @dataclass(frozen=True, slots=True)
 class Shutdown:
-    """Ask the node that was called ``node`` and had its slave API at ``api`` to end: another took its name.
+    """``shutdown`` for the node ``node`` at the slave API ``api``, whose name another node took.
 
-    ``topics`` are those that it published; one of them can tell whether it still is that node.
+    ``topics`` are those that it published: the header of one shows whether it still is that node.
     """
 
     api: str
@@ -54,13 +54,13 @@ class RegistrationKind(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class GraphChange:
-    """One registration that came, changed its type, or went.
+    """One registration that was added or removed, or changed its type.
 
     Args:
-        kind: What it is; parameters' subscriptions are not reported.
-        added: Whether it came (or changed its type) or went.
+        kind: Its kind; subscriptions to parameters are not reported.
+        added: Whether it was added (or changed its type) or removed.
         name: The topic or service.
-        node: Whose it is.
+        node: The node that registered it.
         api: The node's XML-RPC URI.
         type: The topic's type as far as known: ``pkg/Name``, ``*`` or empty; empty for services.
     """
@@ -79,9 +79,9 @@ class GraphState:
 
     Args:
         publishers: By topic, in order of registration: node to XML-RPC URI.
-        subscribers: Likewise.
+        subscribers: By topic: node to XML-RPC URI.
         services: By service: node to ``rosrpc://`` URI.
-        types: By topic, those that ever had one.
+        types: By topic, also of topics without registrations.
         nodes: Node to XML-RPC URI.
     """
 

@@ -1,7 +1,8 @@
-"""The graph of a master that is another program, as far as it is known here, and what of it is ours.
+"""A copy of the graph of a master that is another program, and which registrations in it are the agent's own.
 
-Two sources make it: what the agent itself registers counts at once, what others do counts when a survey shows it. A
-survey also shows what the master lacks of ours (it was started anew), or has too much (an agent was killed).
+It has two sources: the agent's own registrations, which count at once, and surveys, which show those of others. A
+survey also shows which of our registrations the master lacks (it was restarted), or has too many of (an agent was
+killed).
 """
 
 from __future__ import annotations
@@ -24,25 +25,22 @@ Call: TypeAlias = tuple[str, tuple[XmlRpcValue, ...]]
 Entry: TypeAlias = tuple[RegistrationKind, str, str]
 """One registration: its kind, the topic, service or parameter, and the node."""
 
-_REGISTER: Final = {
-    "registerPublisher": RegistrationKind.PUBLISHER,
-    "registerSubscriber": RegistrationKind.SUBSCRIBER,
-    "registerService": RegistrationKind.SERVICE,
-    "subscribeParam": RegistrationKind.PARAM,
+REGISTRATIONS: Final = {
+    "registerPublisher": (RegistrationKind.PUBLISHER, 4),
+    "registerSubscriber": (RegistrationKind.SUBSCRIBER, 4),
+    "registerService": (RegistrationKind.SERVICE, 4),
+    "subscribeParam": (RegistrationKind.PARAM, 3),
+    "unregisterPublisher": (RegistrationKind.PUBLISHER, 3),
+    "unregisterSubscriber": (RegistrationKind.SUBSCRIBER, 3),
+    "unregisterService": (RegistrationKind.SERVICE, 3),
+    "unsubscribeParam": (RegistrationKind.PARAM, 3),
 }
-_UNREGISTER: Final = {
-    "unregisterPublisher": RegistrationKind.PUBLISHER,
-    "unregisterSubscriber": RegistrationKind.SUBSCRIBER,
-    "unregisterService": RegistrationKind.SERVICE,
-    "unsubscribeParam": RegistrationKind.PARAM,
-}
-REGISTRATIONS: Final = frozenset({*_REGISTER, *_UNREGISTER})
-"""The methods that ``Mirror.apply`` takes."""
+"""The methods that ``Mirror.apply`` accepts: what they register, and the number of their parameters."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Own:
-    """One registration of ours."""
+    """One registration of the agent's: the call, the node's slave API, and the call that takes it back."""
 
     call: Call
     api: str
@@ -50,22 +48,22 @@ class _Own:
 
 
 class Mirror:
-    """What is known of the graph of one master.
+    """The copy of the graph of one master.
 
     Args:
-        breathing: For surveys of thousands of topics.
+        yielder: Lets pending data go first in surveys of thousands of topics.
     """
 
-    def __init__(self, *, breathing: Yielder = iter) -> None:
-        self._breathing = breathing
+    def __init__(self, *, yielder: Yielder = iter) -> None:
+        self._yielder = yielder
         self._known = Registrations()
         self._own: dict[Entry, _Own] = {}
-        # What we asked for and no survey was begun since: a survey from before says nothing about it.
+        # Calls since the last survey began, by the count of calls: that survey says nothing about them.
         self._touched: dict[Entry, int] = {}
         self._asked = 0
-        # Nodes whose registrations the master keeps although nobody listens at their address any more.
+        # Nodes whose registrations the master has although nothing listens at their address any more.
         self._dead: dict[str, str] = {}
-        # Nodes that a master which is no more knew: they live, and what they send still comes.
+        # Nodes that the previous run of the master knew: they may live, and their connections go on.
         self._orphans: dict[str, str] = {}
         self._run = ""
 
@@ -73,7 +71,7 @@ class Mirror:
 
     @property
     def asked(self) -> int:
-        """How often ``apply`` was called: what a survey that begins now can have seen."""
+        """Count of calls of ``apply``: a survey that begins now shows the effect of these."""
         return self._asked
 
     @property
@@ -94,39 +92,38 @@ class Mirror:
         return self._known.types().get(topic, ANY_TYPE)
 
     def is_ours(self, node: str) -> bool:
-        """Whether we registered something for this node."""
+        """Whether the agent registered something for this node."""
         return any(entry[2] == node for entry in self._own)
 
     def others(self) -> dict[str, str]:
-        """The nodes that are not ours, and their slave APIs."""
+        """The nodes of others with their slave APIs."""
         ours = {node for _, _, node in self._own}
         return {node: api for node, api in self._known.nodes().items() if node not in ours}
 
-    def undo_all(self) -> list[Call]:
-        """What takes all that is ours away again, in the order opposite to that in which it came."""
+    def unregister_calls(self) -> list[Call]:
+        """The calls that unregister everything of the agent's, the latest registration first."""
         return [own.undo for own in reversed(self._own.values())]
 
     def take_changes(self) -> list[GraphChange]:
-        """What has changed since the last time."""
-        self._known.effects.clear()  # the master tells the nodes
+        """Take the changes since the last time."""
+        self._known.effects.clear()  # the master notifies the nodes
         changes, self._known.changes = self._known.changes, []
         return changes
 
     # --- our own registrations --------------------------------------------------------------------------------
 
     def apply(self, method: str, params: Sequence[XmlRpcValue]) -> RosReply:
-        """Register or unregister something of ours, one of ``REGISTRATIONS``; the master is to be told by the caller.
+        """Apply one of ``REGISTRATIONS`` of the agent's to the copy; the caller sends it to the master.
 
         Returns:
             What the master will answer, as far as it is known here.
         """
         self._asked += 1
         words = [param for param in params if isinstance(param, str)]
-        if method in _REGISTER and len(words) == len(params) == _ARITY[method]:
-            return self._register(_REGISTER[method], method, words)
-        if method in _UNREGISTER and len(words) == len(params) == _ARITY[method]:
-            return self._unregister(_UNREGISTER[method], words)
-        return RosReply(-1, f"{method} does not take {brief(params)}", 0)
+        kind, arity = REGISTRATIONS[method]
+        if not len(words) == len(params) == arity:
+            return RosReply(-1, f"{method} does not take {brief(params)}", 0)
+        return self._unregister(kind, words) if method.startswith("un") else self._register(kind, method, words)
 
     def _register(self, kind: RegistrationKind, method: str, words: list[str]) -> RosReply:
         value: XmlRpcValue = 1
@@ -160,7 +157,7 @@ class Mirror:
         return RosReply(1, "will be unregistered", 1)
 
     def forget(self, call: Call) -> None:
-        """The master does not take this registration of ours: it is none."""
+        """Drop a registration of the agent's that the master refused."""
         for entry, own in list(self._own.items()):
             if own.call == call:
                 self._forget(*entry)
@@ -174,23 +171,23 @@ class Mirror:
 
     # --- the others -------------------------------------------------------------------------------------------
 
-    def buried(self, node: str, api: str) -> None:
-        """A node was found dead: what the master still has of it counts no more."""
+    def mark_dead(self, node: str, api: str) -> None:
+        """A node is dead: ignore what the master still has of it."""
         self._dead[node] = api
         self._orphans.pop(node, None)
         self._known.purge(node, api)
 
-    def risen(self, node: str) -> None:
-        """It lives after all; the next survey brings it back."""
+    def mark_alive(self, node: str) -> None:
+        """A node lives after all; the next survey shows it again."""
         self._dead.pop(node, None)
 
-    def strangers(self, survey: Survey, prefix: str, seen: int) -> dict[str, str]:
-        """Nodes with names of an agent's that are not ours: of another agent, or of one that was killed.
+    def foreign_agents(self, survey: Survey, prefix: str, seen: int) -> dict[str, str]:
+        """Nodes that have names of an agent and are not this agent's: of another agent, or of one that was killed.
 
         Args:
-            survey: What the master said.
-            prefix: The agent's own node; its proxies' names are below.
-            seen: ``asked`` when the survey was begun.
+            survey: The survey.
+            prefix: The agent's own node; the names of its proxies are below it.
+            seen: ``asked`` when the survey began.
         """
         ours = {node: own.api for (_, _, node), own in self._own.items()}
         fresh = {node for (_, _, node), asked in self._touched.items() if asked > seen}
@@ -203,20 +200,20 @@ class Mirror:
             and survey.uris[node] != ours.get(node)
         }
 
-    def learn(self, survey: Survey, seen: int, ignored: Mapping[str, str]) -> list[Call]:
-        """Take in what the others have registered.
+    def update(self, survey: Survey, seen: int, ignored: Mapping[str, str]) -> list[Call]:
+        """Apply a survey to the copy.
 
         Args:
-            survey: What the master said; every node and service of it that still is there was looked up.
-            seen: ``asked`` when it was begun.
-            ignored: Nodes that are passed over.
+            survey: Every node and service of it that still exists was looked up.
+            seen: ``asked`` when it began.
+            ignored: Nodes that are left out.
 
         Returns:
-            What has to be registered again, because the master does not have it of ours, or unregistered again.
+            Calls that register what the master lacks of ours, and unregister what it has too much of.
         """
         if self._run and survey.run != self._run:
-            # Its nodes are not in the new master's graph, and never will be before they restart. In a graph without
-            # a bridge they go on all the same, for their connections stand: so do the routes here.
+            # Nodes do not register at a restarted master before they restart themselves. Without a bridge their
+            # connections go on all the same, and so do the routes here.
             self._orphans |= self.others()
         again = [] if survey.run == self._run else self._own_params()
         self._run = survey.run
@@ -228,20 +225,20 @@ class Mirror:
             self._drop_gone(kind, table, passed, survey)
         for kind, table in survey.holders.items():
             self._add_new(kind, table, passed, survey, seen)
-        self._learn_types(survey, passed)
+        self._update_types(survey, passed)
         again += self._missing(survey, seen, ignored)
         again += self._surplus(survey, seen)
         self._touched = {entry: asked for entry, asked in self._touched.items() if asked > seen}
         return again
 
     def _own_params(self) -> list[Call]:
-        """A survey does not show who follows parameters, so a new master is told of all."""
+        """Subscriptions to parameters, which no survey shows: all are registered at a new master."""
         return [own.call for (kind, _, _), own in self._own.items() if kind is RegistrationKind.PARAM]
 
     def _drop_gone(
         self, kind: RegistrationKind, table: Mapping[str, Sequence[str]], passed: set[str], survey: Survey
     ) -> None:
-        for key, nodes in self._breathing(self._known.providers(kind)):
+        for key, nodes in self._yielder(self._known.providers(kind)):
             there = table.get(key, ())
             for node, api in nodes.items():
                 if node in passed or self._orphans.get(node) == api:
@@ -256,7 +253,7 @@ class Mirror:
     def _add_new(
         self, kind: RegistrationKind, table: Mapping[str, Sequence[str]], passed: set[str], survey: Survey, seen: int
     ) -> None:
-        for key, nodes in self._breathing(table.items()):
+        for key, nodes in self._yielder(table.items()):
             for node in nodes:
                 api = survey.uris.get(node)
                 if node in passed or api is None:
@@ -278,14 +275,14 @@ class Mirror:
             if entry in self._own:
                 if self._touched.get(entry, 0) > seen:
                     return
-                # The master has one provider a service, the last: ours was replaced, and is not pushed in again.
+                # The master keeps the last provider of a service: ours was replaced, and is not registered again.
                 self._forget(*entry)
         self._known.register_service(service, uri, node, api)
 
-    def _learn_types(self, survey: Survey, passed: set[str]) -> None:
-        """A topic whose type is known only now, or another: its publishers' word, since the master keeps the last."""
+    def _update_types(self, survey: Survey, passed: set[str]) -> None:
+        """Update the types of topics: the master has the type that was registered last."""
         types = self._known.types()
-        for topic, type_name in self._breathing(survey.types.items()):
+        for topic, type_name in self._yielder(survey.types.items()):
             if types.get(topic) == type_name or type_name == ANY_TYPE:
                 continue
             for node, api in self._known.at(RegistrationKind.PUBLISHER, topic).items():
@@ -297,7 +294,7 @@ class Mirror:
 
     def _missing(self, survey: Survey, seen: int, ignored: Mapping[str, str]) -> list[Call]:
         again = []
-        for (kind, key, node), own in self._breathing(list(self._own.items())):
+        for (kind, key, node), own in self._yielder(list(self._own.items())):
             if kind is RegistrationKind.PARAM or self._touched.get((kind, key, node), 0) > seen or node in ignored:
                 continue
             there = node in survey.holders[kind].get(key, ()) and survey.uris.get(node) == own.api
@@ -306,26 +303,28 @@ class Mirror:
         return again
 
     def _surplus(self, survey: Survey, seen: int) -> list[Call]:
-        """What the master has of our nodes and we do not: it did not hear that it went."""
+        """Calls that unregister what the master has of our nodes and the copy has not."""
         ours = {node: own.api for (_, _, node), own in self._own.items()}
         nodes = {node: api for node, api in ours.items() if survey.uris.get(node) == api}
         again = []
-        for call, entry in leftovers(survey, nodes, self._breathing):
+        for call, entry in stale_registrations(survey, nodes, self._yielder):
             if entry not in self._own and self._touched.get(entry, 0) <= seen:
                 again.append(call)
         return again
 
 
-def leftovers(survey: Survey, nodes: Mapping[str, str], breathing: Yielder = iter) -> Iterator[tuple[Call, Entry]]:
-    """Everything that a master has of some nodes, and what takes it away.
+def stale_registrations(
+    survey: Survey, nodes: Mapping[str, str], yielder: Yielder = iter
+) -> Iterator[tuple[Call, Entry]]:
+    """Everything that a master has of some nodes: the calls that unregister it, and the registrations.
 
     Args:
-        survey: What the master said.
+        survey: The survey.
         nodes: The nodes and their slave APIs.
-        breathing: For large graphs.
+        yielder: Lets pending data go first in large graphs.
     """
     for kind, table in survey.holders.items():
-        for key, holders in breathing(table.items()):
+        for key, holders in yielder(table.items()):
             for node in holders:
                 if node not in nodes:
                     continue
@@ -337,15 +336,3 @@ def leftovers(survey: Survey, nodes: Mapping[str, str], breathing: Yielder = ite
                         yield ("unregisterSubscriber", (node, key, nodes[node])), entry
                     case _:
                         yield ("unregisterService", (node, key, survey.services.get(key, ""))), entry
-
-
-_ARITY: Final = {
-    "registerPublisher": 4,
-    "registerSubscriber": 4,
-    "registerService": 4,
-    "subscribeParam": 3,
-    "unregisterPublisher": 3,
-    "unregisterSubscriber": 3,
-    "unregisterService": 3,
-    "unsubscribeParam": 3,
-}

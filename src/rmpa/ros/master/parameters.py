@@ -1,7 +1,7 @@
-"""The parameter tree, and who is to be told what of a change.
+"""The parameter tree, and the notifications of its subscribers.
 
-The tree is never changed in place: a change copies the dicts along its path, so whatever was handed out stays as it
-was. Keys are resolved names; a value that is a dict is a namespace.
+The tree is never changed in place: a change copies the dicts along its path, so values that callers hold stay as they
+are. Keys are resolved names; a value that is a dict is a namespace.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ def _without(tree: Tree, parts: list[str]) -> Tree:
     return copy
 
 
-def holds_nil(value: XmlRpcValue, breathing: Yielder = iter) -> bool:
-    """Whether there is a nil in a value, at any depth; ROS has none, and it could not be written again."""
-    return any(part is None for part in breathing(_all_parts(value)))
+def holds_nil(value: XmlRpcValue, yielder: Yielder = iter) -> bool:
+    """Whether there is a nil in a value, at any depth; ROS has none, and no response with it can be written."""
+    return any(part is None for part in yielder(_all_parts(value)))
 
 
 def _all_parts(value: XmlRpcValue) -> Iterator[XmlRpcValue]:
@@ -72,7 +72,7 @@ class Parameters:
 
     @property
     def tree(self) -> Tree:
-        """The whole of it, not to be changed; the same object, and parts of it, until something in them changes."""
+        """The whole tree, not to be changed; the same object until something in it changes, and so are its parts."""
         return self._tree
 
     def get(self, key: str) -> XmlRpcValue:
@@ -101,7 +101,7 @@ class Parameters:
 
         Args:
             key: Its resolved name.
-            value: Kept as it is, not copied: nobody may change it afterwards.
+            value: Stored without a copy; must not be changed afterwards.
 
         Raises:
             TypeError: The root is set to something that is no dict.
@@ -115,7 +115,7 @@ class Parameters:
             raise TypeError("the root of the parameter tree can only be set to a dictionary")
 
     def delete(self, key: str) -> None:
-        """Take ``key`` away.
+        """Delete ``key``.
 
         Raises:
             KeyError: There is none, or it is the root.
@@ -177,27 +177,27 @@ def updates(
     key: str,
     value: XmlRpcValue,
     setter: str | None = None,
-    breathing: Yielder = iter,
+    yielder: Yielder = iter,
 ) -> list[ParamUpdate]:
-    """Who is to be told what after a parameter was set or deleted.
+    """The notifications after a parameter was set or deleted.
 
     Args:
         subscribers: Subscribed keys, each ending in ``/``, with nodes and their slave APIs.
         key: The key that changed.
         value: What it is now; deleted is ``{}``.
-        setter: The node that set it, which is not told of its own namespace's change.
-        breathing: For large values.
+        setter: The node that set it, which is not notified where it subscribed the key or a namespace above.
+        yielder: Lets pending data go first for large values.
 
     Returns:
-        In rosmaster's order: first those who subscribed the key or a namespace above it, or something below that is
-        gone; then those who subscribed something below that is there.
+        In rosmaster's order: first for subscriptions of the key, of a namespace above it, or of something below that
+        is gone; then for subscriptions of something below that exists.
     """
     if not subscribers:
         return []
     key = with_slash(key)
-    # Most values are set where nobody has subscribed something within them, and some are large.
+    # Few values have subscriptions below them, and some are large.
     within = any(subscribed != key and subscribed.startswith(key) for subscribed in subscribers)
-    below = dict(breathing(_below(key, value))) if within else {}
+    below = dict(yielder(_below(key, value))) if within else {}
     found: list[ParamUpdate] = []
     for subscribed, nodes in subscribers.items():
         if key.startswith(subscribed):

@@ -1,7 +1,7 @@
-"""Which registered nodes nothing can connect to: an address without a route, a host name that does not resolve.
+"""Registered nodes to which connecting fails: an address without a route, a host name that does not resolve.
 
-Such a node is not dead for sure: its network may be down for a moment. It stays registered, as at roscore, but after
-``limits.NODE_UNREACHABLE_AFTER`` it is *withdrawn*: peers are no longer offered what nothing could fetch. Pure: the
+Such a node may live: its network may be down for a moment. It stays registered, as at roscore, but after
+``limits.NODE_UNREACHABLE_AFTER`` it is *withdrawn*: its topics and services are no longer offered to peers. Pure: the
 time is an argument.
 """
 
@@ -22,9 +22,9 @@ class Unreachable:
 
     Args:
         api: The slave API's URI that it registered with.
-        problem: What the last attempt said, ready to read.
+        problem: Why the last attempt failed, for people.
         since: When the first attempt failed, in seconds of the monotonic clock.
-        withdrawn: Whether that is so long ago that peers are not offered its topics and services any more.
+        withdrawn: Whether its topics and services are no longer offered to peers.
     """
 
     api: str
@@ -45,7 +45,7 @@ class Reachability:
         return self._nodes
 
     def failed(self, node: str, api: str, problem: str, now: float) -> bool:
-        """Say that an attempt to connect failed, otherwise than by a refusal; whether the node is withdrawn by it."""
+        """An attempt to connect failed, but was not refused; return whether this withdraws the node."""
         known = self._nodes.get(node)
         if known is None or known.api != api:
             known = Unreachable(api, problem, now)
@@ -54,11 +54,11 @@ class Reachability:
         return withdrawn and not known.withdrawn
 
     def reached(self, node: str) -> bool:
-        """Say that a node can be connected to; whether it was withdrawn before."""
+        """A node can be connected to; return whether it was withdrawn before."""
         known = self._nodes.pop(node, None)
         return known is not None and known.withdrawn
 
     def keep(self, nodes: Mapping[str, str]) -> None:
-        """Forget all but these nodes at these slave APIs."""
+        """Drop all but these nodes at these slave APIs."""
         if self._nodes:
             self._nodes = {node: known for node, known in self._nodes.items() if nodes.get(node) == known.api}

@@ -1,7 +1,8 @@
-"""Who publishes, subscribes and serves what: the master's tables, in the order that rosmaster keeps.
+"""The master's tables of publishers, subscribers, services and parameter subscriptions.
 
-Semantics are those of ros_comm's rosmaster 1.15, its order of lists included, because tools print them. Beside the
-tables stand the nodes of the run before (``awaited``): no question shows them until they have answered themselves.
+Semantics are those of ros_comm's rosmaster 1.15, the order of lists included, because tools print them. Nodes
+restored from the previous run (``unverified``) are in no table and no answer until they have been verified
+(``confirm``).
 """
 
 from __future__ import annotations
@@ -9,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from rmpa.ros.master.awaited import Awaited, NodeRecord
 from rmpa.ros.master.effects import Effect, GraphChange, GraphState, PublisherUpdate, RegistrationKind, Shutdown
+from rmpa.ros.master.unverified import NodeRecord, UnverifiedNodes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,7 +22,7 @@ _NOBODY: Final[dict[str, str]] = {}
 
 @dataclass(slots=True)
 class _Node:
-    """One node: where its slave API is, and what it registered (dicts, for their order)."""
+    """One node: its slave API, and what it registered (dicts, for their order)."""
 
     api: str
     keys: dict[RegistrationKind, dict[str, None]] = field(
@@ -36,33 +37,33 @@ class _Node:
 class Registrations:
     """The tables, and what follows from each change.
 
-    Each change appends to ``effects`` (calls to be made to slaves, in order) and to ``changes``; the owner takes
-    them away.
+    Each change appends to ``effects`` (calls to be made to slaves, in order) and to ``changes``; the owner empties
+    both.
     """
 
     def __init__(self) -> None:
         self._nodes: dict[str, _Node] = {}
-        # key -> node -> slave API. The inner dicts are never changed but replaced: they may have been handed out.
+        # key -> node -> slave API. The inner dicts are replaced, never changed: callers may hold them.
         self._tables: dict[RegistrationKind, dict[str, dict[str, str]]] = {kind: {} for kind in RegistrationKind}
         self._service_uris: dict[str, str] = {}
         # service -> node -> service URI, likewise
         self._services: dict[str, dict[str, str]] = {}
         self._types: dict[str, str] = {}
-        # The URI that each node's name was last taken from, while the name is in use.
+        # node -> the slave API from which a new node took the name, while the name is in use.
         self._evicted: dict[str, str] = {}
         self._state: GraphState | None = None
-        self.awaited = Awaited()
-        self._taken_up: set[str] = set()
-        self._count = 0
-        self.marks: dict[str, int] = {}
-        """Of each node that is registered or awaited: a number that is another one after each change of it."""
+        self.unverified = UnverifiedNodes()
+        self._restored: set[str] = set()
+        self._revision = 0
+        self.revisions: dict[str, int] = {}
+        """A number for each registered or unverified node, which differs after each change of the node."""
         self.effects: list[Effect] = []
         self.changes: list[GraphChange] = []
 
     # --- questions --------------------------------------------------------------------------------------------
 
     def node_api(self, node: str) -> str | None:
-        """The slave API of a node, if it has any registration."""
+        """The slave API of a node; ``None`` without any registration."""
         found = self._nodes.get(node)
         return found.api if found is not None else None
 
@@ -105,7 +106,7 @@ class Registrations:
     def state(self) -> GraphState:
         """All registrations; the same object until something changes.
 
-        What is in it is shared with the tables, so that a look at a graph of thousands costs microseconds.
+        The inner dicts are shared with the tables: for a graph of thousands this takes microseconds.
         """
         if self._state is None:
             self._state = GraphState(
@@ -120,16 +121,16 @@ class Registrations:
     # --- changes ----------------------------------------------------------------------------------------------
 
     def register_publisher(self, topic: str, topic_type: str, node: str, api: str) -> None:
-        """Add a publisher and tell the topic's subscribers, also when it was there before.
+        """Add a publisher and notify the topic's subscribers, also when it was registered before.
 
-        Clients rely on the repetition: it is what makes rospy connect again.
+        Clients rely on the repetition: it makes rospy connect again.
         """
         retyped = False
         if topic_type != ANY_TYPE or topic not in self._types:
             retyped = self._types.get(topic) != topic_type
             self._types[topic] = topic_type
         self._register(RegistrationKind.PUBLISHER, topic, node, api, retyped=retyped)
-        self._tell_subscribers(topic)
+        self._notify_subscribers(topic)
 
     def register_subscriber(self, topic: str, topic_type: str, node: str, api: str) -> None:
         """Add a subscriber; its type counts only while the topic has none."""
@@ -140,7 +141,7 @@ class Registrations:
 
     def register_service(self, service: str, uri: str, node: str, api: str) -> None:
         """Make this node the service's provider, in place of any other."""
-        self._seat(node, api)
+        self._claim_name(node, api)
         retyped = self._service_uris.get(service) != uri
         before = self.at(RegistrationKind.SERVICE, service)
         if gone := [other for other in before if other != node]:
@@ -152,17 +153,17 @@ class Registrations:
         self._register(RegistrationKind.SERVICE, service, node, api, retyped=retyped)
 
     def subscribe_param(self, key: str, node: str, api: str) -> None:
-        """Tell this node of changes below ``key``, which ends in ``/``.
+        """Notify this node of changes below ``key``, which ends in ``/``.
 
-        A node that was pushed out does not take its name back by this, as it does at rosmaster, which then asks the
-        new node to end (the one difference by intent; tests/interop/test_core_api.py shows both). roscpp does so: it
-        logs that it was asked to end, and its log asks for a parameter with ``getCached``.
+        A node whose name was taken by another one does not take it back by this. At rosmaster it does, and the new
+        node is asked to end (the one intended difference; tests/interop/test_core_api.py shows both): roscpp logs
+        that it was asked to end, and its log subscribes to a parameter with ``getCached``.
         """
         if self._evicted.get(node) != api:
             self._register(RegistrationKind.PARAM, key, node, api)
 
     def unregister(self, kind: RegistrationKind, key: str, node: str, api: str) -> bool:
-        """Take a publisher, subscriber or parameter's subscriber away, if ``api`` is still that node's.
+        """Remove a publisher, subscriber or parameter subscriber, if ``api`` is still that node's.
 
         Returns:
             Whether it was there.
@@ -172,28 +173,28 @@ class Registrations:
         if found:
             self._remove(kind, key, node, api)
         if kind is RegistrationKind.PUBLISHER and (found or withdrawn):
-            self._tell_subscribers(key)
+            self._notify_subscribers(key)
         self._forget_if_empty(node)
         return found or withdrawn
 
     def unregister_service(self, service: str, uri: str, node: str) -> bool:
-        """Take a service away, if its provider still is this node with this ``rosrpc://`` URI.
+        """Remove a service, if its provider still is this node with this ``rosrpc://`` URI.
 
         Returns:
-            Whether it was so.
+            Whether it was there.
         """
         api = self._tables[RegistrationKind.SERVICE].get(service, {}).get(node)
         found = api is not None and self._service_uris.get(service) == uri
         if api is not None and found:
             self._remove(RegistrationKind.SERVICE, service, node, api)
-        record = self.awaited.get(node)
+        record = self.unverified.get(node)
         if record is not None and record.services.get(service) == uri:
             found = self._withdraw(RegistrationKind.SERVICE, service, node, record.api)
         self._forget_if_empty(node)
         return found
 
     def purge(self, node: str, api: str) -> bool:
-        """Take everything of a dead node away and tell the subscribers of its topics.
+        """Remove everything of a dead node and notify the subscribers of its topics.
 
         Returns:
             Whether there was such a node with this slave API.
@@ -205,16 +206,16 @@ class Registrations:
         self._empty(node)
         self._nodes.pop(node, None)
         self._evicted.pop(node, None)
-        self._touch(node)
+        self._mark_changed(node)
         for topic in topics:
-            self._tell_subscribers(topic)
+            self._notify_subscribers(topic)
         return True
 
-    # --- nodes of the run before ------------------------------------------------------------------------------
+    # --- nodes of the previous run ----------------------------------------------------------------------------
 
     def record(self, node: str) -> NodeRecord | None:
-        """Everything that a node has registered, and what an awaited one had."""
-        found, awaited = self._nodes.get(node), self.awaited.get(node)
+        """Everything that a node has registered, before and after the restart."""
+        found, awaited = self._nodes.get(node), self.unverified.get(node)
         if found is None:
             return awaited
         types = self._types
@@ -234,24 +235,25 @@ class Registrations:
                 record.of(kind).update(awaited.of(kind))  # type: ignore[arg-type] # both of one kind
         return record
 
-    def await_node(self, node: str, record: NodeRecord) -> None:
-        """Remember a node of the run before; nothing shows it. Its topics have their types again."""
-        self.awaited.add(node, record)
+    def restore(self, node: str, record: NodeRecord) -> None:
+        """Restore a node of the previous run as unverified. Its topics have their types again."""
+        self.unverified.add(node, record)
         for topic, topic_type in [*record.publishers.items(), *record.subscribers.items()]:
             self._types.setdefault(topic, topic_type)
         self._state = None
-        self._touch(node)
+        self._mark_changed(node)
 
-    def take_up(self, node: str) -> tuple[list[str], list[str]]:
-        """Show an awaited node, which has answered. What others registered meanwhile stays theirs.
+    def confirm(self, node: str) -> tuple[list[str], list[str]]:
+        """Register an unverified node, which has answered, with all it had. Services of others stay theirs.
 
         Returns:
-            The topics that it publishes and those that it subscribes to: ``announce`` and ``tell`` them.
+            The topics that it publishes, for ``notify_new_subscribers``, and those that it subscribes to, for
+            ``notify_subscriber``.
         """
-        record = self.awaited.pop(node)
+        record = self.unverified.pop(node)
         if record is None:
             return [], []
-        self._taken_up.add(node)
+        self._restored.add(node)
         for topic in record.publishers:
             self._register(RegistrationKind.PUBLISHER, topic, node, record.api)
         for topic in record.subscribers:
@@ -261,62 +263,62 @@ class Registrations:
                 self.register_service(service, uri, node, record.api)
         for key in record.params:
             self._register(RegistrationKind.PARAM, key, node, record.api)
-        self._touch(node)
+        self._mark_changed(node)
         return list(record.publishers), list(record.subscribers)
 
-    def tell(self, topic: str, node: str) -> None:
-        """Tell one subscriber who publishes a topic."""
+    def notify_subscriber(self, topic: str, node: str) -> None:
+        """Send one subscriber the publishers of a topic."""
         api = self.at(RegistrationKind.SUBSCRIBER, topic).get(node)
         if api is not None:
-            publishers = self._publishers(topic, awaited=node in self._taken_up)
+            publishers = self._publishers(topic, unverified=node in self._restored)
             self.effects.append(PublisherUpdate(api, topic, publishers))
 
-    def give_up(self, node: str) -> None:
-        """Forget an awaited node, and tell those that may be connected to it."""
-        record = self.awaited.pop(node)
+    def discard(self, node: str) -> None:
+        """Drop an unverified node, and notify the subscribers that may be connected to it."""
+        record = self.unverified.pop(node)
         if record is not None:
-            self._touch(node)
+            self._mark_changed(node)
             for topic in record.publishers:
-                self._tell_subscribers(topic, self._taken_up.__contains__)
+                self._notify_subscribers(topic, self._restored.__contains__)
 
-    def announce(self, topic: str) -> None:
-        """Tell the subscribers of a topic that do not know those of its publishers that were taken up."""
-        self._tell_subscribers(topic, lambda node: node not in self._taken_up)
+    def notify_new_subscribers(self, topic: str) -> None:
+        """Notify the subscribers of a topic that registered after the restart of its restored publishers."""
+        self._notify_subscribers(topic, lambda node: node not in self._restored)
 
     def _withdraw(self, kind: RegistrationKind, key: str, node: str, api: str) -> bool:
-        """Take a registration of an awaited node away; whether it was there."""
-        if not self.awaited.withdraw(kind, key, node, api):
+        """Remove a registration of an unverified node; whether it was there."""
+        if not self.unverified.withdraw(kind, key, node, api):
             return False
-        record = self.awaited.get(node)
+        record = self.unverified.get(node)
         if record is not None and not any(record.of(kind) for kind in RegistrationKind):
-            self.awaited.pop(node)
-        self._touch(node)
+            self.unverified.pop(node)
+        self._mark_changed(node)
         return True
 
-    def _touch(self, node: str) -> None:
-        """What is to be kept of a node has changed."""
-        if node in self._nodes or self.awaited.get(node) is not None:
-            self._count += 1
-            self.marks[node] = self._count
+    def _mark_changed(self, node: str) -> None:
+        """The record of a node has changed."""
+        if node in self._nodes or self.unverified.get(node) is not None:
+            self._revision += 1
+            self.revisions[node] = self._revision
         else:
-            self.marks.pop(node, None)
-            self._taken_up.discard(node)
+            self.revisions.pop(node, None)
+            self._restored.discard(node)
 
     # --- the tables -------------------------------------------------------------------------------------------
 
-    def _seat(self, node: str, api: str) -> _Node:
-        """The node's record; a node of the same name at another URI is pushed out with all it had."""
-        awaited = self.awaited.get(node)
+    def _claim_name(self, node: str, api: str) -> _Node:
+        """The node's entry; a node of the same name at another URI loses everything and is asked to end."""
+        awaited = self.unverified.get(node)
         if awaited is not None and awaited.api != api:
             self.effects.append(Shutdown(awaited.api, node, tuple(awaited.publishers)))
             self._evicted[node] = awaited.api
-            self.give_up(node)
+            self.discard(node)
         found = self._nodes.get(node)
         if found is not None and found.api != api:
             self.effects.append(Shutdown(found.api, node, tuple(found.keys[RegistrationKind.PUBLISHER])))
             self._empty(node)
             self._evicted[node] = found.api
-            self._taken_up.discard(node)
+            self._restored.discard(node)
             found = None
             # Its place in the order of nodes stays, as rosmaster has it.
         if found is None:
@@ -324,10 +326,10 @@ class Registrations:
         return found
 
     def _register(self, kind: RegistrationKind, key: str, node: str, api: str, *, retyped: bool = False) -> None:
-        keys = self._seat(node, api).keys[kind]
+        keys = self._claim_name(node, api).keys[kind]
         if retyped or key not in keys:
             keys[key] = None
-            self._touch(node)
+            self._mark_changed(node)
         providers = self.at(kind, key)
         new = node not in providers
         if providers.get(node) != api:
@@ -346,7 +348,7 @@ class Registrations:
                 del self._service_uris[key]
                 del self._services[key]
         self._nodes[node].keys[kind].pop(key, None)
-        self._touch(node)
+        self._mark_changed(node)
         self._changed(kind, key, node, api, added=False)
 
     def _empty(self, node: str) -> None:
@@ -362,7 +364,7 @@ class Registrations:
             del self._nodes[node]
             self._evicted.pop(node, None)
             self._state = None
-            self._touch(node)
+            self._mark_changed(node)
 
     def _changed(self, kind: RegistrationKind, key: str, node: str, api: str, *, added: bool) -> None:
         self._state = None
@@ -370,23 +372,23 @@ class Registrations:
             topic_type = "" if kind is RegistrationKind.SERVICE else self._types.get(key, "")
             self.changes.append(GraphChange(kind, added, key, node, api, topic_type))
 
-    def _publishers(self, topic: str, *, awaited: bool) -> tuple[str, ...]:
-        """The slave APIs of a topic's publishers, with or without those of the run before."""
+    def _publishers(self, topic: str, *, unverified: bool) -> tuple[str, ...]:
+        """The slave APIs of a topic's publishers, with or without unverified ones."""
         apis = self.apis(RegistrationKind.PUBLISHER, topic)
-        more = self.awaited.publishers(topic) if awaited else ()
+        more = self.unverified.publishers(topic) if unverified else ()
         return tuple(dict.fromkeys([*apis, *more])) if more else tuple(apis)
 
-    def _tell_subscribers(self, topic: str, which: Callable[[str], bool] | None = None) -> None:
-        """Tell the subscribers of a topic who publishes it, or only those nodes for which ``which`` says so.
+    def _notify_subscribers(self, topic: str, which: Callable[[str], bool] | None = None) -> None:
+        """Send the subscribers of a topic (those that ``which`` accepts) the list of its publishers.
 
-        Who was taken up is connected to publishers that have not answered yet, and would hang up on them.
+        Restored subscribers get unverified publishers too: they are connected to these, and would disconnect.
         """
-        known = self._publishers(topic, awaited=False)
-        old = self._publishers(topic, awaited=True)
+        known = self._publishers(topic, unverified=False)
+        old = self._publishers(topic, unverified=True)
         told: dict[str, tuple[str, ...]] = {}
         for node, api in self.at(RegistrationKind.SUBSCRIBER, topic).items():
             if api not in told and (
                 which is None or which(node)
             ):  # nodelets of one process share an API: it is told once
-                told[api] = old if node in self._taken_up else known
+                told[api] = old if node in self._restored else known
         self.effects += [PublisherUpdate(api, topic, publishers) for api, publishers in told.items()]

@@ -1,6 +1,6 @@
 """Names as rosmaster resolves them: any characters, relative to the caller.
 
-Stricter rules (``core.names``) are for names that we make; a master takes what nodes have always been allowed to say.
+Stricter rules (``core.names``) are for names of our own; a master accepts what rosmaster accepts.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""One look at a master that is another program: what it is asked in one ``system.multicall``, and what it said.
+"""A survey of a master that is another program: one ``system.multicall``, and its answer.
 
-A ROS master tells nobody of changes in its graph, so it has to be looked at. ``getSystemState`` has the names alone;
-where each node and service is must be looked up, all in the same call: a node that restarts has its old name.
+A ROS master does not notify of changes in its graph, so it is polled. ``getSystemState`` has the names alone; the URI
+of each node and service is looked up in the same call, because a node that restarts has the same name.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ Holders = dict[str, tuple[str, ...]]
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """What a master said of its graph.
+    """A master's graph at one moment.
 
     Args:
         holders: By kind, then by topic or service: the nodes, in the master's order.
         types: By topic.
-        run: Which run of the master it was: its process and its ``/run_id``.
-        uris: Slave APIs, of the nodes that were looked up and are there.
-        services: ``rosrpc://`` URIs, of the services that were looked up and are there.
+        run: Identifies the run of the master: its process and its ``/run_id``.
+        uris: Slave APIs of the nodes that were looked up and exist.
+        services: ``rosrpc://`` URIs of the services that were looked up and exist.
     """
 
     holders: dict[RegistrationKind, Holders]
@@ -45,15 +45,15 @@ class Survey:
     services: dict[str, str] = field(default_factory=dict)
 
     def nodes(self) -> dict[str, None]:
-        """Every node of it."""
+        """All nodes."""
         return dict.fromkeys(node for table in self.holders.values() for nodes in table.values() for node in nodes)
 
     def holders_of_services(self) -> Holders:
-        """Every service of it, and its node."""
+        """All services with their nodes."""
         return self.holders[RegistrationKind.SERVICE]
 
     def with_more(self, uris: Mapping[str, str], services: Mapping[str, str]) -> Survey:
-        """The same with more that was looked up."""
+        """A survey with more results of look-ups."""
         return Survey(self.holders, self.types, self.run, {**self.uris, **uris}, {**self.services, **services})
 
 
@@ -63,25 +63,25 @@ def one_call(method: str, params: Sequence[XmlRpcValue]) -> XmlRpcValue:
 
 
 def survey_calls(caller_id: str, nodes: Iterable[str], services: Iterable[str]) -> list[XmlRpcValue]:
-    """What to ask for a survey that looks up these nodes and services; ``read_survey`` reads the answers."""
+    """The calls of a survey that looks up these nodes and services; ``read_survey`` reads the answers."""
     calls = [one_call(method, [caller_id]) for method in _HEAD]
-    # Behind these, so that what is looked up is as new as the state.
+    # Behind the state, so that the look-ups are not older.
     return [*calls, one_call("getParam", [caller_id, "/run_id"]), *lookup_calls(caller_id, nodes, services)]
 
 
 def lookup_calls(caller_id: str, nodes: Iterable[str], services: Iterable[str]) -> list[XmlRpcValue]:
-    """What to ask for the places of nodes and services; ``read_lookups`` reads the answers."""
+    """The calls that look up the URIs of nodes and services; ``read_lookups`` reads the answers."""
     calls = [one_call("lookupNode", [caller_id, node]) for node in nodes]
     return calls + [one_call("lookupService", [caller_id, service]) for service in services]
 
 
 def read_survey(
-    answer: XmlRpcValue, nodes: Sequence[str], services: Sequence[str], *, breathing: Yielder = iter
+    answer: XmlRpcValue, nodes: Sequence[str], services: Sequence[str], *, yielder: Yielder = iter
 ) -> Survey:
     """Read the answer to ``survey_calls`` with the same nodes and services.
 
     Raises:
-        RemoteProtocolError: It is none.
+        RemoteProtocolError: It is malformed.
     """
     if not isinstance(answer, list) or len(answer) < len(_HEAD) + 1:
         raise RemoteProtocolError(f"the master's answer to system.multicall is no list of answers: {brief(answer)}")
@@ -89,40 +89,40 @@ def read_survey(
     if not isinstance(state, list) or len(state) != len(_KINDS):
         raise RemoteProtocolError(f"the master's system state is not three lists: {brief(state)}")
     survey = Survey(
-        {kind: _holders(table, breathing) for kind, table in zip(_KINDS, state, strict=True)},
-        dict(breathing(_pairs(types))),
+        {kind: _holders(table, yielder) for kind, table in zip(_KINDS, state, strict=True)},
+        dict(yielder(_pairs(types))),
         f"{pid} {run_id}",
     )
-    return survey.with_more(*read_lookups(answer[len(_HEAD) + 1 :], nodes, services, breathing=breathing))
+    return survey.with_more(*read_lookups(answer[len(_HEAD) + 1 :], nodes, services, yielder=yielder))
 
 
 def read_lookups(
-    answer: XmlRpcValue, nodes: Sequence[str], services: Sequence[str], *, breathing: Yielder = iter
+    answer: XmlRpcValue, nodes: Sequence[str], services: Sequence[str], *, yielder: Yielder = iter
 ) -> tuple[dict[str, str], dict[str, str]]:
-    """Read the answer to ``lookup_calls`` with the same nodes and services: where they are, those that are.
+    """Read the answer to ``lookup_calls`` with the same nodes and services: the URIs of those that exist.
 
     Raises:
-        RemoteProtocolError: It is none.
+        RemoteProtocolError: It is malformed.
     """
     if not isinstance(answer, list) or len(answer) != len(nodes) + len(services):
         raise RemoteProtocolError(f"the master's answer to system.multicall is no list of answers: {brief(answer)}")
-    found = [_value(one) for one in breathing(answer)]
+    found = [_value(one) for one in yielder(answer)]
     places = [value if isinstance(value, str) else "" for value in found]
     uris = {node: uri for node, uri in zip(nodes, places, strict=False) if uri}
     return uris, {name: uri for name, uri in zip(services, places[len(nodes) :], strict=True) if uri}
 
 
 def _value(answer: XmlRpcValue) -> XmlRpcValue:
-    """The value of one answer out of many: ``None`` where the method failed."""
+    """The value of one answer of a ``system.multicall``; ``None`` where the method failed."""
     match answer:
         case [[1, _, value]]:
             return value
     return None
 
 
-def _holders(table: XmlRpcValue, breathing: Yielder) -> Holders:
+def _holders(table: XmlRpcValue, yielder: Yielder) -> Holders:
     found: Holders = {}
-    for entry in breathing(table) if isinstance(table, list) else ():
+    for entry in yielder(table) if isinstance(table, list) else ():
         match entry:
             case [str(key), list(nodes)]:
                 found[key] = tuple(node for node in nodes if isinstance(node, str))

@@ -20,7 +20,7 @@ Validator: TypeAlias = Callable[[XmlRpcValue, str, str], XmlRpcValue]
 
 
 def anything(value: XmlRpcValue, name: str, caller_id: str) -> XmlRpcValue:  # noqa: ARG001 - a Validator
-    """Every value will do."""
+    """Accept every value."""
     return value
 
 
@@ -40,7 +40,7 @@ def key(value: XmlRpcValue, name: str, caller_id: str) -> str:
 
 
 def node_name(value: XmlRpcValue, name: str, caller_id: str) -> str:
-    """A graph name, resolved; what looks like a URI is none."""
+    """A graph name, resolved; a colon or a space makes it none."""
     given = text(value, name, caller_id)
     if ":" in given or " " in given:
         raise InvalidParameterError(f"{name} {brief(given)} is not a graph name: it has a colon or a space in it")

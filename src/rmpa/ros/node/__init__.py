@@ -1,1 +1,1 @@
-"""TODO room."""
+"""ROS nodes of ours: publications, subscriptions and services at one address."""

@@ -1,4 +1,4 @@
-"""One accepted TCPROS connection: its header comes in, then messages go out."""
+"""One accepted TCPROS connection: receives a header, then sends messages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MESSAGES: Final = 0
 
 
 def keep_alive(sock: socket.socket) -> None:
-    """Let the kernel notice a machine that was switched off, after the same time as roscpp does."""
+    """Let the kernel detect a machine that was switched off, with roscpp's timing."""
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, limits.TCP_KEEPALIVE_IDLE)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, limits.TCP_KEEPALIVE_INTERVAL)
@@ -31,18 +31,18 @@ def keep_alive(sock: socket.socket) -> None:
 
 
 class AcceptedConnection:
-    """A connection that another node opened to us.
+    """A connection that another node opened to one of ours.
 
     Args:
         sock: Accepted, non-blocking; owned from here on.
         number: The node's own number for this connection.
         on_header: Called once, with the fields.
-        on_end: Called once when the other side is gone or broke the protocol (then with the error); not after
-            ``close()`` or ``refuse()``. Its owner may replace it.
+        on_end: Called once when the other side closed the connection or broke the protocol (then with the error); not
+            after ``close()`` or ``refuse()``. The publication or service that takes the connection replaces it.
 
     Attributes:
-        on_bytes: Takes what comes behind the header, as ``runtime.stream`` has it; without one, as for subscribers,
-            it is thrown away.
+        on_bytes: Gets the bytes behind the header, as ``runtime.stream`` defines; without one, as for subscribers,
+            they are dropped.
     """
 
     def __init__(
@@ -55,45 +55,45 @@ class AcceptedConnection:
     ) -> None:
         self.number = number
         self.fields: Header = {}
-        """The other side's header, once it is there."""
+        """The other side's header, once received."""
         self.peer: tuple[str, int] = sock.getpeername()[:2]
         self.messages = 0
-        """Messages given to the connection, later dropped ones included."""
+        """Messages sent, with those that were dropped later."""
         self.on_end = on_end
         self.on_bytes: OnBytes | None = None
         self._on_header = on_header
         self._sock = sock
         self._local_port: int = sock.getsockname()[1]
-        self._heard = False
+        self._has_header = False
         keep_alive(sock)
         self._outbox = Outbox(limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SUBSCRIBER_QUEUE_BYTES)
         self.stream = Stream(sock, on_bytes=self._take, on_close=self._ended, outbox=self._outbox)
 
     @property
     def caller_id(self) -> str:
-        """The other node's name, as it says."""
+        """The other node's name, from its header."""
         return self.fields.get("callerid", "")
 
     @property
     def dropped(self) -> int:
-        """Messages that this connection was too slow for."""
+        """Messages dropped because the other side is slow."""
         return self._outbox.dropped[_MESSAGES]
 
     @property
     def info(self) -> str:
-        """The addresses, in the form that rosnode shows."""
+        """The addresses, in the form of ``rosnode info``."""
         return f"TCPROS connection on port {self._local_port} to [{self.peer[0]}:{self.peer[1]}]"
 
     def accept(
         self, header: Mapping[str, str], queue_messages: int, queue_bytes: int, *, nodelay: bool = False
     ) -> None:
-        """Answer with our header; messages may follow.
+        """Answer with the reply header; messages may follow.
 
         Args:
-            header: Our reply.
-            queue_messages: How many messages may wait for this connection.
+            header: The reply header.
+            queue_messages: Messages in the queue of this connection at most.
             queue_bytes: The same in bytes.
-            nodelay: Whether each message leaves at once, even if the other side did not ask for it.
+            nodelay: Whether TCP_NODELAY is set even if the other side did not ask for it.
         """
         if nodelay or self.fields.get("tcp_nodelay") == "1":
             self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -101,11 +101,11 @@ class AcceptedConnection:
         self.stream.send([encode_header(header)], URGENT)
 
     def bound(self, queue_messages: int, queue_bytes: int) -> None:
-        """Change how much may wait for this connection."""
+        """Change the bounds of the queue."""
         self._outbox.set_bounds(queue_messages, queue_bytes)
 
     def refuse(self, text: str) -> None:
-        """Answer with an error header and close. For good only: the other side does not ask again by itself."""
+        """Answer with an error header and close; the other side does not try again by itself."""
         self.stream.send([encode_header(error_header(text))], URGENT)
         self.close()
 
@@ -115,32 +115,32 @@ class AcceptedConnection:
         return self.stream.send([framed], _MESSAGES)
 
     def begin(self, size: int) -> QueuedMessage:
-        """Begin a message of ``size`` bytes, its length in front, that come in parts."""
+        """Begin a message of ``size`` bytes, its length included, that is sent in parts."""
         self.messages += 1
         return self.stream.open(_MESSAGES, size)
 
-    def extend(self, parcel: QueuedMessage, part: Buffer) -> int:
+    def extend(self, message: QueuedMessage, part: Buffer) -> int:
         """Send a part of it; return how many older ones were dropped for it."""
-        return self.stream.extend(parcel, part)
+        return self.stream.extend(message, part)
 
-    def abandon(self, parcel: QueuedMessage) -> bool:
-        """The rest of it will not come; whether the other side has the beginning, and must be hung up on."""
-        return self.stream.abandon(parcel)
+    def abandon(self, message: QueuedMessage) -> bool:
+        """Give up a message; return whether its beginning was sent, so that the connection has to be closed."""
+        return self.stream.abandon(message)
 
     def close(self) -> None:
         """Close at once, without a call of ``on_end``."""
         self.stream.close()
 
     def _take(self, data: memoryview) -> tuple[int, int]:
-        if self._heard:
+        if self._has_header:
             if self.on_bytes is not None:
                 return self.on_bytes(data)
-            # Nothing may come from a subscriber. Reading it away keeps its end of stream visible.
+            # A subscriber sends nothing; reading on shows the end of the stream.
             return len(data), 0
         fields, consumed, wanted = parse_header(data)
         if fields is None:
             return 0, wanted
-        self._heard = True
+        self._has_header = True
         self.fields = fields
         self._on_header(self, fields)
         if self.on_bytes is not None and consumed < len(data):

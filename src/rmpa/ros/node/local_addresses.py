@@ -1,4 +1,4 @@
-"""The addresses of this machine, for nodes that must tell others where they are."""
+"""The addresses of this machine, from which a node chooses the one to register."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """``get_loggers`` and ``set_logger_level`` of a node of ours, as every roscpp and rospy node has them.
 
-So rqt_logger_level and ``rosservice call /rmpa/set_logger_level rmpa.mesh debug`` turn this program's own log up and
-down while it runs. The messages (roscpp/GetLoggers, roscpp/SetLoggerLevel) are written by hand: the agent starts
-without rosbags and numpy.
+With them rqt_logger_level and ``rosservice call /rmpa/set_logger_level rmpa.mesh debug`` set the levels of this
+program's log while it runs. The messages (roscpp/GetLoggers, roscpp/SetLoggerLevel) are serialized by hand, because
+the agent starts without rosbags and numpy.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class LoggerServices:
 
     Args:
         node: Serves them.
-        call: The core's API, to register them.
-        loggers: The logger behind each name that is shown.
+        call: Calls the core's master.
+        loggers: Python's logger for each name that is shown.
     """
 
     def __init__(self, node: SlaveNode, call: Callable[..., RosReply], loggers: Mapping[str, str]) -> None:
@@ -64,7 +64,7 @@ class LoggerServices:
                 _log.error("! the local core does not take %s: %s", endpoint.service, text)
 
     def close(self) -> None:
-        """Unregister, and serve no more."""
+        """Unregister, and stop serving."""
         node = self._node
         for endpoint in self._endpoints:
             self._call("unregisterService", node.name, endpoint.service, node.service_uri)
@@ -74,7 +74,7 @@ class LoggerServices:
         parts = [LENGTH.pack(len(self._loggers))]
         for name, logger in self._loggers.items():
             level = logging.getLogger(logger).getEffectiveLevel()
-            # The highest that is not above it: there may be levels between those that ROS knows.
+            # The highest level of ROS that is not above it.
             word = next((w for w, number in reversed(_LEVELS.items()) if number <= level), "debug")
             parts += [_string(name), _string(word)]
         call.reply(True, b"".join(parts))
@@ -99,7 +99,7 @@ def _string(text: str) -> bytes:
 
 
 def _strings(raw: Buffer) -> tuple[str, str]:
-    """The two strings that a message is made of."""
+    """The two strings of a request."""
     found: list[str] = []
     start = 0
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""Gives nodes that share one port a loopback address each, ``127.a.b.c``: a client says by it which one it dials."""
+"""Assigns loopback addresses ``127.a.b.c`` to nodes that share one port: the dialled address identifies the node."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _THIRD: Final = 254
 class LoopbackAddresses:
     """The loopback addresses in use, and those freed a short while ago.
 
-    An address follows from the node's name: the same one after a restart, and hardly ever that of another node, so a
-    client with an old address is refused instead of reaching a stranger. A freed address rests
-    (``limits.LOOPBACK_REST``) even for the same node: rospy takes a URI that it has just lost for one that it still
-    has, and does not connect again.
+    An address is a hash of the node's name: it is the same after a restart, and hardly ever another node's, so a
+    client with an old address is refused instead of reaching the wrong node. A freed address is not used again for
+    ``limits.LOOPBACK_REST``, even for the same node: rospy takes a URI that it has just lost for one that it still
+    has, and does not reconnect.
 
     Args:
-        salt: What tells apart the nodes of one name in several graphs of this machine, such as the master's URI.
+        salt: Distinguishes nodes of one name in several graphs of this machine, such as the master's URI.
     """
 
     def __init__(self, salt: str) -> None:
@@ -37,24 +37,24 @@ class LoopbackAddresses:
         self._resting: OrderedDict[str, float] = OrderedDict()
 
     def __len__(self) -> int:
-        """How many are in use."""
+        """Addresses in use."""
         return len(self._used)
 
     def take(self, name: str, now: float) -> str:
-        """The address of a node from now on.
+        """Assign an address to a node.
 
         Args:
             name: The node's name.
             now: Monotonic seconds.
         """
-        self._wake(now)
-        # It ends: there are 16 million addresses, and far fewer nodes and resting ones (LOOPBACK_RESTING_MAX).
+        self._release_rested(now)
+        # There are 16 million addresses, and far fewer nodes and resting ones (LOOPBACK_RESTING_MAX).
         address = next(a for a in self._candidates(name) if a not in self._used and a not in self._resting)
         self._used.add(address)
         return address
 
     def free(self, address: str, now: float) -> None:
-        """The node at an address is gone; nothing happens if the address is not in use.
+        """Free an address; nothing happens if it is not in use.
 
         Args:
             address: As ``take`` gave it.
@@ -63,10 +63,10 @@ class LoopbackAddresses:
         if address in self._used:
             self._used.remove(address)
             self._resting[address] = now
-            self._wake(now)
+            self._release_rested(now)
 
-    def _wake(self, now: float) -> None:
-        """Forget the resting addresses that rested long enough, and the oldest of too many."""
+    def _release_rested(self, now: float) -> None:
+        """Release addresses that rested long enough, and the oldest of too many."""
         while self._resting:
             since = next(iter(self._resting.values()))
             if now - since < limits.LOOPBACK_REST and len(self._resting) <= limits.LOOPBACK_RESTING_MAX:

@@ -1,4 +1,4 @@
-"""A small ROS node for our own tools, demos and tests.
+"""``Node``: a ROS node in Python without ROS, for programs, tools and tests; ``from rmpa.ros import Node``.
 
 ::
 
@@ -25,7 +25,7 @@ from rmpa.core.errors import PeerRefused, RmpaError, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.environment import RosEnvironment, host_of, is_loopback
 from rmpa.ros.http.client import call_api
-from rmpa.ros.node.learn_type import find_or_learn
+from rmpa.ros.node.fetch_type import find_or_fetch
 from rmpa.ros.node.local_addresses import local_addresses
 from rmpa.ros.node.service_client import ServiceConnection
 from rmpa.ros.node.services import Handler, Service, ServiceClient, probe
@@ -53,17 +53,17 @@ _NO_DEFAULT: Final = object()
 class Node:
     """One node, registered at a master as long as the ``async with`` lasts.
 
-    A master that is killed and started again is noticed within ``limits.NODE_MASTER_CHECK`` and gets all
-    registrations anew; connections that stand are kept meanwhile. When the master wants the node to end, it closes
-    itself: ``async for`` loops end and ``stopped`` is set.
+    A restart of the master is detected within ``limits.NODE_MASTER_CHECK``, and everything is registered again; open
+    connections go on meanwhile. When the master shuts the node down, it closes itself: ``async for`` loops end and
+    ``stopped`` is set.
 
     Args:
-        name: As the user writes it; resolved in the namespace. ``__name:=`` replaces it.
-        master_uri: Instead of the environment's.
+        name: Resolved in the namespace; ``__name:=`` replaces it.
+        master_uri: Replaces that of the environment.
         anonymous: Whether the name is made unique.
-        environment: Instead of this process's variables (its arguments are only read through here).
-        on_shutdown: ``(reason)``: the master wants the node to end.
-        on_param_update: ``(key, value)``: a parameter followed by ``follow_param`` has changed.
+        environment: Replaces that of this process's variables; pass one to use command-line arguments.
+        on_shutdown: ``(reason)``: the master shuts the node down.
+        on_param_update: ``(key, value)``: a parameter subscribed to by ``follow_param`` has changed.
 
     Raises:
         ConfigError: A ROS variable cannot be used.
@@ -88,13 +88,13 @@ class Node:
         self.name = environment.node_name(name)
         self.master_uri = master_uri or environment.master_uri
         self.stopped = asyncio.Event()
-        """Set when the node is closed, by whomever."""
+        """Set when the node is closed."""
         self._on_shutdown = on_shutdown
         self._on_param_update = on_param_update
         self._publishers: dict[str, Publisher] = {}
         self._subscribers: dict[str, Subscriber] = {}
         self._services: dict[str, Service] = {}
-        self._followed: set[str] = set()
+        self._param_subscriptions: set[str] = set()
         self._watch: asyncio.Task[None] | None = None
         self._ending: asyncio.Task[None] | None = None
         self._closing: asyncio.Task[None] | None = None
@@ -104,7 +104,7 @@ class Node:
             self._bind,
             self.master_uri,
             advertised_host=host,
-            on_shutdown=self._told_to_stop,
+            on_shutdown=self._shutdown_requested,
             on_param_update=self._param_update,
         )
 
@@ -115,14 +115,14 @@ class Node:
 
     @property
     def slave(self) -> SlaveNode:
-        """The serving side, for its connections and counters."""
+        """The servers of the node, for their connections and counters."""
         return self._slave
 
     async def __aenter__(self) -> Self:
-        """Listen, and see whether the master answers.
+        """Listen, and call the master once.
 
         Raises:
-            UnreachableError: It does not.
+            UnreachableError: The master does not answer.
         """
         await self._slave.start()
         try:
@@ -158,10 +158,10 @@ class Node:
 
         Args:
             topic: Resolved in the namespace; ``~name`` is the node's own.
-            kind: The type: its name, which ``rmpa.ros.types.find`` finds here or a publisher tells; one that was
-                found before; or, for raw bytes only, just a description.
+            kind: The type: its name, which ``rmpa.ros.types.find`` finds here or a publisher sends; a type; or, for
+                raw bytes only, a description.
             latch: Whether each new subscriber gets the last message.
-            queue_messages: Messages that wait for one slow subscriber; the oldest is dropped beyond it.
+            queue_messages: Messages queued for one slow subscriber; above it the oldest is dropped.
 
         Raises:
             DefinitionError: The type is not known.
@@ -170,7 +170,7 @@ class Node:
         """
         resolved = self._resolve(topic)
         if isinstance(kind, str):
-            kind = await find_or_learn(self.master_uri, self.name, kind, resolved)
+            kind = await find_or_fetch(self.master_uri, self.name, kind, resolved)
         description = kind if isinstance(kind, TopicDescription) else kind.describe(latching=latch)
         publisher = Publisher(
             resolved,
@@ -203,11 +203,11 @@ class Node:
 
         Args:
             topic: Resolved in the namespace.
-            kind: The type; ``None`` takes any. The definition is the publisher's where none is found here.
+            kind: The type; ``None`` accepts any. Without a definition on this machine the publisher's is used.
             callback: Called in the loop with each message; what it raises is logged. Without one, use
                 ``async for`` on the result.
             nodelay: Whether to ask publishers for TCP_NODELAY.
-            queue_messages: Messages that wait for the ``async for``; the oldest is dropped beyond it.
+            queue_messages: Messages queued for the ``async for``; above it the oldest is dropped.
 
         Raises:
             DefinitionError: The type is not known.
@@ -218,7 +218,7 @@ class Node:
         resolved = self._resolve(topic)
         type_name = kind if isinstance(kind, str) else ANY
         if isinstance(kind, str):
-            kind = await self._known_here(kind) if kind != ANY else None
+            kind = await self._find_type(kind) if kind != ANY else None
         if resolved in self._subscribers:
             raise ValueError(f"{self.name} subscribes to {resolved} already")
         subscriber = Subscriber(
@@ -251,15 +251,15 @@ class Node:
         kind: str | ServiceType,
         handler: Handler,
         *,
-        timeout: float = config_limits.SERVICE_TIMEOUT,  # noqa: ASYNC109 - of each call, which the client hears of
+        timeout: float = config_limits.SERVICE_TIMEOUT,  # noqa: ASYNC109 - of each call; the client gets an error
     ) -> Service:
         """Serve a service.
 
         Args:
             name: Resolved in the namespace; ``~name`` is the node's own.
             kind: The type.
-            handler: Called in the loop with each request's object; gives the response, as an object or plain values,
-                at once or as an awaitable. What it raises becomes the client's error.
+            handler: Called in the loop with each request's object; returns the response, as an object or plain
+                values, at once or as an awaitable. An exception becomes the client's error.
             timeout: Seconds for a call before the client gets an error.
 
         Raises:
@@ -282,7 +282,7 @@ class Node:
         return service
 
     async def lookup_service(self, name: str) -> str:
-        """Where a service is served, ``rosrpc://host:port``.
+        """The URI of a service, ``rosrpc://host:port``.
 
         Raises:
             UnreachableError: No node serves it, or the master does not answer.
@@ -312,7 +312,7 @@ class Node:
         try:
             return await connect(found)
         except PeerRefused:
-            # Another version of it may be here, too: that of a workspace, and the one that comes with us.
+            # There may be two versions here: one of a workspace, and the one that rmpa brings.
             other = await self._version_of(uri, resolved, found) if isinstance(kind, str) else None
             if other is None:
                 raise
@@ -396,39 +396,39 @@ class Node:
         return str(reply.value) if reply.code == 1 else None
 
     async def follow_param(self, key: str) -> XmlRpcValue:
-        """Have ``on_param_update`` called when a parameter changes; return its value now, ``{}`` for none."""
+        """Subscribe to a parameter: ``on_param_update`` gets its changes; return its value, ``{}`` for none."""
         resolved = self._resolve(key)
-        self._followed.add(resolved)
+        self._param_subscriptions.add(resolved)
         return await self.call_master("subscribeParam", self.uri, resolved)
 
     # --- inside -----------------------------------------------------------------------------------------------
 
     def _hosts(self) -> tuple[str, str]:
-        """The host to tell others, and the address to listen at.
+        """The host to register, and the address to listen at.
 
-        Where nobody asked for an address and the master is on this machine, loopback it is: no other machine can
-        reach that master, and the node goes on when its network is lost.
+        Both are loopback where no address is configured and the master is at a loopback address: no other machine
+        reaches that master, and the node goes on when the network is lost.
         """
         host = self.environment.host
         if not self.environment.host_given and is_loopback(host_of(self.master_uri)):
             host = "127.0.0.1"
         return host, "127.0.0.1" if is_loopback(host) else "0.0.0.0"  # noqa: S104 - as every ROS node does
 
-    async def _known_here(self, name: str) -> MessageType | None:
-        """A message type as it is found here; ``None`` where its publishers may tell it.
+    async def _find_type(self, name: str) -> MessageType | None:
+        """A message type as found on this machine; ``None`` where a publisher may have it.
 
         Raises:
-            DefinitionError: It is malformed, or of a package that comes with us, and not in it.
+            DefinitionError: It is malformed, or not in a package whose types rmpa brings.
         """
         try:
             return await asyncio.to_thread(find_message_type, name)
         except UnknownTypeError as error:
-            if not error.learnable:
+            if not error.fetchable:
                 raise
             return None
 
     async def _version_of(self, uri: str, service: str, found: ServiceType) -> ServiceType | None:
-        """The version of a service type that its server has, if it is another one and found here."""
+        """The server's version of a service type, if it differs and is found here."""
         try:
             said = (await probe(uri, service, self.name, limits.SERVICE_OPEN_TIMEOUT)).description
             other = await asyncio.to_thread(find_service_type, found.name, said.md5sum)
@@ -471,10 +471,10 @@ class Node:
     async def _watch_master(self) -> None:
         while True:
             await asyncio.sleep(limits.NODE_MASTER_CHECK)
-            if not (self._publishers or self._subscribers or self._services or self._followed):
+            if not (self._publishers or self._subscribers or self._services or self._param_subscriptions):
                 continue
             try:
-                if await self._is_forgotten():
+                if await self._is_unknown_to_master():
                     _log.info(
                         "= %s: the master at %s was started anew; registering again", self.name, self.master_uri
                     )
@@ -482,8 +482,8 @@ class Node:
             except RmpaError as error:
                 _log.debug("! %s: %s", self.name, error)
 
-    async def _is_forgotten(self) -> bool:
-        """Whether the master does not know us any more, which only a new one does."""
+    async def _is_unknown_to_master(self) -> bool:
+        """Whether the master has no registration of this node: it was restarted."""
         reply = await self._call("lookupNode", self.name)
         return reply.code != 1
 
@@ -494,24 +494,25 @@ class Node:
             await self._register_subscriber(subscriber, keep=True)
         for service in tuple(self._services.values()):
             await self._register_service(service)
-        for key in tuple(self._followed):
+        for key in tuple(self._param_subscriptions):
             await self.call_master("subscribeParam", self.uri, key)
 
     def _param_update(self, key: str, value: XmlRpcValue) -> bool:
-        # The update of a namespace or of one member concerns those who follow the other.
+        # An update of a namespace concerns subscriptions below it, and the other way round.
         if not any(
-            key == f or key.startswith(f + "/") or f.startswith(key.rstrip("/") + "/") for f in self._followed
+            key == f or key.startswith(f + "/") or f.startswith(key.rstrip("/") + "/")
+            for f in self._param_subscriptions
         ):
             return False
         if self._on_param_update is not None:
             self._on_param_update(key, value)
         return True
 
-    def _told_to_stop(self, reason: str) -> None:
+    def _shutdown_requested(self, reason: str) -> None:
         if self._ending is None and self._closing is None:
             if self._on_shutdown is not None:
                 self._on_shutdown(reason)
-            # Behind the answer to this very call.
+            # Behind the answer to this call.
             self._ending = asyncio.get_running_loop().create_task(self.close(), name=f"shut down {self.name}")
 
     async def _close(self) -> None:
@@ -527,25 +528,25 @@ class Node:
         await self._slave.close()
 
     async def _unregister_all(self) -> None:
-        """Take all registrations back, side by side: what a slow master does not take by one deadline stays there."""
+        """Unregister everything, concurrently and with one deadline for a slow master."""
         at_once = asyncio.Semaphore(limits.NODE_UNREGISTER_AT_ONCE)
 
-        async def take_back(method: str, *params: XmlRpcValue) -> None:
+        async def unregister(method: str, *params: XmlRpcValue) -> None:
             try:
                 async with at_once:
                     await self.call_master(method, *params)
             except RmpaError as error:
                 _log.debug("! %s: %s %s: %s", self.name, method, params, error)
 
-        everything = [
-            *(take_back("unregisterPublisher", topic, self.uri) for topic in self._publishers),
-            *(take_back("unregisterSubscriber", topic, self.uri) for topic in self._subscribers),
-            *(take_back("unregisterService", service, self._slave.service_uri) for service in self._services),
-            *(take_back("unsubscribeParam", self.uri, key) for key in self._followed),
+        calls = [
+            *(unregister("unregisterPublisher", topic, self.uri) for topic in self._publishers),
+            *(unregister("unregisterSubscriber", topic, self.uri) for topic in self._subscribers),
+            *(unregister("unregisterService", service, self._slave.service_uri) for service in self._services),
+            *(unregister("unsubscribeParam", self.uri, key) for key in self._param_subscriptions),
         ]
         try:
             async with asyncio.timeout(limits.NODE_UNREGISTER_TIMEOUT), asyncio.TaskGroup() as group:
-                for one in everything:
+                for one in calls:
                     group.create_task(one, name=f"unregister {self.name}")
         except TimeoutError:
             _log.debug("! %s: the master at %s is slow; not everything is unregistered", self.name, self.master_uri)

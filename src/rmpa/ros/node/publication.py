@@ -1,7 +1,7 @@
-"""The publishing end of one topic, for the subscribers that connect to us.
+"""The publishing end of one topic.
 
-It carries raw bytes. A publication of our own node knows its type from the start; that of a proxy for a remote
-publisher learns it when the route to that publisher opens, and holds its subscribers until then.
+It sends raw bytes. A publication of a node of ours has its type from the start; that of a proxy for a remote
+publisher gets it when the route to that publisher opens, and holds its subscribers until then.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ def _ignore(*_: object) -> None:
 class Publication:
     """One topic of one (real or proxy) node, with its subscribers.
 
-    Demand is the number of connections, held ones included: ``on_first_subscriber`` is called when it leaves 0,
-    ``on_last_subscriber`` when it is 0 again. All callbacks are called in the loop; they may call back.
+    Demand is the number of connections, held ones included. All callbacks are called in the loop; they may call
+    methods of the publication.
 
     Args:
         topic: Its global name; compared literally with what subscribers ask for.
         caller_id: The publishing node's name.
-        description: Type, md5 sum, definition and latching, or ``None`` until ``describe()`` tells.
-        on_first_subscriber: Somebody listens: open the route.
-        on_last_subscriber: Nobody listens any more.
-        on_mismatch: ``(fields, text)``: a subscriber was refused; its header and what it was told.
-        on_listeners: Who is served has changed; see ``listeners``.
-        queue_messages: Messages that wait for one slow subscriber; the oldest is dropped beyond it.
+        description: Type, md5 sum, definition and latching, or ``None`` until ``describe()``.
+        on_first_subscriber: Demand has left 0.
+        on_last_subscriber: Demand is 0 again.
+        on_mismatch: ``(fields, text)``: a subscriber was refused; its header and the text of the error header.
+        on_listeners: ``listeners`` has changed.
+        queue_messages: Messages queued for one slow subscriber; above it the oldest is dropped.
         queue_bytes: The same in bytes; one message always fits.
     """
 
@@ -66,7 +66,7 @@ class Publication:
         self.messages = 0
         """Messages published."""
         self.bytes = 0
-        """Their bytes, lengths included, counted once however many subscribers there are."""
+        """Their bytes, lengths included; each message counts once, whatever the number of subscribers."""
         self._description: TopicDescription | None = None
         self._reply: dict[str, str] = {}
         self._on_first = on_first_subscriber
@@ -78,7 +78,7 @@ class Publication:
         self._held: tuple[AcceptedConnection, ...] = ()
         self._open: tuple[AcceptedConnection, ...] = ()
         self._latched: deque[bytes] = deque(maxlen=1)
-        self._parcels: list[tuple[AcceptedConnection, QueuedMessage]] = []
+        self._partial: list[tuple[AcceptedConnection, QueuedMessage]] = []
         self._whole: bytearray | None = None
         self._size = self._left = 0
         self._dropped_before = 0
@@ -88,12 +88,12 @@ class Publication:
 
     @property
     def description(self) -> TopicDescription | None:
-        """What is published, once it is known."""
+        """The description, once it is known."""
         return self._description
 
     @property
     def latched(self) -> tuple[bytes, ...]:
-        """The messages that are kept for later subscribers, oldest first, with their lengths in front."""
+        """The messages kept for later subscribers, oldest first, with their lengths in front."""
         return tuple(self._latched)
 
     @property
@@ -103,56 +103,58 @@ class Publication:
 
     @property
     def listeners(self) -> tuple[str, ...]:
-        """The caller ids of those that are served, as they gave them."""
-        return tuple(link.caller_id for link in self._open)
+        """The caller ids of the subscribers that are served."""
+        return tuple(connection.caller_id for connection in self._open)
 
     @property
     def dropped(self) -> int:
-        """Messages that slow subscribers missed, those that have left included."""
-        return self._dropped_before + sum(link.dropped for link in self._open)
+        """Messages dropped for slow subscribers, with those that have disconnected."""
+        return self._dropped_before + sum(connection.dropped for connection in self._open)
 
     def connections(self) -> list[BusConnection]:
         """All connections, for ``getBusInfo`` and ``getBusStats``."""
         return [
             BusConnection(
-                link.number,
-                link.caller_id,
+                connection.number,
+                connection.caller_id,
                 OUTBOUND,
                 self.topic,
-                link in self._open,
-                link.info,
-                link.stream.bytes_out,
-                link.messages,
-                link.dropped,
-                link.stream.pending_bytes,
+                connection in self._open,
+                connection.info,
+                connection.stream.bytes_out,
+                connection.messages,
+                connection.dropped,
+                connection.stream.pending_bytes,
             )
-            for link in (*self._open, *self._held)
+            for connection in (*self._open, *self._held)
         ]
 
-    def attach(self, link: AcceptedConnection) -> None:
+    def attach(self, connection: AcceptedConnection) -> None:
         """Take over a connection whose header names this topic: serve it, hold it, or refuse it."""
-        problem = check_subscriber(link.fields, self.topic, self.caller_id, self._description)
+        problem = check_subscriber(connection.fields, self.topic, self.caller_id, self._description)
         if problem is not None:
-            self._refuse(link, problem)
+            self._refuse(connection, problem)
             return
         first = self.subscribers == 0
-        link.on_end = self._gone
+        connection.on_end = self._gone
         if self._description is None:
-            _log.debug("= %s: holds subscriber %s until the type is known", self.topic, printable(link.caller_id))
-            self._held += (link,)
+            _log.debug(
+                "= %s: holds subscriber %s until the type is known", self.topic, printable(connection.caller_id)
+            )
+            self._held += (connection,)
         else:
-            self._serve(link)
+            self._serve(connection)
         if first and self.subscribers:
             self._on_first()
 
     def describe(self, description: TopicDescription) -> int:
-        """Say what is published from now on: held subscribers are served, those that do not fit are refused.
+        """Set the description: held subscribers that match are served, the others refused.
 
-        A publisher may have come back with another definition. Then everybody who was promised the old one is
-        closed, for there is no other way to tell them; rospy subscribers come again on the next ``publisherUpdate``.
+        A restarted publisher may have another definition. Subscribers with the old one are disconnected, because
+        TCPROS has no other way to notify them; rospy reconnects at the next ``publisherUpdate``.
 
         Returns:
-            How many subscribers were closed: if any, the owner should register the topic again.
+            The number of disconnected subscribers: if any, the owner should register the topic again.
 
         Raises:
             ValueError: Type or md5 sum is ``*``; see ``tcpros.publisher_header``.
@@ -164,54 +166,54 @@ class Publication:
             self._latched.clear()
             old, self._open = self._open, ()
             self._on_listeners()
-            for link in old:
-                self._count_out(link)
-                link.close()
+            for connection in old:
+                self._count_dropped(connection)
+                connection.close()
         self._description = description
         self._reply = reply
         held, self._held = self._held, ()
-        for link in held:
-            problem = check_subscriber(link.fields, self.topic, self.caller_id, description)
+        for connection in held:
+            problem = check_subscriber(connection.fields, self.topic, self.caller_id, description)
             if problem is None:
-                self._serve(link)
+                self._serve(connection)
             else:
-                self._refuse(link, problem)
+                self._refuse(connection, problem)
         if before and not self.subscribers:
             self._on_last()
         return len(old)
 
     def publish_framed(self, framed: Buffer) -> int:
-        """Send one message to all subscribers; none waits for another.
+        """Send one message to all subscribers, independently of each other.
 
         Args:
-            framed: The message with its 4-byte length in front. It is not kept, but copied where it must wait.
+            framed: The message with its 4-byte length in front. It is copied where it is queued.
 
         Returns:
-            How many older messages were dropped for it, over all subscribers.
+            Older messages dropped for it, over all subscribers.
         """
         self.messages += 1
         self.bytes += len(framed)
         if self._description is not None and self._description.latching:
             self._latched.append(bytes(framed))
         dropped = 0
-        for link in self._open:
-            dropped += link.send(framed)
+        for connection in self._open:
+            dropped += connection.send(framed)
         return dropped
 
     def begin(self, size: int) -> None:
-        """Begin a message of ``size`` bytes, its length in front, whose parts follow.
+        """Begin a message of ``size`` bytes, its length included, whose parts follow.
 
-        Those that come before its end subscribe too late for it, unless it is kept for such.
+        A subscriber that connects before its end does not get it, unless it is latched.
         """
         self._size = self._left = size
-        self._parcels = [(link, link.begin(size)) for link in self._open]
+        self._partial = [(connection, connection.begin(size)) for connection in self._open]
         latching = self._description is not None and self._description.latching
         self._whole = bytearray() if latching else None
 
     def extend(self, part: Buffer) -> None:
-        """Send a part of it to all that have its beginning; none waits for another."""
-        for link, parcel in self._parcels:
-            link.extend(parcel, part)
+        """Send a part to all subscribers that have its beginning."""
+        for connection, message in self._partial:
+            connection.extend(message, part)
         self._left -= len(part)
         if self._whole is not None:
             self._whole += part
@@ -219,90 +221,92 @@ class Publication:
             return
         self.messages += 1
         self.bytes += self._size
-        began, self._parcels = self._parcels, []
+        partial, self._partial = self._partial, []
         if self._whole is not None:
             framed, self._whole = bytes(self._whole), None
             self._latched.append(framed)
-            served = {link for link, _ in began}
-            for link in self._open:
-                if link not in served:
-                    link.send(framed)
+            served = {connection for connection, _ in partial}
+            for connection in self._open:
+                if connection not in served:
+                    connection.send(framed)
 
     def abort(self) -> int:
-        """The rest of it will not come.
+        """Give up a message whose rest will not come.
 
-        Subscribers that have its beginning are closed: TCPROS has no other way to take back half a message.
+        Subscribers that have its beginning are disconnected: TCPROS has no way to take back half a message.
 
         Returns:
-            How many that were: if any, the owner should register the topic again.
+            Their number: if any, the owner should register the topic again.
         """
-        torn = [link for link, parcel in self._parcels if link.abandon(parcel)]
-        self._parcels = []
+        broken = [connection for connection, message in self._partial if connection.abandon(message)]
+        self._partial = []
         self._whole = None
         before = self.subscribers
-        for link in torn:
-            self._count_out(link)
-            link.close()
-        self._open = tuple(link for link in self._open if link not in torn)
+        for connection in broken:
+            self._count_dropped(connection)
+            connection.close()
+        self._open = tuple(connection for connection in self._open if connection not in broken)
         self._on_listeners()
         if before and not self.subscribers:
             self._on_last()
-        return len(torn)
+        return len(broken)
 
     def bound(self, messages: int) -> None:
-        """Let at most so many messages wait for one slow subscriber from now on."""
+        """Set the bound on messages queued for one slow subscriber."""
         self._queue_messages = min(messages, limits.SUBSCRIBER_QUEUE_MESSAGES)
-        for link in self._open:
-            link.bound(self._queue_messages, self._queue_bytes)
+        for connection in self._open:
+            connection.bound(self._queue_messages, self._queue_bytes)
 
     def keep(self, depth: int) -> None:
-        """Where messages are latched, keep the last ``depth`` of them for later subscribers."""
+        """Set the number of latched messages that are kept for later subscribers."""
         self._latched = deque(self._latched, maxlen=min(depth, limits.LATCHED_MAX))
 
     def forget_latched(self) -> None:
-        """Keep no message for later subscribers: its source is gone, or will send it again."""
+        """Drop the latched messages: their source is gone, or will send them again."""
         self._latched.clear()
 
     async def drained(self, timeout: float = runtime_limits.DRAIN_TIMEOUT) -> None:  # noqa: ASYNC109 - for all together
-        """Wait until all that was published has left, or ``timeout`` seconds are over."""
+        """Wait until all published messages were sent, at most ``timeout`` seconds."""
         if self._open:
-            await asyncio.gather(*(link.stream.drained(timeout) for link in self._open))
+            await asyncio.gather(*(connection.stream.drained(timeout) for connection in self._open))
 
     def withdraw(self) -> None:
-        """Publish no more: close all connections, without a callback."""
+        """Close all connections, without a callback."""
         self._withdrawn = True
-        links, self._held, self._open = (*self._held, *self._open), (), ()
-        for link in links:
-            self._count_out(link)
-            link.close()
+        connections, self._held, self._open = (*self._held, *self._open), (), ()
+        for connection in connections:
+            self._count_dropped(connection)
+            connection.close()
         self._latched.clear()
-        self._parcels = []
+        self._partial = []
         self._whole = None
 
-    def _serve(self, link: AcceptedConnection) -> None:
-        _log.debug("> %s: serves subscriber %s at %s", self.topic, printable(link.caller_id), link.peer[0])
-        link.accept(self._reply, self._queue_messages, self._queue_bytes)
+    def _serve(self, connection: AcceptedConnection) -> None:
+        _log.debug(
+            "> %s: serves subscriber %s at %s", self.topic, printable(connection.caller_id), connection.peer[0]
+        )
+        connection.accept(self._reply, self._queue_messages, self._queue_bytes)
         for framed in self._latched:
-            link.send(framed)
-        if not link.stream.closed:
-            self._open += (link,)
+            connection.send(framed)
+        if not connection.stream.closed:
+            self._open += (connection,)
             self._on_listeners()
 
-    def _refuse(self, link: AcceptedConnection, text: str) -> None:
-        _log.debug("! %s: refuses subscriber %s: %s", self.topic, printable(link.caller_id), text)
-        link.refuse(text)
-        self._on_mismatch(link.fields, text)
+    def _refuse(self, connection: AcceptedConnection, text: str) -> None:
+        _log.debug("! %s: refuses subscriber %s: %s", self.topic, printable(connection.caller_id), text)
+        connection.refuse(text)
+        self._on_mismatch(connection.fields, text)
 
-    def _count_out(self, link: AcceptedConnection) -> None:
-        self._dropped_before += link.dropped
+    def _count_dropped(self, connection: AcceptedConnection) -> None:
+        self._dropped_before += connection.dropped
 
-    def _gone(self, link: AcceptedConnection, error: Exception | None) -> None:
-        _log.debug("< %s: subscriber %s is gone (%s)", self.topic, printable(link.caller_id), error or "closed")
+    def _gone(self, connection: AcceptedConnection, error: Exception | None) -> None:
+        _log.debug("< %s: subscriber %s is gone (%s)", self.topic, printable(connection.caller_id), error or "closed")
         before = self.subscribers
-        self._count_out(link)
-        self._parcels = [(other, parcel) for other, parcel in self._parcels if other is not link]
-        self._held = tuple(other for other in self._held if other is not link)
-        self._open = tuple(other for other in self._open if other is not link)
+        self._count_dropped(connection)
+        self._partial = [(other, message) for other, message in self._partial if other is not connection]
+        self._held = tuple(other for other in self._held if other is not connection)
+        self._open = tuple(other for other in self._open if other is not connection)
         self._on_listeners()
         if before and not self.subscribers and not self._withdrawn:
             self._on_last()

@@ -46,12 +46,12 @@ Done = Callable[["tuple[bool, bytes | bytearray] | ServiceFailed"], None]
 
 @dataclass(eq=False)
 class ServiceFailed(RmpaError):  # noqa: N818 - an event's name
-    """A call got no answer: the server left, was too slow, or broke the protocol.
+    """A call got no response: the server disconnected, was too slow, or broke the protocol.
 
     Args:
-        service: Its name.
-        problem: What happened.
-        sent: Whether the request may have reached the server; if not, the call can be made again elsewhere.
+        service: The service's name.
+        problem: The reason.
+        sent: Whether the request may have reached the server; if not, the call may be repeated.
     """
 
     service: str
@@ -59,7 +59,7 @@ class ServiceFailed(RmpaError):  # noqa: N818 - an event's name
     sent: bool = True
 
     def __str__(self) -> str:
-        """Say which service and what happened."""
+        """The service and the reason."""
         return f"service [{self.service}]: {self.problem}"
 
 
@@ -67,7 +67,7 @@ class ServiceConnection:
     """A connection to a service's server, made by ``open``; one call at a time.
 
     Attributes:
-        service: Its name.
+        service: The service's name.
         fields: The server's header.
     """
 
@@ -104,19 +104,19 @@ class ServiceConnection:
 
         Args:
             uri: ``rosrpc://host:port``.
-            service: The name, as registered there.
-            caller_id: Ours.
-            md5sum: ``*`` takes any.
-            persistent: Whether more than one call will be made.
-            probe: Whether no call will be made at all.
-            timeout: Seconds for both together.
-            on_closed: Called once when the server closes it while no call is under way.
+            service: The service's registered name.
+            caller_id: The calling node.
+            md5sum: ``*`` accepts any.
+            persistent: Whether the connection is for more than one call.
+            probe: Whether the connection is for no call at all.
+            timeout: Seconds for the connection and the headers together.
+            on_closed: Called once when the server closes the connection while no call is under way.
 
         Raises:
-            ConfigError: ``uri`` is not one.
-            UnreachableError: Nobody answers there, or not in time.
+            ConfigError: ``uri`` is malformed.
+            UnreachableError: The server does not answer, or not in time.
             PeerRefused: The server answers with an error header, or has another md5 sum.
-            RemoteProtocolError: What answers there is not a service's server.
+            RemoteProtocolError: The answer is not that of a service's server.
         """
         host, port = parse_service_uri(uri)
         header = client_header(service, caller_id, md5sum=md5sum, persistent=persistent, probe=probe)
@@ -143,17 +143,17 @@ class ServiceConnection:
 
     @property
     def description(self) -> ServiceDescription:
-        """What the server says of its service; a roscpp client needs less, so fields may be empty."""
+        """The server's description; fields that roscpp clients do not need may be empty."""
         return ServiceDescription.from_header(self.fields)
 
     @property
     def caller_id(self) -> str:
-        """The server's node, as it says; may be empty."""
+        """The server's node, from its header; may be empty."""
         return self.fields.get("callerid", "")
 
     @property
     def closed(self) -> bool:
-        """Whether no call can be made any more."""
+        """Whether the connection is closed."""
         return self._stream.closed
 
     @property
@@ -166,13 +166,14 @@ class ServiceConnection:
         body: Buffer,
         timeout: float | None = None,  # noqa: ASYNC109 - the message names it
     ) -> tuple[bool, bytes | bytearray]:
-        """Send a request and wait for its reply: whether it went well, and the response or the error's text.
+        """Send a request and wait for its reply: the ``ok`` byte, and the response or the text of the error.
 
-        Whoever is cancelled here closes the connection: its reply would be taken for the next one's.
+        Cancellation closes the connection: the reply would be taken for that of the next call.
 
         Raises:
             LocalProtocolError: Another call is under way.
-            ServiceFailed: The server left, or did not answer within ``timeout`` seconds; the connection is closed.
+            ServiceFailed: The server disconnected, or did not answer within ``timeout`` seconds; the connection is
+                closed.
         """
         future: asyncio.Future[tuple[bool, bytes | bytearray]] = self._loop.create_future()
 
@@ -192,26 +193,26 @@ class ServiceConnection:
             raise
 
     def request(self, body: Buffer, done: Done, timeout: float | None = None) -> None:
-        """The same without waiting: ``done`` gets the reply, or the error; once, from the loop.
+        """The same without waiting: ``done`` is called once from the loop, with the reply or the error.
 
-        ``body`` must not change until then, where it is larger than ``service_stream.INLINE``.
+        A ``body`` larger than ``service_stream.INLINE`` must not change until then.
 
         Raises:
             LocalProtocolError: Another call is under way.
-            ServiceFailed: The server has closed the connection meanwhile (``sent`` is ``False``), or the request is
-                larger than ``limits.SERVICE_MESSAGE_MAX``.
+            ServiceFailed: The server has closed the connection (``sent`` is ``False``), or the request is larger than
+                ``limits.SERVICE_MESSAGE_MAX``.
         """
         if self.busy:
             raise LocalProtocolError(f"two calls at once over one connection to {self.service}")
         if len(body) > limits.SERVICE_MESSAGE_MAX:
             text = f"request of {len(body)} bytes exceeds the limit of {limits.SERVICE_MESSAGE_MAX}"
             raise ServiceFailed(self.service, text, sent=False)
-        if self._stream.closed or self._was_left():
+        if self._stream.closed or self._was_closed_by_server():
             self._stream.close()
             raise ServiceFailed(self.service, "its server has closed the connection", sent=False)
         self._done = done
         if timeout is not None:
-            self._timer = self._loop.call_later(timeout, self._too_late, timeout)
+            self._timer = self._loop.call_later(timeout, self._timed_out, timeout)
         head = LENGTH.pack(len(body))
         if len(body) > INLINE:
             self._sending = self._loop.create_task(self._send_large(head, body), name=f"request of {self.service}")
@@ -219,14 +220,14 @@ class ServiceConnection:
             self._stream.send([head, body], BODIES)
 
     def close(self) -> None:
-        """Close at once; a call under way fails from within this."""
+        """Close at once; a call under way fails within this call."""
         self._on_closed = None
         self._stop("the connection was closed")
 
     # --- inside -----------------------------------------------------------------------------------------------
 
     async def _exchange(self, header: Header, md5sum: str) -> None:
-        assert self._header is not None  # noqa: S101 - set at its birth
+        assert self._header is not None  # noqa: S101 - set by __init__
         self._stream.send([encode_header(header)], BODIES)
         self.fields = await self._header
         self._header = None
@@ -235,8 +236,8 @@ class ServiceConnection:
             who = printable(self.caller_id) or "its server"
             raise PeerRefused(f"service {self.service}: {who}", problem)
 
-    def _was_left(self) -> bool:
-        """Whether the server closed this while nobody looked; costs less than a call that fails."""
+    def _was_closed_by_server(self) -> bool:
+        """Whether the server closed the connection since the last call; cheaper than a call that fails."""
         try:
             return not self._sock.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
         except (BlockingIOError, InterruptedError):
@@ -288,7 +289,7 @@ class ServiceConnection:
         if done is not None:
             done(result)
 
-    def _too_late(self, timeout: float) -> None:
+    def _timed_out(self, timeout: float) -> None:
         self._timer = None
         self._stop(f"no answer within {timeout:g} s")
 

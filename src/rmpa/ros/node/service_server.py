@@ -38,27 +38,26 @@ _WHOLE: Final = 64 * KIB
 
 Describe = Callable[[], Awaitable[ServiceDescription | str]]
 Serve = Callable[["ServiceCall"], None]
-Respond = Callable[["ServiceCall"], Awaitable[tuple[bool, "Buffer"]]]
 
 
 class ServiceCall:
     """One request, until it is answered.
 
     Attributes:
-        service: The service's name here.
+        service: The service's name in this graph.
         caller_id: The calling node.
-        request: The request's bytes, without a length; belongs to the call and never changes.
-        deadline: ``loop.time()`` at which the client gets an error by itself.
-        on_gone: Set it to hear that no answer is wanted any more: the client has left, the deadline is over, or the
-            service is withdrawn. Called once at the most, and never behind ``reply``.
+        request: The request's bytes, without a length; never changed.
+        deadline: ``loop.time()`` at which the client gets an error.
+        on_gone: Set by the handler; called at most once when no answer is needed any more, because the client has
+            disconnected, the deadline is over, or the service is withdrawn. Never called behind ``reply``.
     """
 
-    __slots__ = ("_session", "caller_id", "deadline", "on_gone", "request", "service")
+    __slots__ = ("_client", "caller_id", "deadline", "on_gone", "request", "service")
 
     def __init__(
-        self, session: _ClientConnection, service: str, caller_id: str, request: bytes | bytearray, deadline: float
+        self, client: _ClientConnection, service: str, caller_id: str, request: bytes | bytearray, deadline: float
     ) -> None:
-        self._session: _ClientConnection | None = session
+        self._client: _ClientConnection | None = client
         self.service = service
         self.caller_id = caller_id
         self.request = request
@@ -67,43 +66,42 @@ class ServiceCall:
 
     @property
     def answered(self) -> bool:
-        """Whether an answer has been given, or is not wanted any more."""
-        return self._session is None
+        """Whether the call was answered, or needs no answer any more."""
+        return self._client is None
 
     def reply(self, ok: bool, body: Buffer) -> None:
-        """Answer; ``body`` is the response, or for ``ok=False`` the error's text. The first answer counts."""
-        session, self._session = self._session, None
-        if session is not None:
+        """Answer; ``body`` is the response, or for ``ok=False`` the text of the error. Later answers are ignored."""
+        client, self._client = self._client, None
+        if client is not None:
             self.on_gone = None
-            session.reply(ok, body)
+            client.reply(ok, body)
 
     def fail(self, text: str) -> None:
         """Answer with an error."""
         self.reply(False, text.encode(errors="replace"))
 
     def abandon(self) -> None:
-        """No answer is wanted any more; for the endpoint."""
-        self._session = None
+        """The call needs no answer any more; for the endpoint."""
+        self._client = None
         on_gone, self.on_gone = self.on_gone, None
         if on_gone is not None:
             try:
                 on_gone()
-            except Exception:  # noqa: BLE001 - a stranger's code within a connection's end
+            except Exception:  # noqa: BLE001 - a handler's mistake must not reach the connection
                 _log.exception("! %s: the end of a call failed", self.service)
 
 
 class ServiceEndpoint:
-    """One service of a node: takes its connections, and hands each request over as a ``ServiceCall``.
+    """One service of a node: takes its connections, and passes each request on as a ``ServiceCall``.
 
     Args:
         service: The global name, compared literally.
         caller_id: The serving node's name.
-        serve: Called in the loop with each request; answers at once or later by ``call.reply``. What it raises
-            becomes the client's error. ``responding(async_function)`` makes one of a coroutine function.
-        describe: Asked when the first header comes and nothing is known (``description`` is ``None``); returns the
-            description, which is kept, or the text of a refusal, which is not. Connections that come meanwhile wait
-            for the same answer.
-        description: What is known from the start.
+        serve: Called in the loop with each request; answers at once or later by ``call.reply``. An exception becomes
+            the client's error.
+        describe: Called at a header while ``description`` is ``None``; returns the description, or the text of an
+            error header, after which it is called again. Connections that come meanwhile wait for the same result.
+        description: The description, if it is known.
         timeout: Seconds for a call before the client gets an error.
         on_mismatch: ``(fields, text)``: a client with another md5 sum was refused.
     """
@@ -124,80 +122,82 @@ class ServiceEndpoint:
         self.serve = serve
         self.timeout = timeout
         self.description = description
-        """What clients are told; ``None`` to have ``describe`` asked at the next header."""
+        """The description for clients; with ``None``, ``describe`` is called at the next header."""
         self.calls = 0
-        """Requests taken so far."""
+        """Requests received."""
         self.failed = 0
-        """Of these, answered with an error."""
+        """Requests answered with an error."""
         self._describe = describe
         self._on_mismatch = on_mismatch
-        self._sessions: set[_ClientConnection] = set()
+        self._clients: set[_ClientConnection] = set()
         self._waiting: list[_ClientConnection] = []
-        self._asking: asyncio.Task[None] | None = None
+        self._describing: asyncio.Task[None] | None = None
         self._empty: asyncio.Future[None] | None = None
 
     @property
     def connections(self) -> int:
         """Open connections."""
-        return len(self._sessions)
+        return len(self._clients)
 
-    def attach(self, link: AcceptedConnection) -> None:
-        """Take a connection whose header names this service and has the fields that it needs."""
-        session = _ClientConnection(self, link)
-        self._sessions.add(session)
+    def attach(self, connection: AcceptedConnection) -> None:
+        """Take a connection whose header names this service and has the required fields."""
+        client = _ClientConnection(self, connection)
+        self._clients.add(client)
         if self.description is not None:
-            session.open(self.description, resume=False)
+            client.open(self.description, resume=False)
             return
-        self._waiting.append(session)
-        if self._asking is None:
-            self._asking = asyncio.get_running_loop().create_task(self._ask(), name=f"describe {self.service}")
+        self._waiting.append(client)
+        if self._describing is None:
+            self._describing = asyncio.get_running_loop().create_task(
+                self._fetch_description(), name=f"describe {self.service}"
+            )
 
     def withdraw(self, text: str = "") -> None:
         """Close all connections; calls under way get an error with ``text``."""
         text = text or f"service [{self.service}] is no longer offered by [{self.caller_id}]"
-        if self._asking is not None:
-            self._asking.cancel()
+        if self._describing is not None:
+            self._describing.cancel()
         self._refuse_waiting(text)
-        for session in tuple(self._sessions):
-            session.withdraw(text)
+        for client in tuple(self._clients):
+            client.withdraw(text)
 
     async def closed(self) -> None:
-        """Behind ``withdraw``: wait, a moment at the most, until the last replies have left."""
-        if self._sessions:
+        """After ``withdraw``: wait until the last replies were sent, at most ``DRAIN_TIMEOUT``."""
+        if self._clients:
             self._empty = asyncio.get_running_loop().create_future()
             await asyncio.wait([self._empty], timeout=runtime_limits.DRAIN_TIMEOUT)
-        for session in tuple(self._sessions):
-            session.close()
+        for client in tuple(self._clients):
+            client.close()
 
     def mismatch(self, fields: Mapping[str, str], text: str) -> None:
-        """A client's md5 sum does not fit; for the sessions."""
+        """A client's md5 sum does not match; for its connection."""
         if self._on_mismatch is not None:
             self._on_mismatch(fields, text)
         else:
             _log.warning("! %s", text)
 
-    def left(self, session: _ClientConnection) -> None:
-        """A connection has ended; for the sessions."""
-        self._sessions.discard(session)
-        if session in self._waiting:
-            self._waiting.remove(session)
-        if not self._sessions and self._empty is not None and not self._empty.done():
+    def remove(self, client: _ClientConnection) -> None:
+        """A connection has ended; for the connection."""
+        self._clients.discard(client)
+        if client in self._waiting:
+            self._waiting.remove(client)
+        if not self._clients and self._empty is not None and not self._empty.done():
             self._empty.set_result(None)
 
-    async def _ask(self) -> None:
+    async def _fetch_description(self) -> None:
         try:
-            answer = await self._answer()
+            answer = await self._call_describe()
         finally:
-            self._asking = None
+            self._describing = None
         if isinstance(answer, str):
             self._refuse_waiting(answer)
             return
         self.description = answer
         waiting, self._waiting = self._waiting, []
-        for session in waiting:
-            session.open(answer)
+        for client in waiting:
+            client.open(answer)
 
-    async def _answer(self) -> ServiceDescription | str:
+    async def _call_describe(self) -> ServiceDescription | str:
         if self._describe is None:
             return f"service [{self.service}] has no description yet"
         try:
@@ -213,18 +213,18 @@ class ServiceEndpoint:
 
     def _refuse_waiting(self, text: str) -> None:
         waiting, self._waiting = self._waiting, []
-        for session in waiting:
-            session.refuse(text)
+        for client in waiting:
+            client.refuse(text)
 
 
 class _ClientConnection:
-    """One client's connection: a request, its reply, and the next one where it is persistent."""
+    """One client's connection: a request, its reply, and if it is persistent the next request."""
 
-    def __init__(self, endpoint: ServiceEndpoint, link: AcceptedConnection) -> None:
+    def __init__(self, endpoint: ServiceEndpoint, connection: AcceptedConnection) -> None:
         self._endpoint = endpoint
-        self._link = link
+        self._connection = connection
         self._loop = asyncio.get_running_loop()
-        self._persistent = is_persistent(link.fields)
+        self._persistent = is_persistent(connection.fields)
         self._open = False
         self._ended = False
         self._taking = False
@@ -236,33 +236,33 @@ class _ClientConnection:
         self._deadline: asyncio.TimerHandle | None = None
         self._stall: asyncio.TimerHandle | None = None
         self._seen = 0
-        link.on_bytes = self._take
-        link.on_end = self._left
+        connection.on_bytes = self._take
+        connection.on_end = self._left
 
     def open(self, description: ServiceDescription, *, resume: bool = True) -> None:
-        """Answer the header; ``resume`` unless this is the very read that the header came with."""
-        link, endpoint = self._link, self._endpoint
-        problem = check_client(link.fields, endpoint.service, endpoint.caller_id, description)
+        """Answer the header; ``resume`` unless called within the read that brought the header."""
+        connection, endpoint = self._connection, self._endpoint
+        problem = check_client(connection.fields, endpoint.service, endpoint.caller_id, description)
         if problem is not None:
-            endpoint.mismatch(link.fields, problem)
+            endpoint.mismatch(connection.fields, problem)
             self.refuse(problem)
             return
         self._open = True
-        link.stream.outbox.set_terms(BODIES, limits.SUBSCRIBER_QUEUE_MESSAGES, spared=True)
+        connection.stream.outbox.set_terms(BODIES, limits.SUBSCRIBER_QUEUE_MESSAGES, spared=True)
         header = server_header(endpoint.caller_id, description)
-        link.accept(header, limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SERVICE_MESSAGE_MAX, nodelay=True)
-        if not self._persistent or is_probe(link.fields):
-            self._watch()
+        connection.accept(header, limits.SUBSCRIBER_QUEUE_MESSAGES, limits.SERVICE_MESSAGE_MAX, nodelay=True)
+        if not self._persistent or is_probe(connection.fields):
+            self._start_stall_timer()
         if resume:
             self._resume()
 
     def refuse(self, text: str) -> None:
         """Answer with an error header and close."""
-        self._link.refuse(text)
-        self._over()
+        self._connection.refuse(text)
+        self._release()
 
     def withdraw(self, text: str) -> None:
-        """The service is gone."""
+        """The service is withdrawn."""
         call, self._call = self._call, None
         if call is not None and not self._ended:
             call.abandon()
@@ -275,8 +275,8 @@ class _ClientConnection:
 
     def close(self) -> None:
         """Close the connection."""
-        self._link.close()
-        self._over()
+        self._connection.close()
+        self._release()
 
     def reply(self, ok: bool, body: Buffer) -> None:
         """Answer the call that is under way."""
@@ -299,18 +299,18 @@ class _ClientConnection:
         return consumed, wanted
 
     def _step(self, data: memoryview) -> tuple[int, int]:
-        """Take one thing off what has come: a request, a part of a large one, or of one that is too large."""
+        """Consume a request, a part of a large one, or a part of one that is too large."""
         if self._discard:
             count = min(self._discard, len(data))
             self._discard -= count
             if not self._discard:
-                self._unwatch()
-                self._settle()
+                self._stop_stall_timer()
+                self._reply_sent()
             return count, 0
         if self._body is not None:
             return self._grow(data)
         if self._busy:
-            # One request at a time; what comes before its answer waits, one more at the most.
+            # One request at a time; at most one more is buffered.
             if len(data) > limits.SERVICE_MESSAGE_MAX + LENGTH.size:
                 raise LimitExceeded("what was sent ahead of a reply", len(data), limits.SERVICE_MESSAGE_MAX)
             return 0, 0
@@ -320,15 +320,15 @@ class _ClientConnection:
         end = LENGTH.size + size
         if size <= _WHOLE:
             if len(data) < end:
-                self._watch()
+                self._start_stall_timer()
                 return 0, end
-            self._begin(bytes(data[LENGTH.size : end]))
+            self._start_call(bytes(data[LENGTH.size : end]))
             return end, 0
         if size > limits.SERVICE_MESSAGE_MAX:
             self._too_large(size)
         else:
             self._body = BodyBuffer(size)
-        self._watch()
+        self._start_stall_timer()
         return LENGTH.size, 0
 
     def _grow(self, data: memoryview) -> tuple[int, int]:
@@ -337,31 +337,31 @@ class _ClientConnection:
         count = body.take(data)
         if body.whole:
             self._body = None
-            self._begin(body.data)
+            self._start_call(body.data)
         return count, 0
 
     @property
     def _busy(self) -> bool:
         return not self._open or self._call is not None or self._sending is not None or self._served
 
-    def _begin(self, request: bytes | bytearray) -> None:
-        self._unwatch()
+    def _start_call(self, request: bytes | bytearray) -> None:
+        self._stop_stall_timer()
         endpoint = self._endpoint
         endpoint.calls += 1
         deadline = self._loop.time() + endpoint.timeout
-        call = ServiceCall(self, endpoint.service, self._link.caller_id, request, deadline)
+        call = ServiceCall(self, endpoint.service, self._connection.caller_id, request, deadline)
         self._call = call
         try:
             endpoint.serve(call)
         except RmpaError as error:
             call.fail(str(error))
-        except Exception:  # noqa: BLE001 - a stranger's code within a connection
+        except Exception:  # noqa: BLE001 - a handler's mistake must not reach the connection
             _log.exception("! %s: a call of %s failed", endpoint.service, printable(call.caller_id))
             call.fail(f"service [{endpoint.service}]: [{endpoint.caller_id}] failed at this call; its log says why")
         if not call.answered:
-            self._deadline = self._loop.call_at(deadline, self._too_late)
+            self._deadline = self._loop.call_at(deadline, self._timed_out)
 
-    def _too_late(self) -> None:
+    def _timed_out(self) -> None:
         self._deadline = None
         call, self._call = self._call, None
         if call is not None:
@@ -376,7 +376,7 @@ class _ClientConnection:
             f"request of {size} bytes to service [{self._endpoint.service}] exceeds the limit of "
             f"{limits.SERVICE_MESSAGE_MAX}"
         )
-        _log.warning("! %s: a %s", printable(self._link.caller_id), text)
+        _log.warning("! %s: a %s", printable(self._connection.caller_id), text)
         self._respond(False, text.encode())
 
     # --- replies ----------------------------------------------------------------------------------------------
@@ -391,133 +391,105 @@ class _ClientConnection:
             body = f"{text}{limits.SERVICE_MESSAGE_MAX}".encode()
         self._endpoint.failed += not ok
         head, body = frame_reply(ok, body)
-        stream = self._link.stream
+        stream = self._connection.stream
         if len(body) > INLINE:
             if isinstance(body, memoryview):
-                body = bytes(body)  # it may be valid for this call only
+                body = bytes(body)  # a view may be valid during this call only
             self._sending = self._loop.create_task(self._send_large(head, body), name="service response")
             return
         stream.send([head, body], BODIES)
         if stream.pending_bytes:
-            # Nothing is taken from a client that does not read what it asked for.
+            # No request is read from a client that does not read its replies.
             self._sending = self._loop.create_task(self._drain(), name="service response drains")
             return
-        self._settle()
+        self._reply_sent()
 
     async def _send_large(self, head: bytes, body: Buffer) -> None:
         try:
-            await send_large(self._link.stream, head, body)
+            await send_large(self._connection.stream, head, body)
             await self._drained()
         finally:
             self._sending = None
-        self._settle()
+        self._reply_sent()
 
     async def _drain(self) -> None:
         try:
             await self._drained()
         finally:
             self._sending = None
-        self._settle()
+        self._reply_sent()
 
     async def _drained(self) -> None:
-        stream = self._link.stream
+        stream = self._connection.stream
         while stream.pending_bytes and not stream.closed:
             await stream.drained()
 
-    def _settle(self) -> None:
-        """A reply has left: close, or go on with what has come meanwhile."""
+    def _reply_sent(self) -> None:
+        """A reply was sent: close, or go on with the next request."""
         if self._discard or self._ended or self._sending is not None or self._call is not None:
             return
         if self._persistent:
             self._resume()
             return
         self._served = True
-        # Not now: a reply from within a read of another connection leaves at the end of that.
+        # Not now: a reply within a read of another connection is sent at the end of that read.
         self._loop.call_soon(self._close_served)
 
     def _close_served(self) -> None:
         if self._ended:
             return
-        if self._link.stream.pending_bytes and self._sending is None:
+        if self._connection.stream.pending_bytes and self._sending is None:
             self._sending = self._loop.create_task(self._drain(), name="service response drains")
             return
         self.close()
 
     def _resume(self) -> None:
         if not self._taking and not self._ended:
-            self._link.stream.feed(b"")
+            self._connection.stream.feed(b"")
 
     # --- the end ----------------------------------------------------------------------------------------------
 
-    def _watch(self) -> None:
-        """Bytes must come soon."""
+    def _start_stall_timer(self) -> None:
+        """Close the connection if no bytes come within ``limits.SERVICE_STALL``."""
         if self._stall is None:
-            self._seen = self._link.stream.bytes_in
+            self._seen = self._connection.stream.bytes_in
             self._stall = self._loop.call_later(limits.SERVICE_STALL, self._stalled)
 
-    def _unwatch(self) -> None:
+    def _stop_stall_timer(self) -> None:
         if self._stall is not None:
             self._stall.cancel()
             self._stall = None
 
     def _stalled(self) -> None:
         self._stall = None
-        if self._link.stream.bytes_in != self._seen:
-            self._watch()
+        if self._connection.stream.bytes_in != self._seen:
+            self._start_stall_timer()
             return
-        who = printable(self._link.caller_id)
+        who = printable(self._connection.caller_id)
         _log.debug("! %s: %s sent nothing for %g s; closed", self._endpoint.service, who, limits.SERVICE_STALL)
         self.close()
 
-    def _left(self, _link: AcceptedConnection, error: Exception | None) -> None:
+    def _left(self, _connection: AcceptedConnection, error: Exception | None) -> None:
         if error is not None and not isinstance(error, OSError):
-            _log.warning("! %s: %s: %s", self._endpoint.service, printable(self._link.caller_id), error)
-        self._over()
+            _log.warning("! %s: %s: %s", self._endpoint.service, printable(self._connection.caller_id), error)
+        self._release()
 
-    def _over(self) -> None:
+    def _release(self) -> None:
         self._ended = True
-        self._unwatch()
+        self._stop_stall_timer()
         if self._deadline is not None:
             self._deadline.cancel()
             self._deadline = None
         if self._sending is not None:
             self._sending.cancel()
-        self._link.on_bytes = None
-        self._link.on_end = _ended
-        self._endpoint.left(self)
+        self._connection.on_bytes = None
+        self._connection.on_end = _ended
+        self._endpoint.remove(self)
         call, self._call = self._call, None
         if call is not None:
             self._endpoint.failed += 1
             call.abandon()
 
 
-def _ended(_link: AcceptedConnection, _error: Exception | None) -> None:
-    """Of a connection that was let go of."""
-
-
-def responding(respond: Respond) -> Serve:
-    """A ``serve`` that runs a coroutine function for each call; it is cancelled when the client leaves."""
-    tasks: set[asyncio.Task[None]] = set()
-
-    async def run(call: ServiceCall) -> None:
-        try:
-            ok, body = await respond(call)
-        except RmpaError as error:
-            call.fail(str(error))
-        except Exception:  # noqa: BLE001 - a task's top: the client must hear of it
-            _log.exception("! %s: a call of %s failed", call.service, printable(call.caller_id))
-            call.fail(f"service [{call.service}] failed at this call; its log says why")
-        else:
-            call.reply(ok, body)
-
-    def serve(call: ServiceCall) -> None:
-        task = asyncio.get_running_loop().create_task(run(call), name=f"call of {call.service}")
-        tasks.add(task)
-        task.add_done_callback(tasks.discard)
-
-        def gone() -> None:
-            task.cancel()
-
-        call.on_gone = gone
-
-    return serve
+def _ended(_connection: AcceptedConnection, _error: Exception | None) -> None:
+    """``on_end`` of a connection that the endpoint has released."""

@@ -1,4 +1,4 @@
-"""Sends the bodies of requests and responses: small ones in one call, large ones in parts that let data go first."""
+"""Sends large requests and responses in parts, between which pending data goes first."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ if TYPE_CHECKING:
     from rmpa.runtime.stream import Stream
 
 BODIES: Final = 0
-"""The key of what a service's connection sends."""
+"""The outbox key of requests and responses."""
 INLINE: Final = 256 * KIB
-"""Larger bodies leave in parts: to copy one of 64 MiB into a queue would hold everything else up for 30 ms."""
+"""Larger bodies are sent in parts: to copy 64 MiB into a queue would hold up the event loop for 30 ms."""
 _PART: Final = 256 * KIB
 
 
 async def send_large(stream: Stream, head: bytes, body: Buffer) -> None:
     """Send a body that is larger than ``INLINE``; ends early when the stream is closed."""
-    parcel = stream.open(BODIES, len(head) + len(body))
-    stream.extend(parcel, head)
+    message = stream.open(BODIES, len(head) + len(body))
+    stream.extend(message, head)
     view = memoryview(body)
     for start in range(0, len(view), _PART):
-        stream.extend(parcel, view[start : start + _PART])
+        stream.extend(message, view[start : start + _PART])
         while stream.pending_bytes and not stream.closed:
             await stream.drained()
         if stream.closed:

@@ -1,4 +1,4 @@
-"""What a ``Node`` hands out for services: one that it serves, and one that it calls."""
+"""The services of a ``Node``: ``Service`` serves one, ``ServiceClient`` calls one."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class Service:
         name: The global name.
         caller_id: The node's name.
         kind: The type.
-        handler: Gets the request as an object; gives the response as an object or as plain values, at once or as an
-            awaitable. What it raises is the client's error.
+        handler: Gets the request as an object; returns the response as an object or as plain values, at once or as an
+            awaitable. An exception becomes the client's error.
         timeout: Seconds for a call.
-        on_close: Unregisters it.
+        on_close: Unregisters the service.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Service:
 
 
 class ServiceClient:
-    """Calls one service over and over; made by ``Node.connect_service``. One call at a time.
+    """Calls one service over one connection, one call at a time; made by ``Node.connect_service``.
 
     Args:
         connection: To its server.
@@ -109,7 +109,7 @@ class ServiceClient:
 
     @property
     def closed(self) -> bool:
-        """Whether the server has closed it, or we have."""
+        """Whether either side has closed the connection."""
         return self.connection.closed
 
     async def call(
@@ -117,7 +117,7 @@ class ServiceClient:
         request: object = None,
         timeout: float | None = limits.SERVICE_TIMEOUT,  # noqa: ASYNC109 - the message names it
     ) -> Any:
-        """Call it.
+        """Call the service.
 
         Args:
             request: As an object, or as plain values (see ``MessageType.make``).
@@ -129,7 +129,7 @@ class ServiceClient:
         Raises:
             MessageError: The request does not fit the type, or the response is not one.
             PeerRefused: The server answers with an error.
-            ServiceFailed: It died, or did not answer in time.
+            ServiceFailed: The server disconnected, or did not answer in time.
         """
         ok, body = await self.connection.call(_serialize(self.kind.request, request), timeout)
         if not ok:
@@ -149,7 +149,7 @@ def _serialize(kind: MessageType, value: object) -> Buffer:
 
 
 async def probe(uri: str, service: str, caller_id: str, timeout: float) -> ServiceConnection:  # noqa: ASYNC109
-    """Ask a server what its service is; the connection is closed again, its ``description`` and ``caller_id`` stay.
+    """Ask a server for its description; returns the closed connection with ``description`` and ``caller_id``.
 
     Raises:
         RmpaError: As ``ServiceConnection.open``.

@@ -1,8 +1,8 @@
 """Two listening sockets for any number of nodes: each node has a loopback address, all have the same two ports.
 
-A socket that listens at all addresses and is bound to the device ``lo`` takes what is dialled to any address
-``127.a.b.c`` (there are 16 million), and nothing that comes from the network. The accepted socket says which node is
-meant: its own address is the one that was dialled. A path in the URI could say it too, but roscpp drops that.
+A socket that listens at all addresses and is bound to the device ``lo`` accepts connections to any address
+``127.a.b.c`` (there are 16 million), and none from the network. The local address of the accepted socket identifies
+the node. A path in the URI could do so too, but roscpp drops it.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.xmlrpc import XmlRpcValue
 
     Adopt = Callable[[socket.socket, tuple[str, int]], None]
-    """Gets an accepted connection, non-blocking, which is its own from there on, and the client's address."""
+    """Takes ownership of an accepted, non-blocking socket; the second argument is the client's address."""
 
 _log = logging.getLogger(__name__)
 _DEVICE: Final = b"lo"
 _RESET: Final = struct.pack("ii", 1, 0)
-"""SO_LINGER: closing resets the connection, as a port does where nothing listens."""
+"""SO_LINGER: closing resets the connection, like a port where nothing listens."""
 
 
 class SharedListener:
-    """The two sockets, and which node has which address.
+    """The two sockets, and the nodes by address.
 
     Args:
-        salt: Tells apart the nodes of one name in several graphs of this machine: the master's URI.
+        salt: Distinguishes nodes of one name in several graphs of this machine: the master's URI.
         counters: ``address.unknown.xmlrpc``, ``address.unknown.tcpros``: connections to addresses without a node.
     """
 
@@ -49,10 +49,10 @@ class SharedListener:
         self._addresses = LoopbackAddresses(salt)
         self._http = _Port("XML-RPC of the proxies", self._answer_stray)
         self._tcpros = _Port("TCPROS of the proxies", self._reset_stray)
-        self._strays = XmlRpcServer(_nobody, counters=self._counters, name="addresses of former nodes")
+        self._strays = XmlRpcServer(_former_node, counters=self._counters, name="addresses of former nodes")
 
     def __len__(self) -> int:
-        """How many nodes have an address here."""
+        """Nodes with an address."""
         return len(self._addresses)
 
     @property
@@ -61,7 +61,7 @@ class SharedListener:
         return self._http.number, self._tcpros.number
 
     async def start(self) -> None:
-        """Listen, and try whether the addresses work here.
+        """Listen, and test whether the addresses work on this machine.
 
         Raises:
             StartError: The device cannot be bound, or its addresses are not 127.0.0.0/8.
@@ -69,8 +69,8 @@ class SharedListener:
         try:
             for port in (self._http, self._tcpros):
                 port.listen()
-            # Containers, sandboxes and firewalls differ: what works is found by trying it once.
-            await _try(LoopbackAddresses(self._salt).take("", 0.0), self._tcpros)
+            # Containers, sandboxes and firewalls differ, so one connection is tried.
+            await _test_address(LoopbackAddresses(self._salt).take("", 0.0), self._tcpros)
         except BaseException as error:
             await self.close()
             if isinstance(error, OSError):
@@ -80,16 +80,16 @@ class SharedListener:
         _log.info("= proxies listen at 127.x addresses of their own, ports %d (XML-RPC) and %d (TCPROS)", *self.ports)
 
     async def close(self) -> None:
-        """Listen no longer; the nodes are closed before."""
+        """Stop listening; the nodes are closed before."""
         self._http.close()
         self._tcpros.close()
         await self._strays.close()
 
     def attach(self, name: str, http: Adopt, tcpros: Adopt) -> str:
-        """Give a node an address; only between ``start()`` and ``close()``.
+        """Assign an address to a node; only between ``start()`` and ``close()``.
 
         Args:
-            name: The node's.
+            name: The node's name.
             http: Gets each connection to its XML-RPC port.
             tcpros: Gets each connection to its TCPROS port.
 
@@ -102,21 +102,21 @@ class SharedListener:
         return address
 
     def detach(self, address: str) -> None:
-        """Let an address be no node's from now on; its connections are the node's own matter."""
+        """Free an address; the node closes its connections itself."""
         self._http.nodes.pop(address, None)
         self._tcpros.nodes.pop(address, None)
         self._addresses.free(address, asyncio.get_running_loop().time())
 
     def _answer_stray(self, sock: socket.socket, client: tuple[str, int]) -> None:
-        """Answer who calls a node that is gone.
+        """Answer a call to a node that is gone with an error.
 
-        A reset would be "try again" to rospy's ``requestTopic``: twice a minute, in a thread, as long as it lives.
+        After a reset rospy would repeat ``requestTopic`` twice a minute in a thread, as long as it lives.
         """
         self._counters.add("address.unknown.xmlrpc")
         self._strays.adopt(sock, client)
 
     def _reset_stray(self, sock: socket.socket, _client: tuple[str, int]) -> None:
-        """Hang up on who dials a node that is gone, as a port does where nothing listens: roscpp backs off."""
+        """Reset a TCPROS connection to a node that is gone, like a port where nothing listens: roscpp backs off."""
         self._counters.add("address.unknown.tcpros")
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
         sock.close()
@@ -126,13 +126,13 @@ class _Port:
     """One of the two sockets.
 
     Args:
-        name: What it is for, for messages.
-        stray: Gets the connections to addresses that no node has.
+        name: Its purpose, for messages.
+        stray: Gets the connections to addresses without a node.
     """
 
     def __init__(self, name: str, stray: Adopt) -> None:
         self.nodes: dict[str, Adopt] = {}
-        """By the address that is dialled."""
+        """By address."""
         self.number = 0
         self._name = name
         self._stray = stray
@@ -142,11 +142,11 @@ class _Port:
         """Bind and accept.
 
         Raises:
-            OSError: This is not allowed here, or there is no such device.
+            OSError: This is not allowed, or there is no such device.
         """
         sock = DESCRIPTORS.open_socket(Use.DATA)
         try:
-            # Before it is bound to all addresses: at no moment the network can reach it.
+            # Before it is bound to all addresses, so that the network can never reach it.
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _DEVICE)
             sock.bind(("0.0.0.0", 0))  # noqa: S104 - of the device lo
             sock.listen(limits.SHARED_BACKLOG)
@@ -158,7 +158,7 @@ class _Port:
         self._acceptor.start()
 
     def close(self) -> None:
-        """Listen no longer."""
+        """Stop listening."""
         if self._acceptor is not None:
             self._acceptor.close()
 
@@ -166,11 +166,11 @@ class _Port:
         self.nodes.get(sock.getsockname()[0], self._stray)(sock, client)
 
 
-async def _try(address: str, port: _Port) -> None:
-    """Dial an address and see the connection arrive under it.
+async def _test_address(address: str, port: _Port) -> None:
+    """Connect to an address, and wait until the connection is accepted with it.
 
     Raises:
-        OSError: It does not.
+        OSError: It is not.
     """
     loop = asyncio.get_running_loop()
     arrived: asyncio.Future[None] = loop.create_future()
@@ -192,5 +192,5 @@ async def _try(address: str, port: _Port) -> None:
         del port.nodes[address]
 
 
-def _nobody(_method: str, _params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
+def _former_node(_method: str, _params: tuple[XmlRpcValue, ...], _client: str) -> XmlRpcValue:
     return [-1, "the node that had this address is gone", 0]

@@ -1,4 +1,4 @@
-"""One node, seen from its graph: XML-RPC endpoint and TCPROS server on one address, and any number of topics."""
+"""The servers of one node, XML-RPC and TCPROS at one address, with its topics and services."""
 
 from __future__ import annotations
 
@@ -37,24 +37,24 @@ def _not_followed(_key: str, _value: XmlRpcValue) -> bool:
 
 
 class SlaveNode:
-    """Serves the topics of one node; registering them at a master is its owner's work.
+    """Serves the topics and services of one node; its owner registers them at a master.
 
-    Light: no task, and two listening sockets, or none where many nodes share a listener. An agent can have thousands.
+    It has no task, and two listening sockets, or none where many nodes share a listener: an agent can have thousands.
 
     Args:
         name: The node's global name.
-        host: The address to listen at, and to tell others unless ``advertised_host`` is given.
-        master_uri: What ``getMasterUri`` answers.
-        advertised_host: What others are told to connect to, where it differs from ``host``.
-        port: Of the XML-RPC server; 0 lets the system choose.
-        listener: Started; accepts for this node in place of sockets of its own, and gives it its address: ``host``,
-            ``advertised_host`` and ``port`` mean nothing then.
-        counters: Where refusals are counted.
-        on_shutdown: ``(reason)``: the master wants this node to end; its owner closes it.
-        on_param_update: ``(key, value) -> whether the node follows that key``.
+        host: The address to listen at, and to register unless ``advertised_host`` is given.
+        master_uri: The answer to ``getMasterUri``.
+        advertised_host: The address to register, if it differs from ``host``.
+        port: The XML-RPC server's; 0 lets the system choose.
+        listener: Started; accepts for this node instead of sockets of its own, and assigns its address: ``host``,
+            ``advertised_host`` and ``port`` are ignored then.
+        counters: Count refusals.
+        on_shutdown: ``(reason)``: the master shuts this node down; its owner closes it.
+        on_param_update: ``(key, value) -> whether the node subscribed to that key``.
         on_publisher_update: ``(topic, uris)``, behind the node's own subscriptions.
-        on_kill: ``(caller id, reason) -> reply``: answers ``shutdown`` in place of ``on_shutdown``, when it can.
-        taps: Connections to publishers that the owner made by itself, for ``getBusInfo`` and its like.
+        on_kill: ``(caller id, reason) -> reply``: awaited for the answer to ``shutdown``, after ``on_shutdown``.
+        taps: The owner's own connections to publishers, for ``getBusInfo`` and ``getBusStats``.
     """
 
     def __init__(
@@ -130,13 +130,13 @@ class SlaveNode:
             subscription.close()
         if self._listener is not None and self.uri:
             self._listener.detach(self._advertised)
-            self._listener = None  # what is closed twice must not free the next node's address
+            self._listener = None  # a second close must not free the next node's address
         self._tcpros.close()
         await self._http.close()
         await asyncio.gather(*(endpoint.closed() for endpoint in services))
         for subscription in subscriptions.values():
             await subscription.closed()
-        # We and our servers know each other, and wait for the collector; what our owner knows must not.
+        # The node and its servers are a reference cycle, which must not hold the owner until it is collected.
         self._on_shutdown, self._on_publisher_update, self._on_kill = _ignore, _ignore, None
         self._on_param_update, self._taps = _not_followed, tuple
 
@@ -155,17 +155,17 @@ class SlaveNode:
         self._publications[publication.topic] = publication
 
     def remove_publication(self, topic: str) -> None:
-        """Serve a topic no longer and close its connections; nothing happens if it is not served."""
+        """Stop serving a topic and close its connections; nothing happens if it is not served."""
         publication = self._publications.pop(topic, None)
         if publication is not None:
             publication.withdraw()
 
     def add_subscription(self, subscription: Subscription) -> None:
-        """Let a subscription follow ``publisherUpdate``."""
+        """Pass ``publisherUpdate`` of its topic on to a subscription."""
         self._subscriptions[subscription.topic] = subscription
 
     async def remove_subscription(self, topic: str) -> None:
-        """Leave a topic's publishers."""
+        """Disconnect from a topic's publishers."""
         subscription = self._subscriptions.pop(topic, None)
         if subscription is not None:
             subscription.close()
@@ -173,7 +173,7 @@ class SlaveNode:
 
     @property
     def service_uri(self) -> str:
-        """Where this node's services are called, ``rosrpc://host:port``; only after ``start()``."""
+        """The URI of this node's services, ``rosrpc://host:port``; only after ``start()``."""
         return f"rosrpc://{self._advertised}:{self._tcpros.address[1]}"
 
     def add_service(self, endpoint: ServiceEndpoint) -> None:
@@ -187,7 +187,7 @@ class SlaveNode:
         self._services[endpoint.service] = endpoint
 
     def remove_service(self, service: str, text: str = "") -> None:
-        """Serve a service no longer; calls under way get an error with ``text``.
+        """Stop serving a service; calls under way get an error with ``text``.
 
         Nothing happens if it is not served.
         """
@@ -195,14 +195,14 @@ class SlaveNode:
         if endpoint is not None:
             endpoint.withdraw(text)
 
-    # --- ros.slave.NodeView -----------------------------------------------------------------------------------
+    # --- wire.slave_api.NodeView ------------------------------------------------------------------------------
 
     def publications(self) -> list[tuple[str, str]]:
-        """Topics and types that are published; ``*`` where the type is not known yet."""
+        """Published topics and types; ``*`` where the type is not known yet."""
         return [(p.topic, p.description.type if p.description else ANY) for p in self._publications.values()]
 
     def subscriptions(self) -> list[tuple[str, str]]:
-        """Topics and types that are subscribed to."""
+        """Subscribed topics and types."""
         found = {s.topic: s.type_name for s in self._subscriptions.values()}
         found |= {tap.topic: tap.fields.get("type", ANY) for tap in self._taps()}
         return list(found.items())
@@ -214,11 +214,11 @@ class SlaveNode:
         return found + [tap.connection() for tap in self._taps()]
 
     def address_of(self, topic: str) -> tuple[str, int] | None:
-        """Where to connect for a published topic."""
+        """Host and port for subscribers of a topic; ``None`` if it is not published."""
         return (self._advertised, self._tcpros.address[1]) if topic in self._publications else None
 
     def publisher_update(self, topic: str, publishers: Sequence[str]) -> None:
-        """The master's list of a topic's publishers."""
+        """The master sends the publishers of a topic."""
         subscription = self._subscriptions.get(topic)
         if subscription is not None:
             subscription.update(publishers)
@@ -229,7 +229,7 @@ class SlaveNode:
         return self._on_param_update(key, value)
 
     def shut_down(self, reason: str) -> None:
-        """The master wants us to end."""
+        """The master shuts the node down."""
         _log.info("< %s: asked to shut down: %s", self.name, reason)
         self._on_shutdown(reason)
 

@@ -1,4 +1,4 @@
-"""The subscribing end: one connection to one publisher, and all those of one topic."""
+"""The subscribing end of a topic: a connection to one publisher, and the connections to all publishers."""
 
 from __future__ import annotations
 
@@ -43,51 +43,46 @@ def _ignore(*_: object) -> None:
 
 
 class PartsTaker(Protocol):
-    """Takes a large message while it still arrives."""
+    """Receives a large message in parts, while it still arrives."""
 
     def begin(self, size: int) -> None:
-        """A message of ``size`` bytes, its length in front, begins."""
-        ...
+        """A message of ``size`` bytes, its length included, begins."""
 
     def part(self, part: memoryview) -> None:
         """A part of it, valid during the call only."""
-        ...
 
     def abort(self) -> None:
-        """The rest will not come."""
-        ...
+        """The rest of the message will not come."""
 
 
 OUT_OF_FILES: Final = "the subscribing side has no file descriptor left for it; `rmpa doctor` there says what to do"
 
 
 class PublisherConnection:
-    """Connects to one publisher of one topic, and connects again until it is closed or refused for good.
+    """Connects to one publisher of one topic, and reconnects until it is closed or the publisher refuses it.
 
-    Whether the publisher is still registered is the owner's knowledge: it closes the connection when the graph
-    says so, and makes a new one for a node that came back (which has a new URI). All callbacks are called in the
-    loop. After ``close()`` none is.
+    The owner closes the connection when the publisher is no longer registered, and makes a new one for a restarted
+    node, which has a new URI. All callbacks are called in the loop, and none after ``close()``.
 
     Args:
         topic: The topic's global name.
         uri: The publisher's slave API.
-        caller_id: Our node's name; a rospy publisher keeps one connection for each (topic, caller id).
-        on_message: ``(framed)``: one message with its 4-byte length in front; the view is only valid during the
-            call. It must not raise.
-        on_parts: Takes messages above ``limits.CUT_THROUGH_BYTES`` while they still arrive; without it they come
-            whole, too.
+        caller_id: The subscribing node; a rospy publisher keeps one connection for each (topic, caller id).
+        on_message: ``(framed)``: one message with its 4-byte length in front; the view is only valid during the call.
+            It must not raise.
+        on_parts: Receives messages above ``limits.CUT_THROUGH_BYTES`` while they still arrive; without it they too
+            are passed to ``on_message``.
         on_header: ``(fields)``: the publisher's reply, before its first message, at each connection.
-        on_refused: ``(text)``: the publisher said no, or has another md5 sum; nothing more will happen.
-        on_lost: ``(reason)``: the publisher could not be reached or is gone; it is tried again after a while.
-            Half a message is dropped.
-        on_oversized: ``(size)``: a message of that many bytes, more than ``limits.TCPROS_MESSAGE_MAX``, begins to
-            come; it is read and left out, and those behind it come as usual.
+        on_refused: ``(text)``: the publisher refused, or has another md5 sum; there is no further attempt.
+        on_lost: ``(reason)``: the connection failed or ended; it is tried again with back-off. Half a message is
+            dropped.
+        on_oversized: ``(size)``: a message of more than ``limits.TCPROS_MESSAGE_MAX`` begins; it is read and dropped.
         type_name: The type to ask for.
-        md5sum: The md5 sum to ask for; with ``*`` whatever comes is taken.
-        definition: The definition to send along, if known.
+        md5sum: The md5 sum to ask for; ``*`` accepts any.
+        definition: The definition to send, if known.
         nodelay: Whether to ask for TCP_NODELAY on the publisher's side.
         number: The node's own number for this connection.
-        rng: Uniform numbers in [0, 1) that spread the attempts.
+        rng: Uniform numbers in [0, 1), for the jitter of the back-off.
     """
 
     def __init__(
@@ -116,12 +111,12 @@ class PublisherConnection:
         self.messages = 0
         self.bytes = 0
         self.oversized = 0
-        """Messages left out because they are too long."""
+        """Messages dropped because they are too long."""
         self.malformed = False
-        """Whether the last connection ended because of what the publisher sent."""
+        """Whether the last connection ended because the publisher broke the protocol."""
         self.number = number
         self.refused: str | None = None
-        """Why the publisher does not fit, once it said so."""
+        """Why the publisher refused or does not match; ``None`` if it does."""
         self._caller_id = caller_id
         self._type = type_name
         self._md5sum = md5sum
@@ -165,14 +160,14 @@ class PublisherConnection:
         self._task.add_done_callback(self._forget_task)
 
     def close(self) -> None:
-        """Leave the publisher at once; no callback comes any more."""
+        """Disconnect at once; no callback is called any more."""
         self._closed = True
         if self._task is not None:
             self._task.cancel()
         self._drop()
 
     async def closed(self) -> None:
-        """Wait, behind ``close()``, until the task has ended."""
+        """Wait, after ``close()``, until the task has ended."""
         if self._task is not None:
             await asyncio.wait([self._task])
 
@@ -183,7 +178,7 @@ class PublisherConnection:
         )
 
     def _forget_task(self, _: asyncio.Task[None]) -> None:
-        """A cancelled one remembers where it was, and so us."""
+        """A cancelled task refers to its frames, and so to this object."""
         self._task = None
 
     async def _run(self) -> None:
@@ -200,7 +195,7 @@ class PublisherConnection:
             await asyncio.sleep(self._backoff.delay())
 
     async def _attempt(self) -> str:
-        """Connect and stay until the connection ends; say why it did."""
+        """Connect and wait until the connection ends; return why it did."""
         try:
             host, port = await self._request_topic()
             async with asyncio.timeout(limits.TCPROS_CONNECT_TIMEOUT):
@@ -216,7 +211,7 @@ class PublisherConnection:
         except OSError as error:
             sock.close()
             return str(error)
-        silent = loop.call_later(limits.TCPROS_HANDSHAKE_TIMEOUT, self._silent)
+        silent = loop.call_later(limits.TCPROS_HANDSHAKE_TIMEOUT, self._handshake_timed_out)
         try:
             ended = await self._ended
         finally:
@@ -243,20 +238,20 @@ class PublisherConnection:
             on_close=self._end,
             outbox=Outbox(1, limits.TCPROS_HEADER_MAX),
         )
-        # At once: a rospy node accepts nobody else while it waits for a header.
+        # At once: a rospy node accepts no other connection while it waits for a header.
         self._stream.send([self._request], URGENT)
 
     def _take(self, data: memoryview) -> tuple[int, int]:
         start = 0
         if self._skipping or self._left or not self.fields:
-            start, wanted = self._go_on(data)
+            start, wanted = self._take_rest_or_header(data)
             if wanted >= 0:
                 return start, wanted
         try:
             messages, consumed, wanted = split_messages(data[start:])
         except LimitExceeded as error:
-            self._leave_out(error.claimed)
-            return self._take_behind(data, start)
+            self._begin_skipping(error.claimed)
+            return self._take_next(data, start)
         for message in messages:
             if self._closed:
                 break
@@ -267,18 +262,18 @@ class PublisherConnection:
         if self._parts is not None and wanted > core_limits.CUT_THROUGH_BYTES and not self._closed:
             self._left = wanted
             self._parts.begin(wanted)
-            if self._left:  # it may have closed us
+            if self._left:  # the callback may have closed this connection
                 self._take_part(self._parts, data[start:])
             return len(data), 0
         if wanted == LENGTH.size and len(data) - start >= LENGTH.size:
-            return self._take_behind(data, start)  # a message that is too long
+            return self._take_next(data, start)  # a message that is too long
         return start, wanted
 
-    def _go_on(self, data: memoryview) -> tuple[int, int]:
-        """Take what comes before further messages: the rest of one, or the header.
+    def _take_rest_or_header(self, data: memoryview) -> tuple[int, int]:
+        """Consume the rest of a message, or the header, before further messages.
 
         Returns:
-            What was taken, and what ``_take`` is to return for wanted; less than 0: messages may follow.
+            Consumed bytes, and what ``_take`` returns for wanted; less than 0 if messages may follow.
         """
         start = 0
         if self._skipping:
@@ -291,31 +286,31 @@ class PublisherConnection:
             fields, start, wanted = parse_header(data)
             if fields is None:
                 return 0, wanted
-            if not self._believe(fields):
+            if not self._accept_header(fields):
                 return len(data), 0
         return start, -1
 
-    def _take_behind(self, data: memoryview, start: int) -> tuple[int, int]:
+    def _take_next(self, data: memoryview, start: int) -> tuple[int, int]:
         if self._closed:
             return len(data), 0
         consumed, wanted = self._take(data[start:])
         return start + consumed, wanted
 
-    def _leave_out(self, size: int) -> None:
-        """A message that is too long begins: its bytes are read, and not kept."""
+    def _begin_skipping(self, size: int) -> None:
+        """A message that is too long begins: drop its bytes."""
         self._skipping = LENGTH.size + size
         self.oversized += 1
         self._on_oversized(size)
 
     def _skip(self, data: memoryview) -> int:
-        """Leave out what has come of such a message; return how many bytes that were."""
+        """Drop the received bytes of such a message; return their number."""
         count = min(self._skipping, len(data))
         self._skipping -= count
         self.bytes += count
         return count
 
     def _take_part(self, parts: PartsTaker, data: memoryview) -> int:
-        """Hand on what has come of a large message; return how many bytes that were."""
+        """Pass on the received bytes of a large message; return their number."""
         count = min(self._left, len(data))
         self._left -= count
         self.bytes += count
@@ -323,7 +318,7 @@ class PublisherConnection:
         parts.part(data[:count])
         return count
 
-    def _believe(self, fields: Header) -> bool:
+    def _accept_header(self, fields: Header) -> bool:
         problem = check_publisher(fields, self._type, self._md5sum)
         if problem is None:
             self.fields = fields
@@ -337,7 +332,7 @@ class PublisherConnection:
         self._on_refused(problem)
         return False
 
-    def _silent(self) -> None:
+    def _handshake_timed_out(self) -> None:
         if not self.fields:
             self._end(TimeoutError(f"no header from the publisher in {limits.TCPROS_HANDSHAKE_TIMEOUT:g} s"))
 
@@ -357,22 +352,22 @@ class PublisherConnection:
 
 
 class Subscription:
-    """One topic for one of our own nodes: follows the list of publishers, with one connection to each.
+    """A topic that a node of ours subscribes to: one connection to each listed publisher.
 
-    Unlike rospy it leaves publishers that are no longer listed. A publisher that refused us is asked again when the
-    master names it again.
+    Unlike rospy it disconnects from publishers that are no longer listed. A publisher that refused is tried again
+    when the master lists it again.
 
     Args:
         topic: The topic's global name.
-        caller_id: Our node's name.
+        caller_id: The node's name.
         on_message: ``(connection, framed)``; the view is only valid during the call.
         on_refused: ``(connection, text)``.
-        own_uri: Our node's slave API, left out of the list: a node does not subscribe to itself.
+        own_uri: The node's slave API, which is ignored in the list: a node does not subscribe to itself.
         type_name: The type to ask for.
         md5sum: The md5 sum to ask for.
-        definition: The definition to send along.
+        definition: The definition to send.
         nodelay: Whether to ask for TCP_NODELAY.
-        number: Gives each connection its number.
+        number: Returns the number of a new connection.
     """
 
     def __init__(
@@ -399,82 +394,84 @@ class Subscription:
         self._definition = definition
         self._nodelay = nodelay
         self._number = number
-        self._links: dict[str, PublisherConnection] = {}
-        self._leaving: set[PublisherConnection] = set()
+        self._connections: dict[str, PublisherConnection] = {}
+        self._closing: set[PublisherConnection] = set()
 
     @property
     def publishers(self) -> int:
-        """Publishers that we are connected to."""
-        return sum(link.connected for link in self._links.values())
+        """Connected publishers."""
+        return sum(connection.connected for connection in self._connections.values())
 
     @property
     def callers(self) -> set[str]:
-        """The names of the publishers that we are connected to, as they say them."""
-        return {link.fields.get("callerid", "") for link in self._links.values() if link.connected}
+        """The names of the connected publishers, from their headers."""
+        return {
+            connection.fields.get("callerid", "") for connection in self._connections.values() if connection.connected
+        }
 
     def connections(self) -> list[BusConnection]:
         """For ``getBusInfo`` and ``getBusStats``."""
-        return [link.connection() for link in self._links.values()]
+        return [connection.connection() for connection in self._connections.values()]
 
     def update(self, uris: Iterable[str], *, keep: bool = False) -> None:
-        """Take the list of publishers from the master: connect to the new ones, leave those that are gone.
+        """Apply the master's list of publishers: connect to the new ones, disconnect from the missing ones.
 
         Args:
             uris: Their slave APIs.
-            keep: Leave none: the list is from a master that was started anew and does not know all yet.
+            keep: Disconnect from none: the list of a restarted master is incomplete.
         """
         listed = {uri for uri in uris if uri != self._own_uri}
-        for uri in () if keep else self._links.keys() - listed:
-            self._leave(uri)
+        for uri in () if keep else self._connections.keys() - listed:
+            self._disconnect(uri)
         for uri in listed:
-            link = self._links.get(uri)
-            if link is not None and link.refused is not None:
-                self._leave(uri)
-                link = None
-            if link is None:
-                self._join(uri)
+            connection = self._connections.get(uri)
+            if connection is not None and connection.refused is not None:
+                self._disconnect(uri)
+                connection = None
+            if connection is None:
+                self._connect(uri)
 
     def close(self) -> None:
-        """Leave all publishers."""
-        for uri in tuple(self._links):
-            self._leave(uri)
+        """Disconnect from all publishers."""
+        for uri in tuple(self._connections):
+            self._disconnect(uri)
 
     async def closed(self) -> None:
-        """Wait, behind ``close()``, until all tasks have ended."""
-        for link in tuple(self._leaving):
-            await link.closed()
-        self._leaving.clear()
+        """Wait, after ``close()``, until all tasks have ended."""
+        for connection in tuple(self._closing):
+            await connection.closed()
+        self._closing.clear()
 
-    def _join(self, uri: str) -> None:
-        link = PublisherConnection(
+    def _connect(self, uri: str) -> None:
+        connection = PublisherConnection(
             self.topic,
             uri,
             self._caller_id,
-            on_message=lambda framed: self._on_message(link, framed),
-            on_refused=lambda text: self._on_refused(link, text),
-            on_oversized=lambda size: self._oversized(link, size),
+            on_message=lambda framed: self._on_message(connection, framed),
+            on_refused=lambda text: self._on_refused(connection, text),
+            on_oversized=lambda size: self._oversized(connection, size),
             type_name=self.type_name,
             md5sum=self._md5sum,
             definition=self._definition,
             nodelay=self._nodelay,
             number=self._number(),
         )
-        self._links[uri] = link
-        link.start()
+        self._connections[uri] = connection
+        connection.start()
 
-    def _oversized(self, link: PublisherConnection, size: int) -> None:
-        if link.oversized == 1:
+    def _oversized(self, connection: PublisherConnection, size: int) -> None:
+        if connection.oversized == 1:
             limit = limits.TCPROS_MESSAGE_MAX
             _log.warning(
                 "! %s: a message of %d bytes of %s is left out: more than %d; others come as usual",
                 self.topic,
                 size,
-                link.uri,
+                connection.uri,
                 limit,
             )
 
-    def _leave(self, uri: str) -> None:
-        link = self._links.pop(uri)
-        link.close()
-        self._leaving = {left for left in self._leaving if not left.ended}
-        self._leaving.add(link)
+    def _disconnect(self, uri: str) -> None:
+        connection = self._connections.pop(uri)
+        connection.close()
+        self._closing = {left for left in self._closing if not left.ended}
+        self._closing.add(connection)

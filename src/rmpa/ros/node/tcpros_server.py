@@ -1,4 +1,4 @@
-"""The listening TCPROS socket of one node: it accepts, reads the header and hands over to the publication."""
+"""The listening TCPROS socket of one node: passes each connection to the publication or service of its header."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ _log = logging.getLogger(__name__)
 
 
 class TcprosServer:
-    """Accepts subscribers for the publications of one node.
+    """Accepts connections for the publications and services of one node.
 
     Args:
         name: The node's name, for the texts.
-        publications: By topic; read at each header, so the owner just changes it.
-        counters: Counts ``tcpros.refused.*``.
-        numbers: Gives each connection its number; shared with the node's outgoing ones.
-        services: By name; read at each header too.
+        publications: By topic; read at each header, so that the owner can change it.
+        counters: Count ``tcpros.refused.*``.
+        numbers: The numbers of connections, shared with the node's outgoing ones.
+        services: By name; read at each header.
         clock: For the rate limit of the log.
     """
 
@@ -90,84 +90,92 @@ class TcprosServer:
         self._acceptor.start()
 
     def close(self) -> None:
-        """Stop listening, and close what has not reached a publication; the rest is the publications' own."""
+        """Stop listening, and close the connections without a header; the owner closes the others."""
         if self._acceptor is not None:
             self._acceptor.close()
             self._acceptor = None
         waiting, self._waiting = self._waiting, {}
-        for link, timer in waiting.items():
+        for connection, timer in waiting.items():
             timer.cancel()
-            link.close()
-        self._accepted.clear()  # they know us: a cycle otherwise, with all that the publications know
+            connection.close()
+        self._accepted.clear()  # breaks a reference cycle
 
     def adopt(self, sock: socket.socket, _client: tuple[str, int]) -> None:
-        """Serve a connection that was accepted, by this server's own socket or by one that several nodes share.
+        """Serve an accepted connection, of this server's own socket or of one that several nodes share.
 
         Args:
             sock: Non-blocking; owned from here on.
         """
         try:
-            link = AcceptedConnection(sock, next(self._numbers), on_header=self._header, on_end=self._ended)
+            connection = AcceptedConnection(sock, next(self._numbers), on_header=self._header, on_end=self._ended)
         except OSError:  # it is gone already
             sock.close()
             return
         if len(self._accepted) >= min(self._forget_at, limits.TCPROS_CONNECTIONS_MAX):
             self._forget_closed()
         if len(self._accepted) >= limits.TCPROS_CONNECTIONS_MAX or len(self._waiting) >= limits.TCPROS_HANDSHAKES_MAX:
-            self._refuse("full", link.peer[0], f"{self._name}: too many connections, one from {link.peer[0]} closed")
-            link.close()
+            self._refuse(
+                "full",
+                connection.peer[0],
+                f"{self._name}: too many connections, one from {connection.peer[0]} closed",
+            )
+            connection.close()
             return
-        self._accepted.add(link)
-        self._waiting[link] = asyncio.get_running_loop().call_later(
-            limits.TCPROS_HANDSHAKE_TIMEOUT, self._timed_out, link
+        self._accepted.add(connection)
+        self._waiting[connection] = asyncio.get_running_loop().call_later(
+            limits.TCPROS_HANDSHAKE_TIMEOUT, self._timed_out, connection
         )
 
     def _forget_closed(self) -> None:
-        """Publications do not report back who left, so the closed ones are sorted out each time they may be half."""
-        self._accepted = {link for link in self._accepted if not link.stream.closed}
+        """Drop closed connections, which publications do not report; called when they may be half of all."""
+        self._accepted = {connection for connection in self._accepted if not connection.stream.closed}
         self._forget_at = 2 * len(self._accepted) + 16
 
-    def _header(self, link: AcceptedConnection, fields: Header) -> None:
-        timer = self._waiting.pop(link, None)
+    def _header(self, connection: AcceptedConnection, fields: Header) -> None:
+        timer = self._waiting.pop(connection, None)
         if timer is not None:
             timer.cancel()
         problem = check_request(fields)
         if problem is not None:
-            self._refuse("header", link.peer[0], f"{self._name}: a connection from {link.peer[0]}: {problem}")
-            link.refuse(problem)
+            self._refuse(
+                "header", connection.peer[0], f"{self._name}: a connection from {connection.peer[0]}: {problem}"
+            )
+            connection.refuse(problem)
             return
         if "service" in fields:
             endpoint = self._services.get(fields["service"])
             if endpoint is not None:
-                endpoint.attach(link)
+                endpoint.attach(connection)
                 return
-            # Quiet: a client, or only its probe, that was told of a service which is gone.
+            # At debug level: a client may have looked up a service that is gone by now.
             _log.debug("! %s: no service %s", self._name, printable(fields["service"]))
-            link.refuse(f"[{self._name}] does not offer the service [{printable(fields['service'])}]")
+            connection.refuse(f"[{self._name}] does not offer the service [{printable(fields['service'])}]")
             return
         publication = self._publications.get(fields["topic"])
         if publication is None:
-            # Quiet: a subscriber that was told of a publisher which left in the meantime.
+            # At debug level: a subscriber may have the address of a publisher that is gone by now.
             _log.debug("! %s: no publication %s", self._name, printable(fields["topic"]))
-            link.refuse(f"[{self._name}] is not a publisher of [{printable(fields['topic'])}]")
+            connection.refuse(f"[{self._name}] is not a publisher of [{printable(fields['topic'])}]")
             return
-        publication.attach(link)
+        publication.attach(connection)
 
-    def _ended(self, link: AcceptedConnection, error: Exception | None) -> None:
-        """It left, or broke the protocol, before its header was there; leaving is normal for rospy."""
-        timer = self._waiting.pop(link, None)
+    def _ended(self, connection: AcceptedConnection, error: Exception | None) -> None:
+        """A connection ended before its header was complete, which is normal for rospy, or broke the protocol."""
+        timer = self._waiting.pop(connection, None)
         if timer is not None:
             timer.cancel()
         if error is not None and not isinstance(error, OSError):
-            self._refuse("malformed", link.peer[0], f"{self._name}: a connection from {link.peer[0]}: {error}")
+            self._refuse(
+                "malformed", connection.peer[0], f"{self._name}: a connection from {connection.peer[0]}: {error}"
+            )
 
-    def _timed_out(self, link: AcceptedConnection) -> None:
-        del self._waiting[link]
-        link.close()
+    def _timed_out(self, connection: AcceptedConnection) -> None:
+        del self._waiting[connection]
+        connection.close()
         self._refuse(
             "silent",
-            link.peer[0],
-            f"{self._name}: {link.peer[0]} sent no header within {limits.TCPROS_HANDSHAKE_TIMEOUT:g} s; closed",
+            connection.peer[0],
+            f"{self._name}: {connection.peer[0]} sent no header within {limits.TCPROS_HANDSHAKE_TIMEOUT:g} s; closed",
         )
 
     def _refuse(self, kind: str, who: str, text: str) -> None:

@@ -1,4 +1,4 @@
-"""What a ``Node`` hands out: publishers, subscribers, and the messages that came."""
+"""The topics of a ``Node``: publishers, subscribers and received messages."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ _log = logging.getLogger(__name__)
 
 
 class Received:
-    """One message that came.
+    """One received message.
 
     Args:
         raw: Its bytes, without the length.
         header: The publisher's connection header: ``type``, ``md5sum``, ``message_definition``, ``callerid`` …
-        stamp_ns: When it came, by the wall clock in nanoseconds.
-        kind: Its type, if the subscriber named one.
+        stamp_ns: The time of reception, wall clock in nanoseconds.
+        kind: Its type, if the subscriber has one.
     """
 
     def __init__(self, raw: bytes, header: Mapping[str, str], stamp_ns: int, kind: MessageType | None) -> None:
@@ -45,7 +45,7 @@ class Received:
 
     @cached_property
     def kind(self) -> MessageType:
-        """The message type, learnt from the publisher's header if need be.
+        """The message type, if need be from the publisher's header.
 
         Raises:
             DefinitionError: The publisher's definition cannot be used.
@@ -54,7 +54,7 @@ class Received:
 
     @cached_property
     def message(self) -> Any:
-        """The message object, read at the first look.
+        """The message object, deserialized at the first access.
 
         Raises:
             MessageError: The bytes are not such a message.
@@ -105,7 +105,7 @@ class Publisher:
 
     @property
     def subscribers(self) -> int:
-        """Connected subscribers."""
+        """Number of connected subscribers."""
         return self.publication.subscribers
 
     def make(self, values: Plain = None) -> Any:
@@ -113,7 +113,7 @@ class Publisher:
         return self._known().make(values)
 
     def publish(self, message: object) -> int:
-        """Publish a message object; return how many older messages slow subscribers lost for it.
+        """Publish a message object; return the number of older messages dropped for slow subscribers.
 
         Raises:
             MessageError: The message does not fit the type.
@@ -129,15 +129,15 @@ class Publisher:
         return self.publication.publish_framed(frame_message(payload))
 
     async def wait_for_subscriber(self) -> None:
-        """Wait until there is at least one."""
+        """Wait until there is at least one subscriber."""
         await self._change.wait()
 
     async def drained(self) -> None:
-        """Wait, a moment at the most, until all that was published has left."""
+        """Wait until all published messages were sent, at most ``DRAIN_TIMEOUT``."""
         await self.publication.drained()
 
     async def close(self) -> None:
-        """Let what was published leave, unregister, and close the connections."""
+        """Send what is queued, unregister, and close the connections."""
         await self.drained()
         await self._on_close(self.topic)
 
@@ -173,9 +173,9 @@ class Subscriber:
         self.kind = kind
         self.type_name = kind.name if kind is not None else type_name
         self.dropped = 0
-        """Messages that the ``async for`` was too slow for."""
+        """Messages dropped because the ``async for`` is slow."""
         self.refusals: dict[str, str] = {}
-        """Why publishers (by slave API URI) refused us, or do not fit."""
+        """Why publishers (by slave API URI) refused or do not match."""
         self._callback = callback
         self._refusals = RefusalLog(_log, Counters())
         self._queue: deque[Received] = deque()
@@ -198,12 +198,12 @@ class Subscriber:
 
     @property
     def publishers(self) -> int:
-        """Publishers that we are connected to."""
+        """Number of connected publishers."""
         return self.subscription.publishers
 
     @property
     def callers(self) -> set[str]:
-        """The names of the publishers that we are connected to."""
+        """The names of the connected publishers."""
         return self.subscription.callers
 
     async def __aiter__(self) -> AsyncIterator[Received]:
@@ -217,21 +217,21 @@ class Subscriber:
             await self._wake.wait()
 
     async def close(self) -> None:
-        """Unregister and leave all publishers."""
+        """Unregister and disconnect from all publishers."""
         self.ended()
         await self._on_close(self.topic)
 
     def ended(self) -> None:
-        """No message will come any more: let the ``async for`` end."""
+        """End the ``async for``: no message will come any more."""
         self._ended = True
         self._wake.set()
 
-    def _message(self, link: PublisherConnection, framed: memoryview) -> None:
-        received = Received(bytes(framed[LENGTH.size :]), link.fields, time.time_ns(), self.kind)
+    def _message(self, connection: PublisherConnection, framed: memoryview) -> None:
+        received = Received(bytes(framed[LENGTH.size :]), connection.fields, time.time_ns(), self.kind)
         if self._callback is not None:
             try:
                 self._callback(received)
-            except Exception:  # noqa: BLE001 - the top of the user's code: the connection must outlive its mistakes
+            except Exception:  # noqa: BLE001 - a callback's mistake must not end the connection
                 _log.exception("! %s: the callback failed on a message from %s", self.topic, received.caller_id)
             return
         if len(self._queue) >= self._queue_messages:
@@ -240,10 +240,12 @@ class Subscriber:
         self._queue.append(received)
         self._wake.set()
 
-    def _refused(self, link: PublisherConnection, text: str) -> None:
-        _remember(self.refusals, link.uri, text)
+    def _refused(self, connection: PublisherConnection, text: str) -> None:
+        _remember(self.refusals, connection.uri, text)
         now = asyncio.get_running_loop().time()
-        self._refusals.refuse(now, "subscription.refused", link.uri, f"{self.topic}: publisher {link.uri}: {text}")
+        self._refusals.refuse(
+            now, "subscription.refused", connection.uri, f"{self.topic}: publisher {connection.uri}: {text}"
+        )
 
 
 def _remember(refusals: dict[str, str], who: str, text: str) -> None:

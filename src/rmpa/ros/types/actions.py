@@ -21,7 +21,7 @@ _PIECES: Final = ("Goal", "Result", "Feedback")
 
 
 def actions_of(message: str) -> Iterator[tuple[str, str]]:
-    """The actions that a message may belong to, with which of their messages it is: ``DoActionGoal`` to ``Do``.
+    """The actions that a message may belong to, and its part in each: ``DoActionGoal`` to ``("Do", "ActionGoal")``.
 
     Args:
         message: The name without its package.
@@ -37,11 +37,11 @@ def action_message(action: str, part: str, text: str) -> str | None:
 
     Args:
         action: The action's name without its package.
-        part: Which one, as ``actions_of`` has it.
+        part: The part, as ``actions_of`` gives it.
         text: The ``.action`` file.
 
     Returns:
-        ``None`` where the file has not three parts.
+        ``None`` if the file has not three parts.
     """
     pieces = [""]
     for line in text.split("\n"):

@@ -1,7 +1,7 @@
-"""Message definitions as text: parse them, put them together, and compute their MD5 sums.
+"""Message definitions as text: parses them, assembles full definitions, and computes MD5 sums.
 
-Pure and without numpy. Sources: wiki.ros.org/msg, and genmsg, whose full text (``gendeps --cat``) and MD5 sum these
-must equal to the byte: publishers and subscribers compare the sums, bags keep the text.
+Pure and without numpy. Sources: wiki.ros.org/msg and genmsg. Full text (``gendeps --cat``) and MD5 sum are equal to
+genmsg's to the byte: publishers and subscribers compare the sums, bags store the text.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class DefinitionError(RmpaError):
     what: str = "message type"
 
     def __str__(self) -> str:
-        """Say which type, what is wrong, and what to do."""
+        """The type, the problem and the remedy."""
         remedy = f"; {self.remedy}" if self.remedy else ""
         return f"{self.what} {self.type}: {self.problem}{remedy}"
 
@@ -60,8 +60,8 @@ class DefinitionError(RmpaError):
 class UnknownTypeError(DefinitionError):
     """No definition of a type was found."""
 
-    learnable: bool = True
-    """Whether a publisher may well know it: it is not of a package whose types all come with us."""
+    fetchable: bool = True
+    """Whether a publisher may have it: rmpa does not bring the types of its package."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class Field:
         name: As written.
         type: A primitive, or ``package/Name``.
         array: Whether it is an array.
-        size: Of an array of fixed size; 0 for one of any length.
+        size: The length of a fixed-size array; 0 for one of any length.
     """
 
     name: str
@@ -92,11 +92,11 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Specification:
-    """One message type by itself.
+    """The definition of one message type, without those that it embeds.
 
     Args:
         name: ``package/Name``.
-        text: Its own part of the definition.
+        text: Its own text.
         fields: In order.
         constants: ``type name=value`` in order, as the MD5 sum has them.
     """
@@ -139,7 +139,7 @@ def _constant(name: str, line: str, clean: str) -> str:
     if kind not in PRIMITIVES or kind in ("time", "duration"):
         raise DefinitionError(name, f"{clean[:80]!r} is not a constant")
     if kind == "string":
-        # A string constant takes all that is behind its "=", a comment's mark included.
+        # The value of a string constant is all text behind its "=", a "#" included.
         left, _, value = line.partition("=")
         return f"string {left.strip().partition(' ')[2]}={value.strip()}"
     constant, _, value = rest.partition("=")
@@ -201,14 +201,14 @@ def _visit(name: str, known: Mapping[str, Specification], order: dict[str, None]
     for embedded in known[name].depends():
         if embedded in inside or embedded == name:
             raise DefinitionError(embedded, "contains itself")
-        # One seen before is not entered again: a hostile definition could make that take for ever.
+        # Each type is visited once: a hostile definition could make the walk exponential.
         if embedded not in order:
             order[embedded] = None
             _visit(embedded, known, order, (*inside, name))
 
 
 def md5sum(name: str, known: Mapping[str, Specification]) -> str:
-    """The MD5 sum that ROS knows a type by.
+    """The MD5 sum of a message type.
 
     Raises:
         DefinitionError: An embedded type is missing, or a type contains itself.
@@ -218,7 +218,7 @@ def md5sum(name: str, known: Mapping[str, Specification]) -> str:
 
 
 def service_md5sum(request: str, response: str, known: Mapping[str, Specification]) -> str:
-    """The MD5 sum that ROS knows a service by, from the types of its request and its response.
+    """The MD5 sum of a service type, from the types of its request and its response.
 
     Raises:
         DefinitionError: As for ``md5sum``.
@@ -273,11 +273,11 @@ def _texts() -> Mapping[str, str]:
 
 
 def complete(known: dict[str, Specification], find: Callable[[str], str | None]) -> None:
-    """Add what types embed, and what that embeds.
+    """Add all types that the given ones embed, directly or not.
 
     Args:
-        known: Types by name; what is found is added.
-        find: Gives the own text of a type, or ``None``.
+        known: Types by name; the embedded ones are added.
+        find: Returns the own text of a type, or ``None``.
 
     Raises:
         UnknownTypeError: One is not found.
@@ -301,31 +301,26 @@ def complete(known: dict[str, Specification], find: Callable[[str], str | None])
 
 
 def known_text(name: str) -> str | None:
-    """The own text of a type that comes with us, or ``None``."""
+    """The own text of a type that rmpa brings, or ``None``."""
     return _texts().get(name)
 
 
 def known_types() -> tuple[str, ...]:
-    """The names of all types that come with us."""
+    """The names of all types that rmpa brings."""
     return tuple(_texts())
 
 
 @functools.lru_cache(maxsize=256)
 def known_specifications(name: str) -> Mapping[str, Specification]:
-    """A type that comes with us, and all that it embeds.
+    """A type that rmpa brings, and all that it embeds.
 
     Raises:
-        DefinitionError: It does not come with us.
+        DefinitionError: rmpa does not bring it.
     """
     if name not in _texts():
         raise UnknownTypeError(
             name, "is not one that comes with rmpa", "its definition is learnt from a publisher of that type"
         )
-    found: dict[str, Specification] = {}
-    todo = [name]
-    while todo:
-        each = todo.pop()
-        if each not in found:
-            found[each] = Specification.parse(each, _texts()[each])
-            todo += found[each].depends()
+    found = {name: Specification.parse(name, _texts()[name])}
+    complete(found, known_text)
     return found

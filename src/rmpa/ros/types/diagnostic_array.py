@@ -1,6 +1,6 @@
-"""``diagnostic_msgs/DiagnosticArray`` as bytes (REP 107): what an agent says of itself to rqt and its like.
+"""Serializes ``diagnostic_msgs/DiagnosticArray`` (REP 107), which an agent publishes on /diagnostics.
 
-Written by hand, for the agent decodes and encodes no other message, and the libraries for it would double its memory.
+By hand: the agent needs few messages, and rosbags with numpy would double its memory.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _SECOND: Final = 1_000_000_000
 
 
 class DiagnosticLevel(IntEnum):
-    """How a component is; the numbers are the message's."""
+    """``level`` of a ``DiagnosticStatus``."""
 
     OK = 0
     WARN = 1
@@ -64,14 +64,14 @@ class DiagnosticLevel(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class DiagnosticStatus:
-    """How one component is.
+    """One ``diagnostic_msgs/DiagnosticStatus``.
 
     Args:
-        level: The worst that is true of it.
-        name: Which component; unique in an array.
-        message: In a few words.
-        hardware_id: The module that says so.
-        values: Figures and facts, each ready to read.
+        level: The worst level of the component.
+        name: The component; unique in an array.
+        message: The status in a few words.
+        hardware_id: The reporting module.
+        values: Figures and facts, for people.
     """
 
     level: DiagnosticLevel
@@ -93,9 +93,9 @@ def frame_array(sequence: int, stamp_ns: int, statuses: Iterable[bytes]) -> byte
     """A whole message with its length in front, as TCPROS sends it.
 
     Args:
-        sequence: The header's; wraps.
-        stamp_ns: The header's, wall clock.
-        statuses: What ``DiagnosticStatus.serialize`` gave.
+        sequence: ``header.seq``, modulo 2^32.
+        stamp_ns: ``header.stamp``, nanoseconds of the wall clock.
+        statuses: Results of ``DiagnosticStatus.serialize``.
     """
     elements = tuple(statuses)
     seconds, nanoseconds = divmod(stamp_ns, _SECOND)

@@ -1,10 +1,9 @@
-"""Finds the definition of a message or service type by its name: one way for commands, nodes and Smart Resources.
+"""Finds the definition of a message or service type by its name, for commands, nodes and Smart Resources.
 
-In this order: the workspaces that are sourced (``ros.types.installed`` says where), what comes with us, and where
-ROS is
-installed on this machine. So a workspace's version of a standard type is preferred to ours, as it is by the nodes of
-that workspace. Where an md5 sum is given (a service's server or a publisher has one), the version with that sum is
-taken, wherever it is. What none of these knows may be learnt from a publisher: ``ros.node.learn_type``.
+The search goes through the sourced workspaces (``ros.types.installed``), the types that rmpa brings, and the ROS
+installations of this machine. So a workspace's version of a standard type is preferred, as by the nodes of that
+workspace. With an md5 sum (of a service's server or a publisher) the version that has it is used, wherever it is. A
+type that is not found may be fetched from a publisher: ``ros.node.fetch_type``.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ class _Versioned(Protocol):
 
 _Type = TypeVar("_Type", bound=_Versioned)
 EMPTY_MD5: Final = "d41d8cd98f00b204e9800998ecf8427e"
-"""Of a message without fields, whose publishers send an empty definition."""
+"""The md5 sum of a message without fields, for which publishers send an empty definition."""
 _REMEDIES: Final = {
     "msg": "source the workspace that has it, or let a node that publishes it run, here or at a peer",
     "srv": "source the workspace that has it; no server sends its definition",
@@ -57,12 +56,12 @@ def find_message_type(name: str, md5: str = "", environ: Mapping[str, str] | Non
 
     Args:
         name: ``package/Name``.
-        md5: The version that is meant; by default the first that is found.
-        environ: Instead of this process's variables.
+        md5: The md5 sum of the version; by default the first that is found.
+        environ: Replaces this process's environment variables.
 
     Raises:
-        UnknownTypeError: It is in none of the places, which are named.
-        DefinitionError: What is there is malformed, or has another sum.
+        UnknownTypeError: It is in none of the places, which the text names.
+        DefinitionError: The definition is malformed, or has another md5 sum.
         LimitExceeded: It is too long.
     """
     return _again(_message, name, md5, SearchPath.read(os.environ if environ is None else environ))
@@ -77,7 +76,7 @@ def find_service_type(name: str, md5: str = "", environ: Mapping[str, str] | Non
 
 
 def _again(find: Callable[[str, str, SearchPath], _Type], name: str, md5: str, path: SearchPath) -> _Type:
-    """Find a type; where it is missing, look at the folders anew: it may have been built since the last look."""
+    """Find a type; if it is missing, search again without the cache: it may have been built since."""
     fresh = packages_below.cache_info().currsize == 0
     try:
         return find(name, md5, path)
@@ -95,7 +94,7 @@ def message_with_sum(name: str, md5: str, path: SearchPath) -> MessageType:
     Raises:
         DefinitionError: As for ``find_message_type``.
     """
-    # Asked for each message. With a sum it stays true whatever becomes of the files.
+    # Called for each message. With a sum the result stays valid when the files change.
     return _again(_message, name, md5, path)
 
 
@@ -108,10 +107,10 @@ def _service(name: str, md5: str, path: SearchPath) -> ServiceType:
 
 
 def _choose(name: str, md5: str, versions: Iterator[Callable[[], _Type]]) -> _Type | None:
-    """The first version that can be made and has the sum; ``None`` if there is none at all.
+    """The first valid version that has the sum; ``None`` if there is no version at all.
 
     Raises:
-        RmpaError: There are some, but none of them will do.
+        RmpaError: There are versions, but none is valid and has the sum.
     """
     problem: RmpaError | None = None
     for make in versions:
@@ -131,7 +130,7 @@ def _choose(name: str, md5: str, versions: Iterator[Callable[[], _Type]]) -> _Ty
 
 
 def _messages(name: str, path: SearchPath) -> Iterator[Callable[[], MessageType]]:
-    """Makers of the versions of a message type, best first."""
+    """Factories of the versions of a message type, best first."""
     for found in find_messages(name, path, sourced=True):
         yield functools.partial(_make_message, name, found, path)
     if known_text(name) is not None:
@@ -159,7 +158,7 @@ def _make_message(name: str, found: Found, path: SearchPath) -> MessageType:
     if known_text(name) is not None:
         ours = MessageType(name)
         if ours.md5sum == made.md5sum:
-            return ours  # it is ready sooner
+            return ours  # it is built already
     return made
 
 
@@ -179,7 +178,7 @@ def _make_service(name: str, found: Found, path: SearchPath) -> ServiceType:
     return _built_service(name, found.text, tuple(embedded.items()), str(found.where))
 
 
-# Types are kept by their text, with the code that reads and writes them: making that takes some 10 ms.
+# Types are cached by their text, with their serialization code, which takes some 10 ms to generate.
 @functools.lru_cache(maxsize=limits.TYPES_FOUND_MAX)
 def _built_message(name: str, definition: str, source: str) -> MessageType:
     return MessageType(name, parse_definition(name, definition), source)
@@ -215,16 +214,16 @@ def _embedded(found: Found, path: SearchPath, name: str) -> str | None:
 
 
 def _unknown(name: str, path: SearchPath, kind: str) -> NoReturn:
-    """Say where was looked, and what there is instead.
+    """Raise the error for a type that was not found, with the searched places and similar names.
 
     Args:
         name: The type.
-        path: Where was looked.
+        path: The searched places.
         kind: ``msg`` or ``srv``.
 
     Raises:
         UnknownTypeError: Always.
-        DefinitionError: It is not the name of a type.
+        DefinitionError: ``name`` is not the name of a type.
     """
     what = "message type" if kind == "msg" else "service type"
     if not is_type_name(name):
@@ -244,4 +243,4 @@ def _unknown(name: str, path: SearchPath, kind: str) -> NoReturn:
     near = did_you_mean(name, there or [each for each in ours if each.endswith(f"/{base}")])
     guess = f"did you mean {near}? Else " if near else ""
     problem += f"; looked in {path}, and at what comes with rmpa"
-    raise UnknownTypeError(name, problem, guess + _REMEDIES[kind], what, learnable=not ours_too)
+    raise UnknownTypeError(name, problem, guess + _REMEDIES[kind], what, fetchable=not ours_too)

@@ -1,4 +1,4 @@
-"""The message type that a connection header names, asked for each message: what is not found is remembered."""
+"""The message type of a connection header, for each message: failed searches are cached."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 _missing: OrderedDict[tuple[str, str, SearchPath], tuple[float, RmpaError]] = OrderedDict()
-"""When types were looked for in vain, monotonic seconds, and what was said; the oldest first."""
+"""Types that were not found: the time of the search (monotonic seconds) and the error; the oldest first."""
 _missing_lock: Final = threading.Lock()
 
 
 def _unless_missing(name: str, md5: str, path: SearchPath) -> MessageType:
-    """Find a message type with a sum, unless it was looked for in vain a moment ago."""
+    """Find a message type with a sum, unless the last search failed within ``limits.TYPE_MISSING``."""
     key = name, md5, path
     with _missing_lock:
         when, error = _missing.get(key, (0.0, None))
@@ -31,7 +31,7 @@ def _unless_missing(name: str, md5: str, path: SearchPath) -> MessageType:
             del _missing[key]
             error = None
     if error is not None:
-        raise error.with_traceback(None)  # else it would grow by each message
+        raise error.with_traceback(None)  # it would grow with each message
     try:
         return message_with_sum(name, md5, path)
     except RmpaError as problem:
@@ -44,9 +44,9 @@ def _unless_missing(name: str, md5: str, path: SearchPath) -> MessageType:
 
 
 def type_of_header(fields: Mapping[str, str]) -> MessageType:
-    """The message type that a publisher's connection header names, by its definition or, without one, as found here.
+    """The message type of a publisher's connection header, by its definition or else as found on this machine.
 
-    It may be called for each message: what is not found is not looked for again for ``limits.TYPE_MISSING``.
+    May be called for each message: a failed search is not repeated within ``limits.TYPE_MISSING``.
 
     Raises:
         DefinitionError: As for ``MessageType.learn`` and ``find_message_type``.

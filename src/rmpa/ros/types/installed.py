@@ -1,12 +1,13 @@
-"""The text of definitions that are on this machine: in the workspaces that are sourced, and where ROS is installed.
+"""Definitions on this machine: in the sourced workspaces, and where ROS is installed.
 
-Looked at, in this order, the workspaces first:
+The search order is, in the workspaces:
 
-* the modules that genpy made, below each folder of PYTHONPATH: what rospy's nodes import. They are read, never run;
+* genpy's modules below each folder of PYTHONPATH, which rospy's nodes import. They are read, never run;
 * the packages below each folder of ROS_PACKAGE_PATH (``ros.types.packages``): ``msg/Name.msg``, ``srv/Name.srv``,
-  and of an action ``action/Name.action`` alone is enough;
-* of each prefix of CMAKE_PREFIX_PATH (a devel or install space) genpy's modules, ``share``, and the source folders
-  that catkin writes to its file ``.catkin``.
+  or ``action/Name.action`` for the messages of an action;
+* in each prefix of CMAKE_PREFIX_PATH (a devel or install space) genpy's modules, ``share``, and the source folders
+that
+  its file ``.catkin`` lists.
 
 Then, sourced or not, ``/opt/ros/*`` (that of ROS_DISTRO first) and ``/usr``, likewise.
 """
@@ -40,7 +41,7 @@ _FULL_TEXT: Final = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class SearchPath:
-    """Where definitions are looked for.
+    """The places in which definitions are searched.
 
     Args:
         python: The folders of PYTHONPATH.
@@ -56,7 +57,7 @@ class SearchPath:
 
     @classmethod
     def read(cls, environ: Mapping[str, str]) -> SearchPath:
-        """The path that these variables say."""
+        """Read it from environment variables."""
         python, packages, prefixes = (
             tuple(dict.fromkeys(part for part in environ.get(name, "").split(os.pathsep) if part))
             for name in ("PYTHONPATH", "ROS_PACKAGE_PATH", "CMAKE_PREFIX_PATH")
@@ -65,7 +66,7 @@ class SearchPath:
 
     @property
     def system(self) -> tuple[str, ...]:
-        """The prefixes where ROS is installed, sourced or not: that of the distribution, then the newest."""
+        """The prefixes of ROS installations, sourced or not: first that of the distribution, then the newest."""
         try:
             found = sorted((str(prefix) for prefix in _DISTRIBUTIONS.iterdir()), reverse=True)
         except OSError:
@@ -97,8 +98,8 @@ class Found:
     """One definition.
 
     Args:
-        text: Of a message its own text; of a service the request's, a line ``---`` and the response's.
-        embedded: The own texts of types that it embeds, as far as its file has them.
+        text: A message's own text; or a service's request, a line ``---`` and its response.
+        embedded: The own texts of embedded types, as far as its file has them.
         where: The file.
     """
 
@@ -108,7 +109,7 @@ class Found:
 
 
 def find_messages(name: str, path: SearchPath, *, sourced: bool) -> Iterator[Found]:
-    """The definitions of a message type, best first; ``sourced``: those of the workspaces, else of the system."""
+    """The definitions of a message type, best first: of the workspaces (``sourced``) or of the system."""
     if not is_type_name(name):
         return
     package, _, base = name.partition("/")
@@ -149,7 +150,7 @@ def definitions_of(package: str, path: SearchPath, kind: str) -> tuple[list[Path
 
     Args:
         package: Its name.
-        path: Where to look.
+        path: The places to search.
         kind: ``msg`` or ``srv``.
     """
     folders: list[Path] = []
@@ -164,7 +165,7 @@ def definitions_of(package: str, path: SearchPath, kind: str) -> tuple[list[Path
 
 
 def _places(package: str, path: SearchPath, *, sourced: bool) -> Iterator[tuple[bool, Path]]:
-    """Folders that may be the package's, and whether genpy's modules are in them rather than definitions."""
+    """Folders that may be the package's, each with whether it holds genpy's modules instead of definitions."""
     if sourced:
         for entry in path.python:
             yield True, Path(entry, package)

@@ -1,7 +1,7 @@
-"""Messages as Python objects: serialize, read, build from plain values, and turn back into them.
+"""Messages as Python objects: serialize, deserialize, and convert from and to plain values.
 
-``rosbags`` does the work; it and numpy are imported when the first message is built or read, never before: the agent
-carries bytes and starts without them. MD5 sums and definitions need neither.
+``rosbags`` and numpy are imported when the first message is built or read: the agent forwards bytes and starts
+without them. MD5 sums and definitions need neither.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 Plain: TypeAlias = Union[  # noqa: UP007 - | does not take the forward references of a recursive type
     bool, int, float, str, list["Plain"], dict[str, "Plain"], None
 ]
-"""What YAML and JSON can say."""
+"""A value of YAML or JSON."""
 
 _TIMES: Final = {"time": "builtin_interfaces/msg/Time", "duration": "builtin_interfaces/msg/Duration"}
 _NANO: Final = 1_000_000_000
 _FLOATS: Final = frozenset(("float32", "float64"))
 _SHOWN: Final = 80
-"""Characters of a wrong value that an error shows."""
+"""Characters of a wrong value in an error."""
 _DTYPES: Final = {"bool": "bool_", "byte": "uint8", "char": "uint8"}
 
 
@@ -50,9 +50,9 @@ class MessageType:
 
     Args:
         name: ``package/Name``.
-        specifications: The type and all that it embeds, by name; by default those that come with us. To find those of
-            this machine's packages, use ``rmpa.ros.types.find``.
-        source: The file that its definition is from; empty: it comes with us, or was learnt.
+        specifications: The type and all that it embeds, by name; by default those that rmpa brings.
+            ``rmpa.ros.types.find`` finds those of this machine's packages.
+        source: The file of its definition; empty for one that rmpa brings or that a publisher sent.
 
     Raises:
         DefinitionError: The type is not known, or malformed.
@@ -70,12 +70,12 @@ class MessageType:
 
     @classmethod
     def learn(cls, name: str, definition: str, md5: str = "") -> MessageType:
-        """A type from what its publisher says about it; the last ``limits.LEARNT_TYPES_MAX`` are remembered.
+        """A type from its publisher's header; the last ``limits.RECEIVED_TYPES_MAX`` are cached.
 
         Args:
             name: ``package/Name``.
             definition: The full text.
-            md5: The sum that the publisher names; with it the text is checked.
+            md5: The publisher's md5 sum, with which the text is checked.
 
         Raises:
             DefinitionError: The text is malformed, or has another sum.
@@ -87,7 +87,7 @@ class MessageType:
         return learnt
 
     def describe(self, *, latching: bool = False) -> TopicDescription:
-        """What a publisher of this type says."""
+        """The description for a publisher's header."""
         return TopicDescription(self.name, self.md5sum, self.definition, latching)
 
     @property
@@ -104,7 +104,7 @@ class MessageType:
         try:
             return bytes(self._store.serialize_ros1(message, _inner(self.name)))
         except Exception as error:
-            # rosbags checks nothing: what it meets depends on the field.
+            # rosbags checks nothing: the exception depends on the field.
             raise MessageError(f"cannot serialize a {self.name}: {type(error).__name__}: {error}") from error
 
     def deserialize(self, raw: Buffer) -> Any:
@@ -119,7 +119,7 @@ class MessageType:
             raise MessageError(f"{len(raw)} bytes are not a {self.name}: {error}") from error
 
     def make(self, values: Plain | Mapping[str, object] = None) -> Any:
-        """A message object from plain values; what is not given is 0, empty or false, as in ROS.
+        """A message object from plain values; missing fields are 0, empty or false, as in ROS.
 
         Args:
             values: A mapping of fields; or a list of all fields in order; or the value itself where there is one
@@ -131,14 +131,14 @@ class MessageType:
         return self._make(self.name, values, "")
 
     def to_plain(self, message: object) -> dict[str, Plain]:
-        """A message object as what JSON and YAML can say; times are ``{secs, nsecs}``."""
+        """A message object as plain values; times are ``{secs, nsecs}``."""
         return self._plain(self.name, message)
 
     # --- inside -----------------------------------------------------------------------------------------------
 
     @functools.cached_property
     def _store(self) -> Typestore:
-        # rosbags brings most of the types that come with us; TFMessage is one that it does not.
+        # rosbags has most of the types that rmpa brings, but not TFMessage.
         if self._learnt or _inner(self.name) not in _known_store().types:
             return _learnt_store(self.name, self._specifications)
         return _known_store()
@@ -261,7 +261,7 @@ def _primitive(kind: str, value: Plain, path: str) -> bool | float | str:
 
 
 def _sequence(field: Field, value: Any, path: str) -> Any:
-    """What a program has for an array: numpy's array or bytes, ready to be sent; else as a list."""
+    """A program's value for an array: numpy's array or bytes as an array to serialize, all else as a list."""
     if isinstance(value, tuple):
         return list(value)
     raw = isinstance(value, bytes | bytearray | memoryview) and field.type in ("uint8", "char", "byte", "int8")
@@ -272,7 +272,7 @@ def _sequence(field: Field, value: Any, path: str) -> Any:
     import numpy as np  # noqa: PLC0415 - see the module's docstring
 
     kind = np.dtype(_DTYPES.get(field.type, field.type))
-    # A copy: the caller may go on to change what it gave.
+    # A copy: the caller may change its array later.
     given = np.frombuffer(value, kind).copy() if raw else np.asarray(value).ravel()
     if field.size and given.size != field.size:
         raise MessageError(f"{path} has {field.size} elements, not {given.size}")
@@ -339,7 +339,7 @@ def _known_store() -> Typestore:
     return Ros1Store(Stores.ROS1_NOETIC)
 
 
-@functools.lru_cache(maxsize=limits.LEARNT_TYPES_MAX)
+@functools.lru_cache(maxsize=limits.RECEIVED_TYPES_MAX)
 def _learn(name: str, definition: str) -> MessageType:
     return MessageType(name, parse_definition(name, definition))
 
@@ -353,8 +353,8 @@ def _learnt_store(name: str, specifications: Mapping[str, Specification]) -> Typ
     store = Ros1Store(Stores.EMPTY)
     try:
         for each in specifications.values():
-            # Written anew from the parsed fields: comments and constants, which a reader does not need, stay out of
-            # the code that rosbags generates, and so do lines that it reads differently.
+            # From the parsed fields: without comments and constants, which serialization does not need, and without
+            # lines that rosbags parses differently.
             text = "".join(f"{field} {field.name}\n" for field in each.fields)
             store.register(get_types_from_msg(text, _inner(each.name)))
     except (TypesysError, SyntaxError, ValueError) as error:

@@ -1,9 +1,9 @@
-"""The ROS packages below a folder, found as rospack finds them (wiki.ros.org/rospack).
+"""Finds the ROS packages below a folder as rospack does (wiki.ros.org/rospack).
 
 A folder with a ``package.xml`` (catkin) or ``manifest.xml`` (rosbuild) is a package, and none is within another.
 ``CATKIN_IGNORE`` hides a folder and all below it, ``rospack_nosubdirs`` what is below. Symbolic links are followed,
-each folder once. The search is bounded (``limits.PACKAGE_*``), nearer folders come first, and what cannot be read is
-passed over. Only packages with definitions are kept.
+each folder once. The search is bounded (``limits.PACKAGE_*``) and breadth first; what cannot be read is skipped. Only
+packages with definitions are found.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
 DEFINITIONS: Final = frozenset(("msg", "srv", "action"))
-"""The folders of a package that definitions are in."""
+"""The folders of a package with definitions."""
 _COMMENT: Final = re.compile(r"<!--.*?-->", re.DOTALL)
 _NAME: Final = re.compile(r"<name(?:\s[^>]*)?>\s*([^<\s]+)\s*</name>")
 
 
 @dataclass(frozen=True, slots=True)
 class Packages:
-    """What was found below a folder.
+    """The packages with definitions below a folder.
 
     Args:
-        folders: Those of each package with definitions, by its name.
-        whole: Whether all was searched; ``False`` where a limit ended it.
+        folders: The folders of each package, by its name.
+        whole: Whether the search was complete; ``False`` if a limit ended it.
     """
 
     folders: Mapping[str, tuple[Path, ...]]
@@ -43,7 +43,7 @@ class Packages:
 
 @functools.lru_cache(maxsize=64)
 def packages_below(root: str) -> Packages:
-    """Search a folder for packages; ``packages_below.cache_clear()`` makes the next call look again."""
+    """Search a folder for packages; ``packages_below.cache_clear()`` makes the next call search again."""
     search = _Search()
     whole = search.run(Path(root))
     folders: dict[str, tuple[Path, ...]] = {}
@@ -53,7 +53,7 @@ def packages_below(root: str) -> Packages:
 
 
 def package_folders(package: str, root: str) -> Iterator[Path]:
-    """The folders of a package below a root; the search is only begun where it is not right below it."""
+    """The folders of a package below a root; one right below it is found without a search."""
     direct = Path(root, package)
     is_direct = _is_package(direct, package)
     if is_direct:
@@ -80,12 +80,12 @@ class _Search:
     def __init__(self) -> None:
         self.packages: list[tuple[str, Path]] = []
         self.loose: list[tuple[str, Path]] = []
-        """Folders with definitions that do not say that they are packages; ROS takes them for none."""
+        """Folders with definitions but without a manifest, which ROS does not take for packages."""
         self._seen: set[tuple[int, int]] = set()
         self._entries = 0
 
     def run(self, root: Path) -> bool:
-        """Search; whether no limit was met."""
+        """Search; return whether no limit was met."""
         waiting = deque([(root, 0)])
         whole = True
         for _ in range(limits.PACKAGE_FOLDERS_MAX):
@@ -100,7 +100,7 @@ class _Search:
         return whole and not waiting
 
     def _look(self, folder: Path) -> list[str]:
-        """Note a folder if it is a package; return the names of the folders in it that are to be searched."""
+        """Add a folder if it is a package; return the names of the folders in it to search."""
         files, inner = self._entries_of(folder)
         if "CATKIN_IGNORE" in files:
             return []
@@ -113,7 +113,7 @@ class _Search:
         return sorted(name for name in inner - DEFINITIONS if not name.startswith("."))
 
     def _entries_of(self, folder: Path) -> tuple[set[str], set[str]]:
-        """The names of its files and of its folders; none where it was seen before or cannot be read."""
+        """The names of its files and of its folders; none if it was searched before or cannot be read."""
         files: set[str] = set()
         folders: set[str] = set()
         try:

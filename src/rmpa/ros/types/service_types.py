@@ -1,7 +1,7 @@
 """Service types: their definitions, MD5 sums, and requests and responses as Python objects.
 
-A definition is the request's text, a line ``---``, and the response's (wiki.ros.org/srv). Those of ROS's own packages
-come with us; ``ros.types.find`` finds those of this machine's packages, for no server sends its own.
+A definition is the request's text, a line ``---``, and the response's (wiki.ros.org/srv). rmpa brings those of ROS's
+own packages; ``ros.types.find`` finds those of this machine's packages. No server sends its definition.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ class ServiceType:
 
     Args:
         name: ``package/Name``.
-        text: Its definition; by default that which comes with us.
-        find: Gives the own text of a message type that it embeds, or ``None``; by default those that come with us.
-        source: The file that its definition is from; empty: it comes with us.
+        text: Its definition; by default the one that rmpa brings.
+        find: Returns the own text of an embedded message type, or ``None``; by default of those that rmpa brings.
+        source: The file of its definition; empty for one that rmpa brings.
 
     Raises:
         DefinitionError: The type is not known, or malformed.
@@ -65,7 +65,7 @@ class ServiceType:
         self.md5sum = service_md5sum(*parts, known)
 
     def describe(self) -> ServiceDescription:
-        """What a server of this type says."""
+        """The description for a server's header."""
         return ServiceDescription(self.name, self.md5sum, self.request.name, self.response.name)
 
 
@@ -74,15 +74,15 @@ def _texts() -> Mapping[str, str]:
 
 
 def known_services() -> tuple[str, ...]:
-    """The names of all service types that come with us."""
+    """The names of all service types that rmpa brings."""
     return tuple(_texts())
 
 
 def known_service(name: str) -> str:
-    """The definition of a service type that comes with us.
+    """The definition of a service type that rmpa brings.
 
     Raises:
-        DefinitionError: It does not.
+        DefinitionError: rmpa does not bring it.
     """
     if name not in _texts():
         raise UnknownTypeError(

@@ -1,4 +1,4 @@
-"""The text of ``std_msgs/Header``, as it stands behind the definition of every stamped message."""
+"""The text of ``std_msgs/Header`` in the full definition of a stamped message."""
 
 from __future__ import annotations
 
@@ -21,4 +21,4 @@ HEADER_PART: Final = (
     "#Frame this data is associated with\n"
     "string frame_id\n"
 )
-"""Byte for byte as ROS's own publishers send it: rosbag and others compute md5 sums from definitions."""
+"""To the byte as ROS's publishers send it: rosbag and others compute md5 sums from definitions."""

@@ -1,7 +1,7 @@
-"""A rosbags store that makes what ROS 1 needs, and nothing for CDR: a message type is ready in a quarter of the time.
+"""A rosbags type store without CDR: a message type is ready in a quarter of the time.
 
-rosbags makes twelve functions for each type when it is first used; three of them read and write ROS 1. Imported only
-where a message is built or read (see ``ros.types.messages``).
+rosbags generates twelve functions for each type when it is first used; three of them are for ROS 1. This module is
+imported when the first message is built or read (see ``ros.types.messages``).
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 
 class Ros1Store(Typestore):
-    """A store of its own that begins with all types of one of rosbags' own.
+    """A store that begins with the types of one of rosbags' stores.
 
     Args:
-        begin: Which.
+        begin: That store.
     """
 
     def __init__(self, begin: Stores) -> None:
@@ -32,7 +32,7 @@ class Ros1Store(Typestore):
         self.types = dict(known.types)
 
     def get_msgdef(self, typename: str) -> Msgdef[object]:
-        """What reads and writes a type; made when it is first asked for.
+        """The generated functions of a type; generated at the first call.
 
         Raises:
             KeyError: The type is not known.

@@ -1,1 +1,1 @@
-"""TODO room."""
+"""Wire formats without I/O: HTTP, XML-RPC, the Slave API, TCPROS and its services."""

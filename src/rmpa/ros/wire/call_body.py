@@ -1,8 +1,8 @@
-"""The body of an XML-RPC call as it comes, and what the caller of one that is too large is told: an XML-RPC fault.
+"""Collects the body of an XML-RPC call; a call that is too large is answered with an XML-RPC fault.
 
-Of the ways to say no, a fault is the one that ROS's clients show: ``rospy.set_param`` ignores a status of -1 and
-xmlrpc.client hides the text of an HTTP error. ``rosparam`` and ``roslaunch`` print the fault's text. A client reads
-no answer before it has sent its whole call, so a refused one is read to its end; only its beginning is kept.
+Of all errors a fault is the one that ROS's clients show: ``rospy.set_param`` ignores a status of -1 and xmlrpc.client
+hides the text of an HTTP error, while ``rosparam`` and ``roslaunch`` print a fault's text. A client reads no answer
+before it has sent its whole call, so a refused call is read to its end, but only its beginning is kept.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 _METHOD: Final = re.compile(rb"<methodName>\s*([A-Za-z0-9_.]{1,64})\s*</methodName>")
 _TEXTS: Final = re.compile(rb"<value>\s*(?:<string>)?([^<]{1,256})(?:</string>)?\s*</value>")
 _BEGIN: Final = 4 * KIB
-"""Bytes of a refused call that are kept to say what it was."""
+"""Bytes of a refused call that are kept, to name the call in the fault."""
 
 
 class CallBody:
-    """Takes one body after the other.
+    """Collects one body after the other.
 
     Args:
         reserve: ``(bytes) -> whether there is room``: asked once for each large call.
@@ -37,19 +37,19 @@ class CallBody:
         self._left_out = 0
         self._why: Callable[[bytes | bytearray, int], str] | None = None
         self.reserved = 0
-        """Bytes that are set aside for the present call, until ``answered``."""
+        """Bytes reserved for the present call, until ``answered``."""
 
     def __len__(self) -> int:
-        """Bytes that have come."""
+        """Bytes received."""
         return len(self._data) + self._left_out
 
     @property
     def refused(self) -> bool:
-        """Whether what comes now is only read to be refused."""
+        """Whether the call is too large: its bytes are dropped."""
         return self._why is not None
 
     def expect(self, size: int) -> bool:
-        """Say how many bytes a body will have, if its head tells; whether it is taken."""
+        """Announce the size of a body that has a Content-length; return whether it is accepted."""
         if size > limits.HTTP_BODY_MAX:
             self._why = too_large
         elif size > limits.HTTP_BODY_INLINE and not self.reserved:
@@ -60,10 +60,10 @@ class CallBody:
         return self._why is None
 
     def add(self, data: bytes | bytearray) -> None:
-        """Take a part."""
+        """Add a part."""
         size = len(self) + len(data)
         if self._why is None and size > limits.HTTP_BODY_INLINE:
-            # One that comes in chunks tells only now that it is large.
+            # A body in chunks has no announced size.
             self.expect(max(size, limits.HTTP_BODY_MAX))
         if self._why is None:
             self._data += data
@@ -73,21 +73,21 @@ class CallBody:
             self._left_out = size - len(self._data)
 
     def end(self) -> tuple[memoryview, str]:
-        """The whole body and an empty text; or of a refused one its beginning, and what its caller is told."""
+        """The whole body and an empty text; or of a refused one its beginning and the text of the fault."""
         data, size, why = self._data, len(self), self._why
         self._data, self._left_out, self._why = bytearray(), 0, None
         return memoryview(data), why(data, size) if why is not None else ""
 
     def answered(self) -> None:
-        """The call is answered: it needs no room any more."""
+        """Release what is reserved: the call is answered."""
         self.reserved = 0
 
 
 def call_name(begin: bytes | bytearray) -> str:
-    """What a call is, by its first bytes: ``setParam /map``, ``system.multicall``; ``a call`` where they do not tell.
+    """A call's method, and of a parameter its key: ``setParam /map``; ``a call`` if the bytes do not show it.
 
     Args:
-        begin: At least its method, its caller and, for a parameter, the key.
+        begin: The first bytes of the call.
     """
     method = _METHOD.search(begin)
     if method is None:
@@ -100,7 +100,7 @@ def call_name(begin: bytes | bytearray) -> str:
 
 
 def too_large(begin: bytes | bytearray, size: int, limit: int = 0) -> str:
-    """The text for a call of ``size`` bytes, the bound and the remedy included."""
+    """The text of the fault for a call of ``size`` bytes, with the limit and a remedy."""
     limit = limit or limits.HTTP_BODY_MAX
     return (
         f"{call_name(begin)}: {size} bytes, above the {limit} ({limit >> 20} MiB) of one call; set its parts one by "
@@ -109,7 +109,7 @@ def too_large(begin: bytes | bytearray, size: int, limit: int = 0) -> str:
 
 
 def too_many(begin: bytes | bytearray, size: int) -> str:
-    """The text for a call that has no room beside those under way."""
+    """The text of the fault for a call that does not fit beside those under way."""
     return (
         f"{call_name(begin)}: {size} bytes beside other large calls, above the {limits.HTTP_BODIES_MAX >> 20} MiB of "
         "all that are under way; try again in a moment"

@@ -24,18 +24,18 @@ if TYPE_CHECKING:
     from rmpa.ros.wire.tcpros import Buffer, Header
 
 REPLY: Final = struct.Struct("<BI")
-"""In front of a response: whether it went well, and the length."""
+"""In front of a response: the ``ok`` byte and the length."""
 _SCHEME: Final = "rosrpc://"
 _TRUE: Final = ("1", "true")
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceDescription:
-    """What a server says about its service.
+    """A server's description of its service.
 
     Args:
         type: ``package/Name``.
-        md5sum: Of both definitions, 32 hexadecimal digits.
+        md5sum: Of request and response together, 32 hexadecimal digits.
         request_type: ``package/NameRequest``.
         response_type: ``package/NameResponse``.
     """
@@ -47,7 +47,7 @@ class ServiceDescription:
 
     @classmethod
     def from_header(cls, fields: Mapping[str, str]) -> ServiceDescription:
-        """Read a server's reply header; fields that it need not have are empty."""
+        """Read a server's reply header; missing fields are empty."""
         kind = fields.get("type", "")
         return cls(
             kind,
@@ -67,7 +67,7 @@ class ServiceDescription:
 def client_header(
     service: str, caller_id: str, *, md5sum: str = ANY, persistent: bool = False, probe: bool = False
 ) -> Header:
-    """What a client says first."""
+    """The header of a client."""
     fields = {"service": service, "callerid": caller_id, "md5sum": md5sum}
     if persistent:
         fields["persistent"] = "1"
@@ -77,7 +77,7 @@ def client_header(
 
 
 def server_header(caller_id: str, description: ServiceDescription) -> Header:
-    """What a server answers.
+    """The reply header of a server.
 
     Raises:
         ValueError: The description has ``*`` for its type or md5 sum; clients build messages from them.
@@ -94,19 +94,19 @@ def server_header(caller_id: str, description: ServiceDescription) -> Header:
 
 
 def is_persistent(fields: Mapping[str, str]) -> bool:
-    """Whether a client wants to call several times over one connection: ``1`` or ``true`` in any case."""
+    """Whether a client calls several times over one connection: ``1`` or ``true`` in any case."""
     return fields.get("persistent", "").lower() in _TRUE
 
 
 def is_probe(fields: Mapping[str, str]) -> bool:
-    """Whether a client only wants to know what the service is."""
+    """Whether a client asks for the description alone."""
     return fields.get("probe", "").lower() in _TRUE
 
 
 def check_client(
     fields: Mapping[str, str], service: str, caller_id: str, description: ServiceDescription
 ) -> str | None:
-    """Whether a client's md5 sum fits: ``None``, or the text of the error header."""
+    """Compare a client's md5 sum: ``None`` if it matches, else the text of the error header."""
     if fields["md5sum"] in (ANY, description.md5sum):
         return None
     return (
@@ -116,7 +116,7 @@ def check_client(
 
 
 def check_server(fields: Mapping[str, str], service: str, md5sum: str = ANY) -> str | None:
-    """Whether a server's reply may be believed: an error text, or ``None``."""
+    """Check a server's reply header: an error text, or ``None`` if it is valid."""
     if "error" in fields:
         return printable(fields["error"])
     if not fields.get("md5sum"):
@@ -143,7 +143,7 @@ def parse_request_length(data: Buffer) -> int | None:
 
 
 def parse_reply_head(data: Buffer) -> tuple[bool, int] | None:
-    """Whether a reply went well and how long its body is, or ``None`` without enough bytes.
+    """The ``ok`` byte of a reply and the length of its body, or ``None`` without enough bytes.
 
     Raises:
         LimitExceeded: It claims more than ``limits.SERVICE_MESSAGE_MAX``.
@@ -157,10 +157,10 @@ def parse_reply_head(data: Buffer) -> tuple[bool, int] | None:
 
 
 class BodyBuffer:
-    """A request or response of a known size whose bytes come in parts; what is only claimed takes no memory.
+    """A request or response of a known size that comes in parts; memory is taken as bytes come.
 
     Args:
-        size: How many bytes it has.
+        size: Its bytes.
     """
 
     __slots__ = ("data", "size")
@@ -170,14 +170,14 @@ class BodyBuffer:
         self.data = bytearray()
 
     def take(self, part: memoryview) -> int:
-        """Append what belongs to it; return how many bytes that are."""
+        """Append the bytes that belong to it; return their number."""
         mine = part[: self.size - len(self.data)]
         self.data += mine
         return len(mine)
 
     @property
     def whole(self) -> bool:
-        """Whether all of it is there."""
+        """Whether all bytes have come."""
         return len(self.data) == self.size
 
 
@@ -185,7 +185,7 @@ def parse_service_uri(uri: str) -> tuple[str, int]:
     """Host and port of ``rosrpc://host:port``.
 
     Raises:
-        ConfigError: It is not one.
+        ConfigError: The text is not such a URI.
     """
     host, _, port = uri.removeprefix(_SCHEME).rstrip("/").rpartition(":")
     number = int(port) if re.fullmatch(r"[0-9]{1,5}", port) else 0

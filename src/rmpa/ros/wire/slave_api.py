@@ -1,7 +1,7 @@
 """The Slave API: what a node answers over XML-RPC (wiki.ros.org/ROS/Slave_API).
 
-Pure: a call comes in as a method and its parameters, and leaves as ``Reply(code, status, value)``. What the node
-has and what is to be done are asked from a ``NodeView``.
+Pure: a call comes in as a method and its parameters, and leaves as ``RosReply(code, status, value)``. The state of
+the node and the effects of a call are behind ``NodeView``.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class BusConnection:
         bytes: Sent or received, headers included.
         messages: Sent or received.
         dropped: Messages dropped because the other side is slow; 0 inbound.
-        waiting: Bytes that wait for the other side to read; 0 inbound.
+        waiting: Bytes queued because the other side is slow; 0 inbound.
     """
 
     number: int
@@ -56,35 +56,28 @@ class BusConnection:
 
 
 class NodeView(Protocol):
-    """What the Slave API asks of a node, and tells it."""
+    """A node as the Slave API needs it."""
 
     def publications(self) -> Iterable[tuple[str, str]]:
-        """Topics with their types (``*`` where unknown) that the node publishes."""
-        ...
+        """Published topics with their types (``*`` where unknown)."""
 
     def subscriptions(self) -> Iterable[tuple[str, str]]:
-        """Topics with their types that the node subscribes to."""
-        ...
+        """Subscribed topics with their types."""
 
     def connections(self) -> Iterable[BusConnection]:
         """All topic connections."""
-        ...
 
     def address_of(self, topic: str) -> tuple[str, int] | None:
-        """Where subscribers of a published topic connect to; ``None`` if it is not published."""
-        ...
+        """Host and port for subscribers of a topic; ``None`` if the node does not publish it."""
 
     def publisher_update(self, topic: str, publishers: Sequence[str]) -> None:
-        """The master says who publishes a topic now, by slave API URIs."""
-        ...
+        """The master sends the publishers of a topic, as slave API URIs."""
 
     def param_update(self, key: str, value: XmlRpcValue) -> bool:
-        """A parameter has changed (``{}``: deleted); ``False`` if the node does not follow it."""
-        ...
+        """A parameter has changed (``{}``: deleted); ``False`` if the node has not subscribed to it."""
 
     def shut_down(self, reason: str) -> None:
         """The master wants the node to end."""
-        ...
 
 
 class SlaveApi:
@@ -92,9 +85,9 @@ class SlaveApi:
 
     Args:
         name: The node's global name.
-        master_uri: Of the master that the node is registered at.
-        pid: The process's id.
-        node: What the calls are about.
+        master_uri: The URI of the node's master.
+        pid: The process id.
+        node: The node.
     """
 
     def __init__(self, name: str, master_uri: str, pid: int, node: NodeView) -> None:
@@ -114,7 +107,7 @@ class SlaveApi:
         arity, default, answer = self._METHODS[method]
         if not params:
             return RosReply(_ERROR, "missing required caller_id parameter", default)
-        # The reason of shutdown may be left out, says the wiki; rospy refuses that, which helps nobody.
+        # By the wiki the reason of shutdown is optional; rospy refuses a call without it.
         if len(params) - 1 != arity and not (method == "shutdown" and len(params) == 1):
             return RosReply(_ERROR, "Error: bad call arity", default)
         if not isinstance(params[0], str):
@@ -171,7 +164,7 @@ class SlaveApi:
         return RosReply(_SUCCESS, "publications", [list(pair) for pair in self._node.publications()])
 
     def _param_update(self, params: Sequence[XmlRpcValue]) -> RosReply:
-        # rosmaster writes the key with a slash at its end, and roscpp cleans it off (trap of every new client).
+        # rosmaster appends a slash to the key, and roscpp removes it.
         key = str(params[0]).rstrip("/") or "/"
         if self._node.param_update(key, params[1]):
             return RosReply(_SUCCESS, "", 0)

@@ -1,11 +1,11 @@
 """TCPROS: connection headers and message framing (wiki.ros.org/ROS/TCPROS, wiki.ros.org/ROS/Connection%20Header).
 
-Pure: bytes in, values out. Two nodes agree on a connection by one header each way; the publisher alone decides
-whether they fit (``check_subscriber``). Behind the headers come messages, each with its length in front. All
-integers are little-endian 32-bit.
+Pure: bytes in, values out. Each side of a connection sends one header; the publisher alone decides whether they match
+(``check_subscriber``). Behind the headers come messages, each with its length in front. All integers are
+little-endian 32-bit.
 
-The wiki leaves much open; where it does, this module does what rospy and roscpp 1.15 both accept, and never
-takes a length on trust as they do.
+Where the wiki leaves something open, this module does what rospy and roscpp 1.15 both accept. Unlike them it checks
+each length before it stores anything.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ class MalformedHeader(RemoteProtocolError):  # noqa: N818 - the name says what h
 
 
 class MalformedStream(RemoteProtocolError):  # noqa: N818 - the name says what happened
-    """The bytes where a message's length must be are no length: the stream is out of step."""
+    """The length of a message is impossible: the stream is out of step."""
 
 
 @dataclass(frozen=True, slots=True)
 class TopicDescription:
-    """What a publisher says about its messages.
+    """A publisher's description of its messages.
 
     Args:
         type: ``package/Name``.
         md5sum: Of the definition, 32 hexadecimal digits.
-        definition: The full text with all embedded types, as it came from the publisher; may be empty.
-        latching: Whether the last message is kept for later subscribers.
+        definition: The full text with all embedded types, as the publisher sent it; may be empty.
+        latching: Whether the last message is sent to later subscribers.
     """
 
     type: str
@@ -58,7 +58,7 @@ class TopicDescription:
 
     @classmethod
     def from_header(cls, fields: Mapping[str, str]) -> TopicDescription:
-        """Read a publisher's reply header; fields that it need not have are empty."""
+        """Read a publisher's reply header; missing fields are empty."""
         return cls(
             fields.get("type", ""),
             fields.get("md5sum", ""),
@@ -72,7 +72,7 @@ class TopicDescription:
 
 
 def printable(text: str) -> str:
-    """What a peer sent, made safe for logs and terminals: no control characters, no surrogates, not too long."""
+    """Received text made safe for logs and terminals: without control characters and surrogates, and cut."""
     shown = text if len(text) <= _SHOWN else text[:_SHOWN] + "…"
     return "".join(c if c.isprintable() else "�" for c in shown)
 
@@ -91,10 +91,10 @@ def encode_header(fields: Mapping[str, str]) -> bytes:
 
 
 def decode_header(body: Buffer) -> Header:
-    """Read the fields of a header whose own length was taken off.
+    """Read the fields of a header without its leading length.
 
-    A field is split at its first ``=`` and blanks around its name are taken off, as rospy does; of two fields
-    with one name the last one counts.
+    A field is split at its first ``=`` and blanks around its name are stripped, as rospy does; of two fields with one
+    name the last one counts.
 
     Raises:
         MalformedHeader: A field is empty, has no ``=``, or is longer than what is left.
@@ -121,11 +121,11 @@ def decode_header(body: Buffer) -> Header:
 
 
 def parse_header(data: Buffer) -> tuple[Header | None, int, int]:
-    """Read a header from the front of what has come so far.
+    """Read a header from the front of the received bytes.
 
     Returns:
-        ``(fields, consumed, wanted)``: without enough bytes ``(None, 0, wanted)``, where ``wanted`` is how many
-        there must be in all.
+        ``(fields, consumed, wanted)``: without enough bytes ``(None, 0, wanted)``, where ``wanted`` is the number
+        that is needed in all.
 
     Raises:
         LimitExceeded: The header claims more than ``limits.TCPROS_HEADER_MAX``.
@@ -157,16 +157,16 @@ def frame_message(payload: Buffer) -> bytes:
 
 
 def split_messages(data: memoryview) -> tuple[list[memoryview], int, int]:
-    """Take all whole messages off the front of what has come so far.
+    """Split the received bytes into whole messages.
 
     Returns:
         ``(messages, consumed, wanted)``: each message is a view into ``data`` with its 4-byte length in front;
         ``wanted`` counts from behind the consumed bytes, as ``runtime.stream`` asks for.
 
     Raises:
-        LimitExceeded: The first message claims more than ``limits.TCPROS_MESSAGE_MAX``. Whole messages before such
-            a one are returned first, as before the next one.
-        MalformedStream: The first message claims more than ``limits.TCPROS_LENGTH_MAX``: those bytes are no length.
+        LimitExceeded: The first message claims more than ``limits.TCPROS_MESSAGE_MAX``. Whole messages before such a
+            message are returned first.
+        MalformedStream: The first message claims more than ``limits.TCPROS_LENGTH_MAX``.
     """
     messages: list[memoryview] = []
     start = 0
@@ -188,13 +188,13 @@ def split_messages(data: memoryview) -> tuple[list[memoryview], int, int]:
     return messages, start, LENGTH.size
 
 
-# --- who fits whom --------------------------------------------------------------------------------------------
+# --- matching ---------------------------------------------------------------------------------------------------
 
 
 def subscriber_header(
     topic: str, caller_id: str, *, type_name: str = ANY, md5sum: str = ANY, definition: str = "", nodelay: bool = True
 ) -> Header:
-    """What a subscriber says first; the definition is left out where it is not known, as roscpp does."""
+    """The header of a subscriber; an unknown definition is left out, as roscpp does."""
     fields = {
         "callerid": caller_id,
         "md5sum": md5sum,
@@ -208,11 +208,11 @@ def subscriber_header(
 
 
 def publisher_header(topic: str, caller_id: str, description: TopicDescription) -> Header:
-    """What a publisher answers.
+    """The reply header of a publisher.
 
     Raises:
-        ValueError: The description has ``*`` for its type or md5 sum. Such an answer ends up in bags, and a roscpp
-            subscriber hands it on to every other publisher.
+        ValueError: The description has ``*`` for its type or md5 sum. Such a reply ends up in bags, and a roscpp
+            subscriber sends it to every other publisher.
     """
     if ANY in (description.type, description.md5sum):
         raise ValueError(f"a publisher of {topic} cannot have the type {description}")
@@ -227,12 +227,12 @@ def publisher_header(topic: str, caller_id: str, description: TopicDescription) 
 
 
 def error_header(text: str) -> Header:
-    """What is answered to a header that does not fit; the connection is closed behind it."""
+    """The reply to a header that does not match; the connection is closed behind it."""
     return {"error": text}
 
 
 def check_request(fields: Mapping[str, str]) -> str | None:
-    """Whether a header that came in can be answered at all: an error text for the other side, or ``None``."""
+    """Check the required fields of a received header: an error text for the other side, or ``None``."""
     if "error" in fields:
         return f"an error was sent where a request was expected: {printable(fields['error'])}"
     if "topic" not in fields and "service" not in fields:
@@ -246,19 +246,19 @@ def check_request(fields: Mapping[str, str]) -> str | None:
 def check_subscriber(
     fields: Mapping[str, str], topic: str, caller_id: str, description: TopicDescription | None
 ) -> str | None:
-    """Whether a subscriber may have a publisher's messages.
+    """Check whether a subscriber matches a publisher.
 
-    The md5 sum alone decides: a subscriber that names another type with the right sum is served, as rospy and
+    The md5 sum alone decides: a subscriber that names another type with the right sum is accepted, as rospy and
     roscpp do, and ``*`` matches all.
 
     Args:
         fields: The subscriber's header.
-        topic: What is published, compared as it is.
+        topic: The published topic, compared literally.
         caller_id: The publisher's name, for the text.
-        description: What the publisher says, or ``None`` while that is not known: then only the rest is checked.
+        description: The publisher's, or ``None`` while it is not known: then the md5 sum is not checked.
 
     Returns:
-        ``None``, or the text of the error header.
+        ``None`` if it matches, else the text of the error header.
     """
     problem = check_request(fields)
     if problem is not None:
@@ -275,14 +275,14 @@ def check_subscriber(
 
 
 def check_publisher(fields: Mapping[str, str], type_name: str = ANY, md5sum: str = ANY) -> str | None:
-    """Whether a publisher's reply may be believed: an error text, or ``None``.
+    """Check a publisher's reply header: an error text, or ``None`` if it matches.
 
-    rospy and roscpp only look whether the fields are there and then deliver what comes; we compare.
+    rospy and roscpp only require the fields and deliver any message; here type and md5 sum are compared.
 
     Args:
         fields: The reply header.
-        type_name: The type that we asked for, or ``*``; it is compared where the md5 sum is not.
-        md5sum: The md5 sum that we asked for, or ``*``.
+        type_name: The requested type, or ``*``; it is compared where the md5 sum is not.
+        md5sum: The requested md5 sum, or ``*``.
     """
     if "error" in fields:
         return printable(fields["error"])

@@ -1,15 +1,16 @@
 """XML-RPC calls and responses as bytes (xmlrpc.com/spec, and what ROS makes of it).
 
-The standard library reads; ``defusedxml`` refuses entity declarations; this module bounds depth and size and insists
-on the types that ROS has. Long documents are read and written piece by piece.
+The standard library parses; ``defusedxml`` refuses entity declarations; this module bounds depth and size and allows
+only the types that ROS has. Long documents are read and written piece by piece.
 """
 
 from __future__ import annotations
 
 import contextlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime
-from typing import Final, NamedTuple, TypeAlias, Union, cast
+from typing import Final, Generic, NamedTuple, TypeAlias, TypeVar, Union, cast
 from xml.parsers.expat import ExpatError
 from xmlrpc.client import Fault, ResponseError, Unmarshaller
 
@@ -24,8 +25,9 @@ from rmpa.ros.wire.xmlrpc_writer import legal_text, pieces
 XmlRpcValue: TypeAlias = Union[  # noqa: UP007 - | does not take the forward references of a recursive type
     bool, int, float, str, bytes, datetime, Sequence["XmlRpcValue"], Mapping[str, "XmlRpcValue"], None
 ]
-"""What can be said in XML-RPC. Parsed values are made of lists and dicts; ``None`` is read, never written."""
+"""A value of XML-RPC. Parsed values are made of lists and dicts; ``None`` is read, never written."""
 
+_T = TypeVar("_T")
 _DECLARATION: Final = "<?xml version='1.0'?>\n"
 
 
@@ -33,8 +35,8 @@ class RosFault(RmpaError):  # noqa: N818 - XML-RPC calls it a fault
     """The other side answered a call with an XML-RPC fault.
 
     Args:
-        code: Its number; Python's servers, rosmaster among them, always say 1.
-        text: What it says.
+        code: The fault code; Python's servers, rosmaster among them, always have 1.
+        text: The fault string.
     """
 
     def __init__(self, code: int, text: str) -> None:
@@ -47,9 +49,9 @@ class RosFault(RmpaError):  # noqa: N818 - XML-RPC calls it a fault
 
 
 class RosReply(NamedTuple):
-    """What every method of the Master, Parameter and Slave APIs returns.
+    """The result of every method of the Master, Parameter Server and Slave APIs.
 
-    ``code`` is 1 for success, 0 for a failure, -1 for a mistake of the caller; ``status`` is text for people.
+    ``code`` is 1 for success, 0 for a failure, -1 for an error of the caller; ``status`` is text for people.
     """
 
     code: int
@@ -61,7 +63,7 @@ class RosReply(NamedTuple):
         """Read the triple out of a parsed response.
 
         Raises:
-            RemoteProtocolError: It is none.
+            RemoteProtocolError: The value is not such a triple.
         """
         match value:
             case [int(code), str(status), result]:
@@ -100,7 +102,7 @@ _DISPATCH: Final[dict[str, Callable[[Unmarshaller, str], None]]] = {
 
 
 class _BoundedUnmarshaller(Unmarshaller):
-    """The standard unmarshaller, with limits and without the types that ROS does not have."""
+    """The standard unmarshaller, with limits and only the types that ROS has."""
 
     def __init__(self) -> None:
         super().__init__(use_builtin_types=True)
@@ -122,8 +124,8 @@ class _BoundedUnmarshaller(Unmarshaller):
         super().end(tag)
 
 
-class _Reader:
-    """A document that is read piece by piece, for who has something else to do in between."""
+class DocumentReader(ABC, Generic[_T]):
+    """Reads one document piece by piece, so that something else can be done between two pieces."""
 
     def __init__(self) -> None:
         self._unmarshaller = _BoundedUnmarshaller()
@@ -134,8 +136,8 @@ class _Reader:
         self._waiting = bytearray()
         self._token = 0
 
-    def feed(self, data: bytes | memoryview) -> None:
-        """Take the next piece.
+    def feed(self, data: bytes | bytearray | memoryview) -> None:
+        """Parse the next piece.
 
         Raises:
             RemoteProtocolError: It is malformed, too deep or too large, declares entities, or holds an integer beyond
@@ -145,7 +147,7 @@ class _Reader:
         if self._size > limits.HTTP_BODY_MAX:
             raise LimitExceeded("XML-RPC body", self._size, limits.HTTP_BODY_MAX)
         self._waiting += data
-        # expat looks at an unfinished token (a comment of megabytes) from its begin, each time that it is given more.
+        # expat scans an unfinished token (a comment of megabytes) from its start again each time it is fed.
         if len(self._waiting) < self._token:
             return
         with self._errors():
@@ -153,16 +155,20 @@ class _Reader:
         self._token = self._size - self._expat.CurrentByteIndex
 
     def abandon(self) -> None:
-        """Read no more: breaks a reference cycle, which nobody else does while the collector is off."""
+        """Stop reading: breaks a reference cycle, which would wait for the garbage collector."""
         with contextlib.suppress(Exception):
             self._parser.close()
+
+    @abstractmethod
+    def close(self) -> _T:
+        """The content of the document, once all pieces were fed."""
 
     def _end(self) -> tuple[str | None, tuple[XmlRpcValue, ...]]:
         """The method's name, if it is a call, and the values.
 
         Raises:
             Fault: It is a fault.
-            RemoteProtocolError: As for ``feed``, or it is not whole.
+            RemoteProtocolError: As for ``feed``, or the document is incomplete.
         """
         with self._errors():
             self._give()
@@ -196,14 +202,14 @@ class _Reader:
             raise
 
 
-class CallReader(_Reader):
+class CallReader(DocumentReader["tuple[str, tuple[XmlRpcValue, ...]]"]):
     """Reads a ``methodCall`` document."""
 
     def close(self) -> tuple[str, tuple[XmlRpcValue, ...]]:
-        """The method's name and its parameters, once all pieces are there.
+        """The method's name and its parameters, once all pieces were fed.
 
         Raises:
-            RemoteProtocolError: As for ``feed``, it is not whole, or no call.
+            RemoteProtocolError: As for ``feed``, or the document is incomplete or no call.
         """
         try:
             method, params = self._end()
@@ -214,15 +220,15 @@ class CallReader(_Reader):
         return method, params
 
 
-class ResponseReader(_Reader):
+class ResponseReader(DocumentReader[XmlRpcValue]):
     """Reads a ``methodResponse`` document."""
 
     def close(self) -> XmlRpcValue:
-        """The value, once all pieces are there.
+        """The value, once all pieces were fed.
 
         Raises:
             RosFault: The response is a fault.
-            RemoteProtocolError: As for ``feed``, it is not whole, or there is not exactly one value.
+            RemoteProtocolError: As for ``feed``, or the document is incomplete or has not exactly one value.
         """
         try:
             method, params = self._end()
@@ -250,10 +256,10 @@ def parse_response(data: bytes) -> XmlRpcValue:
 
 
 def call_pieces(method: str, params: Sequence[XmlRpcValue]) -> Iterator[bytes]:
-    """Write a ``methodCall`` document in pieces of some KiB, for who has something else to do in between.
+    """Write a ``methodCall`` document in pieces of some KiB, so that something else can be done in between.
 
     Raises:
-        LocalProtocolError: A value cannot be said: ``None``, an integer beyond 32 bits, a control character.
+        LocalProtocolError: A value cannot be written: ``None``, an integer beyond 32 bits, a control character.
     """
     yield f"{_DECLARATION}<methodCall>\n<methodName>{method}</methodName>\n<params>\n".encode()
     for param in params:

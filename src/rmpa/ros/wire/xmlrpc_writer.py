@@ -1,7 +1,7 @@
-"""Values as XML-RPC text, piece by piece: who writes much of it can do something else between two pieces.
+"""Writes values as XML-RPC, piece by piece, so that something else can be done between two pieces.
 
-Exactly the text that Python's own ``xmlrpc.client`` writes, because XmlRpc++ (roscpp) is known to read that: it
-matches strings, and an empty tag written ``<string/>`` or an ``<i8>`` ends its parsing without an error.
+The text is exactly that of Python's ``xmlrpc.client``, because XmlRpc++ (roscpp) is known to read it: that parser
+compares strings, and stops without an error at ``<string/>`` or ``<i8>``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rmpa.ros import limits
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-# XML 1.0, section 2.2: what a document cannot hold, not even escaped.
+# XML 1.0, section 2.2: characters that a document cannot hold, not even escaped.
 _ILLEGAL: Final = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 _PIECE: Final = 128
 """Scalars in one piece: some 50 microseconds."""
@@ -36,19 +36,19 @@ def pieces(what: str, value: object) -> Iterator[bytes]:
     """``<value>…</value>`` in pieces of some KiB; the value must not change meanwhile.
 
     Args:
-        what: What the value is a part of, for errors: ``the response``.
+        what: The document, for errors: ``the response``.
         value: Of the types that ROS has; lists and tuples alike, dicts with strings as keys.
 
     Raises:
-        LocalProtocolError: A value cannot be said: ``None``, an integer beyond 32 bits, a control character.
+        LocalProtocolError: A value cannot be written: ``None``, an integer beyond 32 bits, a control character.
     """
     try:
         yield from _pieces(value)
-    except _UnsayableError as error:
+    except _NotXmlRpcError as error:
         raise LocalProtocolError(f"{what} {error}") from None
 
 
-class _UnsayableError(Exception):
+class _NotXmlRpcError(Exception):
     """Why a value cannot be written."""
 
 
@@ -65,7 +65,7 @@ def _pieces(value: object) -> Iterator[bytes]:
             write = _SCALARS.get(type(item))
             if write is None:
                 if len(above) > limits.XMLRPC_DEPTH_MAX:
-                    raise _UnsayableError(f"is nested deeper than {limits.XMLRPC_DEPTH_MAX} levels")
+                    raise _NotXmlRpcError(f"is nested deeper than {limits.XMLRPC_DEPTH_MAX} levels")
                 above.append((rest, members, end))
                 rest, begin, end = _open(item, end="</member>\n" if members else "")
                 members = type(item) is dict
@@ -94,23 +94,23 @@ def _flush(out: list[str]) -> bytes:
 
 
 def _open(item: object, end: str) -> tuple[Iterator[object], str, str]:
-    """The parts of a list or dict, and the text around them; ``end`` comes behind it."""
+    """The elements of a list or dict, and the text around them; ``end`` comes behind it."""
     if type(item) is dict:
         return iter(item.items()), "<value><struct>\n", f"</struct></value>\n{end}"
     if type(item) in {list, tuple}:
         return iter(cast("list[object]", item)), "<value><array><data>\n", f"</data></array></value>\n{end}"
-    raise _UnsayableError(f"cannot be said in XML-RPC: it holds a {type(item).__name__}")
+    raise _NotXmlRpcError(f"cannot be said in XML-RPC: it holds a {type(item).__name__}")
 
 
 def _escaped(text: str) -> str:
     if not text.isprintable() and (illegal := _ILLEGAL.search(text)) is not None:
-        raise _UnsayableError(f"holds the character {illegal[0]!a}, which XML cannot hold; remove it")
+        raise _NotXmlRpcError(f"holds the character {illegal[0]!a}, which XML cannot hold; remove it")
     return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
 
 
 def _name(key: object) -> str:
     if type(key) is not str:
-        raise _UnsayableError("cannot be said in XML-RPC: it has a dictionary key that is not a string")
+        raise _NotXmlRpcError("cannot be said in XML-RPC: it has a dictionary key that is not a string")
     return _escaped(key)
 
 
@@ -128,7 +128,7 @@ def _base64(value: bytes) -> Iterable[str]:
 
 def _int(value: int) -> Iterable[str]:
     if not INT32_MIN <= value <= INT32_MAX:
-        raise _UnsayableError(f"cannot be said in XML-RPC: {str(value)[:40]} does not fit 32 bits")
+        raise _NotXmlRpcError(f"cannot be said in XML-RPC: {str(value)[:40]} does not fit 32 bits")
     return (f"<value><int>{value}</int></value>\n",)
 
 
@@ -145,4 +145,4 @@ _SCALARS: Final[dict[type, Callable[..., Iterable[str]]]] = {
     bytearray: _base64,
     datetime: _datetime,
 }
-"""How each type is written that is no list or dict."""
+"""Writers of the types other than list and dict."""

@@ -118,7 +118,7 @@ async def test_a_connection_that_the_server_closed_meanwhile_is_replaced(desk: D
 async def test_a_server_that_dies_in_the_middle_of_a_call(desk: Desk) -> None:
     desk.call(b"1")
     await desk.until(calls=1)
-    for session in tuple(desk.endpoint._sessions):
+    for session in tuple(desk.endpoint._clients):
         session.close()
     await desk.until(answers=1, lost=1)
     ok, text = desk.answers[b"1"]

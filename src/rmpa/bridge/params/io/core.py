@@ -9,10 +9,10 @@ from rmpa.bridge import limits
 from rmpa.bridge.params.transfer import too_large
 from rmpa.bridge.policy import OWN_NODE
 from rmpa.core.errors import LocalProtocolError, PeerRefused, RemoteProtocolError
-from rmpa.ros import limits as ros_limits
+from rmpa.ros.http.documents import read_large, slices
 from rmpa.ros.master.parameters import holds_nil
 from rmpa.ros.wire.xmlrpc import ResponseReader, response_pieces
-from rmpa.runtime.event_loop import yield_to_data, yielding_to_data
+from rmpa.runtime.event_loop import yielding_to_data
 
 if TYPE_CHECKING:
     from rmpa.ros.core.api import Core
@@ -49,21 +49,10 @@ async def read_text(text: str) -> XmlRpcValue:
     Raises:
         RemoteProtocolError: It is none, or holds a nil, which ROS does not have.
     """
-    reader = ResponseReader()
     try:
-        for begin in range(0, len(text), ros_limits.XMLRPC_SLICE):
-            reader.feed(text[begin : begin + ros_limits.XMLRPC_SLICE].encode())
-            if begin >= ros_limits.HTTP_BODY_INLINE:
-                await asyncio.sleep(0)
-            else:
-                yield_to_data()
-    except asyncio.CancelledError:
-        reader.abandon()
-        raise
+        value = await read_large(ResponseReader(), (piece.encode() for piece in slices(text)))
     except UnicodeEncodeError as error:
-        reader.abandon()
         raise RemoteProtocolError(f"a parameter's text is not Unicode: {error.reason}") from None
-    value = reader.close()
     if holds_nil(value, yielding_to_data):
         raise RemoteProtocolError("the value is nil or contains one, which ROS does not have; leave it out")
     return value

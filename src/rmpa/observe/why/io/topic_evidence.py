@@ -58,7 +58,7 @@ class TopicEvidence:
 
     def awaited(self, topic: str) -> list[str]:
         """Nodes that published a topic before this agent was restarted, each with its address."""
-        return [f"{node} at {uri}" for node, uri in self._core.awaited(topic).items()]
+        return [f"{node} at {uri}" for node, uri in self._core.unverified(topic).items()]
 
     def there(self, peer: str, topic: str) -> tuple[str, str]:
         """The names of a topic of a peer here and at the peer.

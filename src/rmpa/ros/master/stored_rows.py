@@ -1,12 +1,12 @@
-"""What a core keeps over its end, as rows of a file, and the way back.
+"""A core's registrations and parameters as rows of its state file, and the way back.
 
 A row is ``(kind, name, value)``::
 
     ("node", "/talker", JSON of a NodeRecord)
     ("param", JSON list of the names on the way to it, MessagePack)
 
-A parameter's row is one value, or one empty namespace. Whatever is in a file is checked: what cannot be is left out
-and said, and the rest is taken.
+A parameter's row is one value, or one empty namespace. Rows that are read are checked: bad ones are reported and left
+out, the rest is used.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import msgspec
 
 from rmpa.core.sizes import INT32_MAX, INT32_MIN
 from rmpa.ros import limits
-from rmpa.ros.master.awaited import NodeRecord
 from rmpa.ros.master.effects import RegistrationKind
+from rmpa.ros.master.unverified import NodeRecord
 from rmpa.ros.wire.xmlrpc import brief
 from rmpa.ros.wire.xmlrpc_writer import legal_text
 
@@ -37,29 +37,29 @@ Key: TypeAlias = tuple[str, str]
 """Kind and name of a row."""
 Row: TypeAlias = tuple[str, str, bytes]
 Path: TypeAlias = tuple[str, ...]
-"""The names on the way to a parameter: a name may hold a slash where a struct was set."""
+"""The names of a parameter and its namespaces: a name may hold a slash where a struct was set."""
 
 _DATETIME: Final = 1
-"""Of MessagePack's extensions: XML-RPC's dates have no zone, and MessagePack's have."""
+"""A MessagePack extension: XML-RPC's dates have no time zone, and MessagePack's have one."""
 _RUN: Final = 256
-"""Elements of a list that are packed at once, some 10 microseconds."""
+"""Elements of a list packed at once, some 10 microseconds."""
 _GONE: Final = object()
 _pack = msgspec.msgpack.Encoder().encode
 _CONTAINERS: Final = (dict, list, tuple)
 
 
-class UnkeepableError(Exception):
-    """A value that has no row; the text says why. Never leaves the core."""
+class NotStorableError(Exception):
+    """A value that cannot be stored; the text says why. It does not leave this package."""
 
 
 @dataclass(slots=True)
 class StoredRegistrations:
-    """What the rows of a file say.
+    """The content of a state file.
 
     Args:
-        nodes: By name.
-        tree: Of the parameters.
-        lost: What could not be read, each ready for the log.
+        nodes: Records by the node's name.
+        tree: The parameters.
+        lost: Rows that could not be read, as texts for the log.
     """
 
     nodes: dict[str, NodeRecord] = field(default_factory=dict)
@@ -78,7 +78,7 @@ def param_key(path: Path) -> Key:
 def changed_params(before: Tree, after: Tree) -> Iterator[tuple[Path, XmlRpcValue | None]]:
     """The parameters that differ between two trees, with their values now; ``None`` for those that are gone.
 
-    Trees are never changed in place, so what two of them share is passed over at once.
+    Trees are never changed in place, so parts that both share are skipped.
     """
     waiting: list[tuple[Path, Mapping[str, Any], Mapping[str, Any]]] = [((), before, after)]
     while waiting:
@@ -117,16 +117,16 @@ def _leaves(path: Path, tree: Mapping[str, Any]) -> Iterator[Path]:
                 yield (*above, name)
 
 
-def packed(value: XmlRpcValue, breathing: Yielder = iter) -> bytes:
+def packed(value: XmlRpcValue, yielder: Yielder = iter) -> bytes:
     """A parameter's value as MessagePack.
 
     Raises:
-        UnkeepableError: It cannot be said so.
+        NotStorableError: MessagePack cannot express it.
     """
     try:
-        return b"".join(breathing(_pieces(value)))
+        return b"".join(yielder(_pieces(value)))
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise UnkeepableError(f"{type(error).__name__}: {error}") from None
+        raise NotStorableError(f"{type(error).__name__}: {error}") from None
 
 
 def _pieces(value: Any) -> Iterator[bytes]:
@@ -152,7 +152,7 @@ def _pieces(value: Any) -> Iterator[bytes]:
 
 
 def _head(short: int, long: int, count: int) -> bytes:
-    """What stands in front of an array's or a map's elements (msgpack's spec)."""
+    """The head of an array or map (MessagePack specification)."""
     if count < 16:
         return bytes([short | count])
     if count < 1 << 16:
@@ -173,7 +173,7 @@ _unpack = msgspec.msgpack.Decoder(ext_hook=_unpacked_ext).decode
 
 
 def read(rows: Iterable[Row]) -> StoredRegistrations:
-    """What was kept. Rows that are damaged, or say what no node could have said, are named in ``lost``."""
+    """Read rows. Those that are damaged, or that no node could have caused, are named in ``lost``."""
     kept = StoredRegistrations()
     for kind, name, value in rows:
         try:
@@ -204,7 +204,7 @@ def _node(name: str, row: bytes) -> NodeRecord:
 
 
 def _check_text(text: str) -> None:
-    """Raise where XML cannot hold it: no answer with it in it could be written."""
+    """Raise ``ValueError`` where XML cannot hold the text: no response with it could be written."""
     if legal_text(text) != text:
         raise ValueError(f"{brief(text)} has a character that XML cannot hold")
 
@@ -239,7 +239,7 @@ def _value(value: bytes) -> Any:
 
 
 def _put(tree: Tree, path: Path, value: Any) -> None:
-    """Put a value into a tree that nobody has seen yet."""
+    """Put a value into a tree that is being built."""
     at: Any = tree
     for name in path[:-1]:
         at = at.setdefault(name, {})

@@ -116,12 +116,12 @@ def rows(path: Path) -> list[tuple[str, str]]:
 
 
 async def all_asked(core: RosCore) -> None:
-    assert core.memory is not None
-    memory = core.memory
-    await until(lambda: memory.take_up.all_asked)
+    assert core.persistence is not None
+    memory = core.persistence
+    await until(lambda: memory.verification.all_asked)
 
 
-async def test_nodes_that_go_on_are_back_and_told_of_each_other(path: Path) -> None:
+async def test_running_nodes_are_restored_and_notified(path: Path) -> None:
     async with Slave("/talker") as talker, Slave("/hearer") as hearer:
         async with running(path) as core:
             await talker.publish(core, "/chatter")
@@ -140,8 +140,8 @@ async def test_nodes_that_go_on_are_back_and_told_of_each_other(path: Path) -> N
             assert core.call("getParam", "/x", "/run_id").value == run_id
             await until(lambda: hearer.updates)
             assert hearer.updates[-1] == ("/chatter", [talker.uri])
-            assert "2 of 2 nodes of the run before are taken up" in core.remembered()
-            assert str(path) in core.remembered()
+            assert "2 of 2 nodes of the run before are taken up" in core.restored()
+            assert str(path) in core.restored()
 
 
 async def test_who_is_gone_or_has_another_name_is_not_shown(path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -154,18 +154,18 @@ async def test_who_is_gone_or_has_another_name_is_not_shown(path: Path, caplog: 
         async with running(path) as core:
             await all_asked(core)
             assert core.state().publishers == {}
-            assert core.remembered().endswith("0 of 2 nodes of the run before are taken up, 2 are gone")
+            assert core.restored().endswith("0 of 2 nodes of the run before are taken up, 2 are gone")
             assert "node /moved" in caplog.text
             assert "another node is there" in caplog.text
             await until(lambda: core.counters["kept.written"])
         assert not [name for kind, name in rows(path) if kind == "node"]
 
 
-async def test_a_node_that_hangs_delays_nobody_and_is_taken_up_when_it_answers(
+async def test_hanging_node_delays_no_other_and_is_restored_later(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(limits, "TAKE_UP_AT_ONCE", 1)
-    monkeypatch.setattr(limits, "TAKE_UP_PROMPT", 0.01)
+    monkeypatch.setattr(limits, "VERIFY_AT_ONCE", 1)
+    monkeypatch.setattr(limits, "VERIFY_PROMPT", 0.01)
     monkeypatch.setattr(limits, "SLAVE_CALL_TIMEOUT", 0.3)
     async with Slave("/hangs") as hangs, Slave("/answers") as answers, Slave("/hearer") as hearer:
         async with running(path) as core:
@@ -176,7 +176,7 @@ async def test_a_node_that_hangs_delays_nobody_and_is_taken_up_when_it_answers(
         hearer.updates.clear()
         async with running(path) as core:
             await until(lambda: names(core) == {"/answers", "/hearer"})
-            assert dict(core.awaited("/a")) == {"/hangs": hangs.uri}
+            assert dict(core.unverified("/a")) == {"/hangs": hangs.uri}
             await until(lambda: hearer.updates)
             # It may be connected to the one that hangs: roscpp would hang up on who is not named.
             assert set(hearer.updates[-1][1]) == {answers.uri, hangs.uri}
@@ -188,26 +188,24 @@ async def test_a_node_that_hangs_delays_nobody_and_is_taken_up_when_it_answers(
 
 
 async def test_a_node_that_never_answers_is_given_up(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "TAKE_UP_PATIENCE", 0.1)
+    monkeypatch.setattr(limits, "VERIFY_PATIENCE", 0.1)
     monkeypatch.setattr(limits, "SLAVE_CALL_TIMEOUT", 0.1)
     async with Slave("/hangs") as hangs:
         async with running(path) as core:
             await hangs.publish(core, "/a")
         hangs.go.clear()
         async with running(path) as core:
-            await until(lambda: "did not answer for" in core.remembered())
+            await until(lambda: "did not answer for" in core.restored())
             assert core.notes() == ()
             await until(lambda: ("node", "/hangs") not in core_rows(core))
 
 
 def core_rows(core: RosCore) -> set[tuple[str, str]]:
-    assert core.memory is not None
-    return set(core.memory._keeper._known)
+    assert core.persistence is not None
+    return set(core.persistence._writer._known)
 
 
-async def test_a_node_that_hangs_is_still_kept_when_the_core_ends_again(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_hanging_node_stays_stored_over_a_second_restart(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "SLAVE_CALL_TIMEOUT", 0.1)
     async with Slave("/hangs") as hangs:
         async with running(path) as core:
@@ -220,7 +218,7 @@ async def test_a_node_that_hangs_is_still_kept_when_the_core_ends_again(
             await until(lambda: core.state().publishers == {"/a": {"/hangs": hangs.uri}})
 
 
-async def test_what_a_node_did_without_a_core_is_learnt_from_it(path: Path) -> None:
+async def test_changes_without_a_core_come_from_the_nodes_lists(path: Path) -> None:
     async with Slave("/node") as node:
         async with running(path) as core:
             await node.publish(core, "/old")
@@ -244,7 +242,7 @@ async def test_a_node_without_a_name_is_known_by_what_it_has(path: Path) -> None
             assert names(core) == {"/nameless"}
 
 
-async def test_who_registers_anew_wins_over_what_was_kept(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_new_registration_wins_over_the_stored_one(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "SLAVE_CALL_TIMEOUT", 0.5)
     async with Slave("/talker") as old, Slave("/talker") as new:
         async with running(path) as core:
@@ -258,7 +256,7 @@ async def test_who_registers_anew_wins_over_what_was_kept(path: Path, monkeypatc
             assert core.state().publishers == {"/b": {"/talker": new.uri}}
 
 
-async def test_our_own_nodes_are_not_kept(path: Path) -> None:
+async def test_our_own_nodes_are_not_stored(path: Path) -> None:
     async with Slave("/rmpa/proxy") as proxy, Slave("/user") as user:
         core = RosCore(port=0, state=path, temporary=lambda name: name.startswith("/rmpa"))
         await core.start()
@@ -286,7 +284,7 @@ async def test_parameters_survive_with_their_types_and_fresh_forgets_all(path: P
             assert core.call("getParam", "/x", "/run_id").value != run_id
             await asyncio.sleep(0)
             assert names(core) == set()
-            assert "begun empty" in core.remembered()
+            assert "begun empty" in core.restored()
             await call(core.uri, "setParam", "/x", "/after", 1)
         async with running(path) as core:
             assert (await call_api(core.uri, "hasParam", "/x", "/robot")).value is False
@@ -334,7 +332,7 @@ async def test_churn_is_gathered(path: Path) -> None:
         assert core.counters["kept.written"] <= 2 + took / limits.CORE_STATE_GATHER
 
 
-async def test_what_does_not_fit_is_said_and_the_rest_is_kept(
+async def test_what_does_not_fit_is_reported_and_the_rest_stored(
     path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(limits, "CORE_STATE_BYTES", 20_000)
@@ -404,7 +402,7 @@ async def test_the_file_is_for_its_user_alone(path: Path) -> None:
         assert path.parent.stat().st_mode & 0o777 == 0o700
 
 
-async def test_a_place_that_cannot_be_used_is_said_and_used_when_it_can(
+async def test_unusable_place_is_reported_and_used_when_usable(
     path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(limits, "CORE_STATE_RETRY", 0.05)
@@ -414,7 +412,7 @@ async def test_a_place_that_cannot_be_used_is_said_and_used_when_it_can(
         (note,) = core.notes()
         assert "nothing of the core is kept over a restart" in note
         assert "set RMPA_STATE_DIR" in note
-        assert "nothing is kept" in core.remembered()
+        assert "nothing is kept" in core.restored()
         await until(lambda: core.counters["kept.failed"] > 1)
         assert caplog.text.count("nothing of the core is kept") == 1
         path.parent.unlink()
@@ -423,9 +421,7 @@ async def test_a_place_that_cannot_be_used_is_said_and_used_when_it_can(
         assert core.call("getParam", "/x", "/a").value == 1
 
 
-async def test_a_full_disk_is_said_and_nothing_is_lost_when_there_is_room_again(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_full_disk_is_reported_and_nothing_is_lost(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "CORE_STATE_RETRY", 0.05)
     async with running(path) as core:
         core.call("setParam", "/x", "/before", 1)
@@ -446,7 +442,7 @@ async def test_a_full_disk_is_said_and_nothing_is_lost_when_there_is_room_again(
         assert [core.call("getParam", "/x", key).value for key in ("/before", "/meanwhile")] == [1, 2]
 
 
-async def test_a_file_that_is_taken_away_is_written_anew(path: Path) -> None:
+async def test_removed_file_is_written_again(path: Path) -> None:
     async with running(path) as core:
         core.call("setParam", "/x", "/before", 1)
         await until(lambda: core.counters["kept.written"])
@@ -526,7 +522,7 @@ async def test_a_node_that_answers_with_an_error_keeps_what_it_had(path: Path) -
             assert core.state().publishers == {"/t": {"/odd": odd.uri}}
 
 
-async def test_a_disk_that_hangs_later_is_said(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_hanging_disk_is_reported(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import threading
 
     monkeypatch.setattr(limits, "CORE_STATE_WRITE", 0.05)

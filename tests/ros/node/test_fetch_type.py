@@ -9,7 +9,7 @@ from rmpa.core.errors import PeerRefused, UnreachableError
 from rmpa.ros import limits
 from rmpa.ros.core.embedded import RosCore
 from rmpa.ros.environment import RosEnvironment
-from rmpa.ros.node.learn_type import find_or_learn, learn_type
+from rmpa.ros.node.fetch_type import fetch_type, find_or_fetch
 from rmpa.ros.node.node import Node
 from rmpa.ros.types import installed
 from rmpa.ros.types.definitions import DefinitionError, UnknownTypeError
@@ -55,11 +55,11 @@ def node(core: RosCore, name: str) -> Node:
 
 
 async def learnt(core: RosCore, topic: str = "", *, elsewhere: bool = True) -> tuple[str, str, str] | None:
-    found = await learn_type(core.uri, "/asker", NAME, topic=topic, elsewhere=elsewhere)
+    found = await fetch_type(core.uri, "/asker", NAME, topic=topic, elsewhere=elsewhere)
     return (found.node, found.topic, found.kind.md5sum) if found is not None else None
 
 
-async def test_a_publisher_tells_a_type(core: RosCore) -> None:
+async def test_type_is_fetched_from_a_publisher(core: RosCore) -> None:
     async with node(core, "old") as old, node(core, "new") as new, node(core, "/rmpa/base/new") as proxy:
         assert await learnt(core) is None
         await old.advertise("/c", OLD)
@@ -76,7 +76,7 @@ async def test_a_publisher_tells_a_type(core: RosCore) -> None:
 
 
 async def test_publishers_that_cannot_tell_are_passed_over(core: RosCore, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "ASKED_FOR_TYPE_TIMEOUT", 0.5)
+    monkeypatch.setattr(limits, "FETCH_TYPE_TIMEOUT", 0.5)
     silent = socket.create_server(("127.0.0.1", 0))  # listens, and never answers
     port = silent.getsockname()[1]
     core.call("registerPublisher", "/a_gone", "/a", NAME, "http://127.0.0.1:9/")
@@ -88,26 +88,26 @@ async def test_publishers_that_cannot_tell_are_passed_over(core: RosCore, monkey
         assert await learnt(core) is None
         await two.advertise("/f", FOO)
         assert await learnt(core) == ("/two", "/f", FOO.md5sum)
-        monkeypatch.setattr(limits, "ASKED_FOR_TYPE_MAX", 3)
+        monkeypatch.setattr(limits, "FETCH_TYPE_PUBLISHERS", 3)
         assert await learnt(core) is None
     silent.close()
 
 
-async def test_without_a_publisher_the_error_says_all(core: RosCore) -> None:
+async def test_without_a_publisher_the_error_has_all_reasons(core: RosCore) -> None:
     with pytest.raises(UnknownTypeError) as caught:
-        await find_or_learn(core.uri, "/asker", NAME)
+        await find_or_fetch(core.uri, "/asker", NAME)
     assert str(caught.value) == (
         "message type my_msgs/Foo: is not known here; looked in ROS_PACKAGE_PATH (not set), CMAKE_PREFIX_PATH "
         f"(not set), PYTHONPATH (not set), and at what comes with rmpa; no publisher at {core.uri} tells it; source "
         "the workspace that has it, or let a node that publishes it run, here or at a peer"
     )
     with pytest.raises(UnknownTypeError, match="did you mean std_msgs/String"):
-        await find_or_learn("http://127.0.0.1:9/", "/asker", "std_msgs/Strin")
+        await find_or_fetch("http://127.0.0.1:9/", "/asker", "std_msgs/Strin")
     with pytest.raises(UnreachableError):
-        await find_or_learn("http://127.0.0.1:9/", "/asker", NAME)
+        await find_or_fetch("http://127.0.0.1:9/", "/asker", NAME)
 
 
-async def test_a_node_advertises_a_type_that_it_has_learnt(core: RosCore) -> None:
+async def test_node_advertises_a_received_type(core: RosCore) -> None:
     async with node(core, "a") as a, node(core, "b") as b:
         with pytest.raises(UnknownTypeError, match="no publisher at"):
             await b.advertise("/y", NAME)

@@ -1,4 +1,4 @@
-"""Keeps a core's registrations and parameters in its file: what has changed, a moment after it has."""
+"""Writes changes of a core's registrations and parameters to its state file, a moment after they happen."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 from rmpa.core import limits as core_limits
 from rmpa.ros import limits
 from rmpa.ros.core.store import is_locked
-from rmpa.ros.master import kept
+from rmpa.ros.master import stored_rows
 from rmpa.ros.wire.xmlrpc import brief
 from rmpa.runtime.event_loop import yielding_to_data
 
@@ -21,25 +21,25 @@ if TYPE_CHECKING:
     from rmpa.core.counters import Counters
     from rmpa.ros.core.store import CoreStore
     from rmpa.ros.master.api import MasterApi
-    from rmpa.ros.master.kept import Key, Row, StoredRegistrations
     from rmpa.ros.master.parameters import Tree
+    from rmpa.ros.master.stored_rows import Key, Row, StoredRegistrations
 
 _log = logging.getLogger(__name__)
 _NONE: Final = (0, 0)
 _ROW: Final = 64
 _OPENS: Final = 3
-"""Times that a locked file is tried at the start, ``limits.CORE_STATE_LOCKED`` each."""
+"""Attempts to open a locked file at the start, ``limits.CORE_STATE_LOCKED`` each."""
 _RECORDS: Final = 8
-"""Nodes that are looked at between two breaths: to write one down takes some 25 microseconds."""
+"""Nodes serialized before pending data goes first; each takes some 25 microseconds."""
 
 
-class Keeper:
-    """Looks what has changed, and writes that; where nothing has, it writes nothing.
+class StateWriter:
+    """Finds the rows that have changed, and writes them.
 
     Args:
         store: The file.
-        api: The core's.
-        temporary: Whether a node of this name is not to be kept: the agent's own are made anew.
+        api: The core's master.
+        temporary: Whether a node of this name is not stored: the agent registers its own anew.
         counters: ``kept.written``, ``kept.failed``, ``kept.unfit``.
     """
 
@@ -51,16 +51,16 @@ class Keeper:
         self._temporary = temporary
         self._counters = counters
         self.problem = ""
-        """Why nothing is kept at present, or empty."""
-        self._marks: dict[str, int] = {}
+        """Why nothing is stored at present, or empty."""
+        self._revisions: dict[str, int] = {}
         self._tree: Tree = {}
         self._known: dict[Key, tuple[int, int]] = {}
         """Size and hash of each row that is in the file."""
         self._size = 0
         self._unfit: dict[Key, str] = {}
-        self._anew = False
+        self._rewrite = False
         self._unread = False
-        """Whether the file may hold what was not read at the start: it is copied before it is written."""
+        """Whether the file could not be read at the start: it is copied before it is written."""
         self._timer: asyncio.TimerHandle | None = None
         self._writing: asyncio.Task[None] | None = None
         self._again = False
@@ -68,28 +68,28 @@ class Keeper:
 
     @property
     def path(self) -> Path:
-        """Of the file."""
+        """The file."""
         return self._store.path
 
     # --- the start --------------------------------------------------------------------------------------------
 
     async def open(self, *, fresh: bool) -> StoredRegistrations:
-        """Open the file and read what was kept; nothing if it cannot be read, which ``problem`` says.
+        """Open the file and read it; nothing if it cannot be read (``problem`` says why).
 
         Args:
-            fresh: Take nothing from it, and begin it anew.
+            fresh: Restore nothing, and empty the file with the first write.
         """
         try:
             rows = await self._opened()
         except OSError as error:
-            self._anew = self._unread = True
-            self._say(str(error))
+            self._rewrite = self._unread = True
+            self._set_problem(str(error))
             self._after(limits.CORE_STATE_RETRY)
-            return kept.StoredRegistrations()
+            return stored_rows.StoredRegistrations()
         if fresh:
-            self._anew = bool(rows)
-            return kept.StoredRegistrations()
-        found = kept.read(rows)
+            self._rewrite = bool(rows)
+            return stored_rows.StoredRegistrations()
+        found = stored_rows.read(rows)
         for lost in found.lost[: core_limits.LOG_LINES_MAX]:
             _log.warning("! %s: left out: %s", self.path, lost)
         self._known = {(kind, name): _known(name, value) for kind, name, value in rows}
@@ -97,7 +97,7 @@ class Keeper:
         return found
 
     async def _opened(self) -> list[Row]:
-        """The rows; a process that is just ending may hold the file's lock for a moment more."""
+        """The rows; the previous process may still hold the file's lock."""
         for _ in range(_OPENS - 1):
             try:
                 return await self._store.open()
@@ -106,13 +106,13 @@ class Keeper:
                     raise
         return await self._store.open()
 
-    def taken(self, tree: Tree) -> None:
-        """Everything that was read is in the master now; ``tree`` are the parameters that were in the file."""
-        self._marks = dict(self._api.registrations.marks)
+    def restored_all(self, tree: Tree) -> None:
+        """The master has all that was read; ``tree`` are the parameters in the file."""
+        self._revisions = dict(self._api.registrations.revisions)
         self._tree = tree
 
-    def look_soon(self) -> None:
-        """Something may have changed."""
+    def schedule_write(self) -> None:
+        """Write soon, if something has changed."""
         if self._closed:
             return
         if self._writing is not None:
@@ -121,7 +121,7 @@ class Keeper:
             self._after(limits.CORE_STATE_GATHER)
 
     async def close(self) -> None:
-        """Write what has changed, and let go of the file."""
+        """Write what has changed, and close the file."""
         self._closed = True
         if self._timer is not None:
             self._timer.cancel()
@@ -136,7 +136,7 @@ class Keeper:
         await self._store.close()
 
     def notes(self) -> tuple[str, ...]:
-        """What the user should know."""
+        """Problems that the user should know of."""
         notes = []
         if self.problem:
             notes.append(f"nothing of the core is kept over a restart: {self.problem}")
@@ -169,68 +169,70 @@ class Keeper:
                 self._after(limits.CORE_STATE_GATHER if good else limits.CORE_STATE_RETRY)
 
     async def _write(self) -> bool:
-        """Write what has changed; whether that went well."""
+        """Write what has changed; return whether that succeeded."""
         registrations, tree = self._api.registrations, self._api.parameters.tree
-        marks = dict(registrations.marks)
-        if marks == self._marks and tree is self._tree and not self._anew and not self.problem:
+        revisions = dict(registrations.revisions)
+        if revisions == self._revisions and tree is self._tree and not self._rewrite and not self.problem:
             return True
         try:
             if self._unread:
                 if (aside := await self._store.copy_aside()) is not None:
                     _log.warning("! %s was not read at the start; what it holds is kept as %s", self.path, aside)
                 self._unread = False
-            if await self._store.taken_away() and not self._anew:
+            if await self._store.taken_away() and not self._rewrite:
                 self._forget()
-            rows = dict(self._changed_nodes(marks))
+            rows = dict(self._changed_nodes(revisions))
             rows |= self._changed_params(tree)
             known = self._fitting(rows)
-            if rows or self._anew:
-                await self._store.write(rows, anew=self._anew)
+            if rows or self._rewrite:
+                await self._store.write(rows, anew=self._rewrite)
                 self._counters.add("kept.written")
         except OSError as error:
             self._counters.add("kept.failed")
-            self._say(str(error))
+            self._set_problem(str(error))
             return False
-        self._anew = False
-        self._marks, self._tree = marks, tree
+        self._rewrite = False
+        self._revisions, self._tree = revisions, tree
         for key, (size, digest) in known.items():
             self._size += size - self._known.pop(key, _NONE)[0]
             if size:
                 self._known[key] = size, digest
-        self._say("")
+        self._set_problem("")
         return True
 
     def _forget(self) -> None:
-        """The file is another one than it was: everything is to be written."""
-        self._marks, self._tree, self._known, self._size = {}, {}, {}, 0
-        self._anew = True
+        """The file was replaced: everything has to be written."""
+        self._revisions, self._tree, self._known, self._size = {}, {}, {}, 0
+        self._rewrite = True
 
-    def _changed_nodes(self, marks: dict[str, int]) -> dict[Key, bytes | None]:
+    def _changed_nodes(self, revisions: dict[str, int]) -> dict[Key, bytes | None]:
         rows: dict[Key, bytes | None] = {
-            (kept.NODE, name): None for name in yielding_to_data(list(self._marks)) if name not in marks
+            (stored_rows.NODE, name): None
+            for name in yielding_to_data(list(self._revisions))
+            if name not in revisions
         }
-        for name, mark in yielding_to_data(marks.items(), every=_RECORDS):
-            if self._marks.get(name) != mark and not self._temporary(name):
+        for name, revision in yielding_to_data(revisions.items(), every=_RECORDS):
+            if self._revisions.get(name) != revision and not self._temporary(name):
                 record = self._api.registrations.record(name)
-                rows[kept.NODE, name] = record.serialize() if record is not None else None
+                rows[stored_rows.NODE, name] = record.serialize() if record is not None else None
         return rows
 
     def _changed_params(self, tree: Tree) -> dict[Key, bytes | None]:
         rows: dict[Key, bytes | None] = {}
-        for path, value in yielding_to_data(kept.changed_params(self._tree, tree)):
-            key = kept.param_key(path)
+        for path, value in yielding_to_data(stored_rows.changed_params(self._tree, tree)):
+            key = stored_rows.param_key(path)
             rows[key] = None
             if value is not None:
                 try:
-                    rows[key] = kept.packed(value, yielding_to_data)
-                except kept.UnkeepableError as error:
+                    rows[key] = stored_rows.packed(value, yielding_to_data)
+                except stored_rows.NotStorableError as error:
                     self._refuse(key, "/" + "/".join(path), str(error))
                     continue
             self._unfit.pop(key, None)
         return rows
 
     def _fitting(self, rows: dict[Key, bytes | None]) -> dict[Key, tuple[int, int]]:
-        """Leave out what is in the file already and what does not fit; size and hash of each row that is left."""
+        """Remove rows that are in the file already or do not fit; return size and hash of each other row."""
         known: dict[Key, tuple[int, int]] = {}
         size = self._size
         for key, value in sorted(rows.items(), key=lambda row: row[1] is not None):
@@ -253,8 +255,8 @@ class Keeper:
             _log.warning("! %s is not kept over a restart of the core: %s", name, why)
         self._unfit[key] = f"{key[0]} {name} ({why})"
 
-    def _say(self, problem: str) -> None:
-        """Log it when it begins and when it is over."""
+    def _set_problem(self, problem: str) -> None:
+        """Note a problem; log when it begins and when it is over."""
         if problem and not self.problem:
             _log.warning("! nothing of the core is kept over a restart: %s", problem)
         elif self.problem and not problem:
@@ -263,5 +265,5 @@ class Keeper:
 
 
 def _known(name: str, value: bytes) -> tuple[int, int]:
-    """Size and hash of a row. Its name stands in an index too, and each takes a few bytes more."""
+    """Size and hash of a row. The name counts twice because it is in the index too."""
     return 2 * len(name) + len(value) + _ROW, hash(value)

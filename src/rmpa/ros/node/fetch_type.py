@@ -1,7 +1,8 @@
-"""Learns the definition of a message type from a node that publishes it: each publisher sends it in its header.
+"""Fetches the definition of a message type from a node that publishes it: each publisher sends it in its header.
 
-The connection ends with the header, and is not registered at the master. A publisher that works only while there is a
-subscriber (a lazy one) sees one for a moment. To a peer's publisher it goes by its proxy, which opens the route.
+The connection ends with the header and is not registered at the master. A lazy publisher, which works only while it
+has a subscriber, sees one for a moment. A connection to a peer's publisher goes through its proxy, which opens the
+route.
 """
 
 from __future__ import annotations
@@ -27,17 +28,17 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _PROXIES: Final = "/rmpa/"
-"""Begins the names of nodes that stand for a peer's: asked last, for that opens a route."""
+"""Prefix of the names of proxies for a peer's nodes. They are asked last, because that opens a route."""
 
 
 @dataclass(frozen=True, slots=True)
-class Learnt:
-    """A type that a publisher has told.
+class FetchedType:
+    """A type from a publisher's header.
 
     Args:
         kind: The type.
-        topic: What it publishes.
-        node: Its name.
+        topic: The publisher's topic.
+        node: The publisher's name.
     """
 
     kind: MessageType
@@ -45,10 +46,10 @@ class Learnt:
     node: str
 
 
-async def learn_type(
+async def fetch_type(
     master_uri: str, caller_id: str, name: str, *, topic: str = "", elsewhere: bool = True
-) -> Learnt | None:
-    """Ask the publishers of a type for its definition, one behind the other, at most ``limits.ASKED_FOR_TYPE_MAX``.
+) -> FetchedType | None:
+    """Ask up to ``limits.FETCH_TYPE_PUBLISHERS`` publishers of a type for its definition, one after the other.
 
     Args:
         master_uri: The master that knows them.
@@ -58,7 +59,7 @@ async def learn_type(
         elsewhere: Whether publishers of other topics are asked, too.
 
     Returns:
-        ``None`` where no publisher of that type could tell.
+        ``None`` where no publisher of that type sent a definition.
 
     Raises:
         UnreachableError: The master does not answer.
@@ -67,7 +68,7 @@ async def learn_type(
     if not elsewhere:
         candidates = [each for each in candidates if each[0] == topic]
     candidates.sort(key=lambda each: (each[0] != topic, each[1].startswith(_PROXIES), each))
-    for where, node in candidates[: limits.ASKED_FOR_TYPE_MAX]:
+    for where, node in candidates[: limits.FETCH_TYPE_PUBLISHERS]:
         if node == caller_id:
             continue
         try:
@@ -78,12 +79,12 @@ async def learn_type(
             _log.debug("! %s from %s: %s", name, node, error)
             continue
         if kind is not None:
-            return Learnt(kind, where, node)
+            return FetchedType(kind, where, node)
     return None
 
 
-async def find_or_learn(master_uri: str, caller_id: str, name: str, topic: str = "") -> MessageType:
-    """Find a message type on this machine (``ros.types.find``), else learn it from a publisher.
+async def find_or_fetch(master_uri: str, caller_id: str, name: str, topic: str = "") -> MessageType:
+    """Find a message type on this machine (``ros.types.find``), else fetch it from a publisher.
 
     Args:
         master_uri: The master whose publishers are asked.
@@ -92,17 +93,17 @@ async def find_or_learn(master_uri: str, caller_id: str, name: str, topic: str =
         topic: Its publishers are asked first.
 
     Raises:
-        UnknownTypeError: Neither this machine nor a publisher knows it.
-        DefinitionError: What is here is malformed.
+        UnknownTypeError: Neither this machine nor a publisher has it.
+        DefinitionError: The definition on this machine is malformed.
         UnreachableError: The master does not answer.
     """
     try:
         return await asyncio.to_thread(find_message_type, name)
     except UnknownTypeError as error:
-        if not error.learnable:
+        if not error.fetchable:
             raise
         unknown = error
-    learnt = await learn_type(master_uri, caller_id, name, topic=topic)
+    learnt = await fetch_type(master_uri, caller_id, name, topic=topic)
     if learnt is None:
         unknown.problem += f"; no publisher at {master_uri} tells it"
         raise unknown
@@ -111,7 +112,7 @@ async def find_or_learn(master_uri: str, caller_id: str, name: str, topic: str =
 
 
 async def _publishers(master_uri: str, caller_id: str, name: str) -> list[tuple[str, str]]:
-    """(topic, node) pairs of all that publish a type."""
+    """(topic, node) pairs of all publishers of a type."""
     state = (await call_api(master_uri, "getSystemState", caller_id)).value
     types = (await call_api(master_uri, "getTopicTypes", caller_id)).value
     topics = {str(pair[0]) for pair in _pairs(types) if pair[1] == name}
@@ -134,7 +135,7 @@ async def _header(uri: str, topic: str, caller_id: str) -> Header:
     Args:
         uri: Its slave API.
         topic: The topic.
-        caller_id: Not that of a node that listens to it: a rospy publisher has one connection for each caller.
+        caller_id: Not that of a subscriber of the topic: a rospy publisher keeps one connection for each caller id.
     """
     told: asyncio.Future[Header] = asyncio.get_running_loop().create_future()
 
@@ -146,7 +147,7 @@ async def _header(uri: str, topic: str, caller_id: str) -> Header:
         _log.debug("! %s from %s: %s", topic, uri, printable(why))
         tell({})
 
-    link = PublisherConnection(
+    connection = PublisherConnection(
         topic,
         uri,
         caller_id,
@@ -155,12 +156,12 @@ async def _header(uri: str, topic: str, caller_id: str) -> Header:
         on_refused=fail,
         on_lost=fail,
     )
-    link.start()
+    connection.start()
     try:
-        async with asyncio.timeout(limits.ASKED_FOR_TYPE_TIMEOUT):
+        async with asyncio.timeout(limits.FETCH_TYPE_TIMEOUT):
             return await told
     except TimeoutError:
         return {}
     finally:
-        link.close()
-        await link.closed()
+        connection.close()
+        await connection.closed()

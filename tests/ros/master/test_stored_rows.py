@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rmpa.ros import limits
-from rmpa.ros.master.awaited import NodeRecord
-from rmpa.ros.master.kept import NODE, PARAM, UnkeepableError, changed_params, packed, param_key, read
 from rmpa.ros.master.parameters import Parameters
+from rmpa.ros.master.stored_rows import NODE, PARAM, NotStorableError, changed_params, packed, param_key, read
+from rmpa.ros.master.unverified import NodeRecord
 from rmpa.ros.wire.xmlrpc_writer import legal_text
 
 if TYPE_CHECKING:
-    from rmpa.ros.master.kept import Key
+    from rmpa.ros.master.stored_rows import Key
 
 TALKER = NodeRecord(
     "http://127.0.0.1:4001/",
@@ -83,7 +83,7 @@ def test_whatever_the_parameters_were_and_become_the_rows_say_the_same(history: 
     assert found.tree == history[-1]
 
 
-def test_only_what_changed_is_told() -> None:
+def test_only_changes_are_reported() -> None:
     parameters = Parameters()
     parameters.set("/", {"a": {"x": 1, "y": [1]}, "b": {"z": "old"}, "empty": {}})
     before = parameters.tree
@@ -111,10 +111,10 @@ def test_long_lists_and_names_with_slashes_come_back() -> None:
     assert read(table(rows)).tree == tree
 
 
-def test_what_cannot_be_said_is_refused() -> None:
-    with pytest.raises(UnkeepableError, match="OverflowError"):
+def test_unwritable_values_are_refused() -> None:
+    with pytest.raises(NotStorableError, match="OverflowError"):
         packed(1 << 70)
-    with pytest.raises(UnkeepableError):
+    with pytest.raises(NotStorableError):
         packed(object())  # type: ignore[arg-type]
 
 
@@ -159,7 +159,7 @@ def test_whatever_rows_there_are_they_are_read(rows: list[tuple[str, str, bytes]
 
 
 @given(st.recursive(st.none() | scalars, lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner)))
-def test_whatever_a_node_row_says_it_is_read(value: object) -> None:
+def test_any_node_row_is_read(value: object) -> None:
     row = msgspec.json.encode(value)
     for name in read([(NODE, "/x", row)]).nodes:
         assert name == "/x"

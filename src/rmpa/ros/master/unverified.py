@@ -1,4 +1,4 @@
-"""Nodes that were registered when the core ended, and have not been asked yet whether they are still there."""
+"""Nodes restored from the previous run of a core that have not answered yet since its restart."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ class NodeRecord(msgspec.Struct, omit_defaults=True):
                 return self.params
 
 
-class Awaited:
-    """The records of nodes that are awaited, and the publishers among them by topic."""
+class UnverifiedNodes:
+    """The records of unverified nodes, and the publishers among them by topic."""
 
     def __init__(self) -> None:
         self._records: dict[str, NodeRecord] = {}
@@ -60,24 +60,24 @@ class Awaited:
         return iter(self._records)
 
     def get(self, node: str) -> NodeRecord | None:
-        """What an awaited node had registered; not to be changed."""
+        """The record of an unverified node; not to be changed."""
         return self._records.get(node)
 
     def add(self, node: str, record: NodeRecord) -> None:
-        """Await a node; the record is ours from now on."""
+        """Add a node; the caller must not change the record afterwards."""
         self._records[node] = record
         for topic in record.publishers:
             self._publishers.setdefault(topic, {})[node] = record.api
 
     def pop(self, node: str) -> NodeRecord | None:
-        """Await a node no longer."""
+        """Remove a node."""
         record = self._records.pop(node, None)
         for topic in record.publishers if record is not None else ():
             self._forget_publisher(topic, node)
         return record
 
     def withdraw(self, kind: RegistrationKind, key: str, node: str, api: str) -> bool:
-        """Take one registration away, if ``api`` is that node's; whether it was there."""
+        """Remove one registration, if ``api`` is that node's; whether it was there."""
         record = self._records.get(node)
         if record is None or record.api != api or key not in record.of(kind):
             return False
@@ -87,11 +87,11 @@ class Awaited:
         return True
 
     def publishers_of(self, topic: str) -> dict[str, str]:
-        """The awaited publishers of a topic, and their slave APIs."""
+        """The unverified publishers of a topic with their slave APIs."""
         return dict(self._publishers.get(topic, {}))
 
     def publishers(self, topic: str) -> list[str]:
-        """The slave APIs of awaited publishers of a topic."""
+        """The slave APIs of the unverified publishers of a topic."""
         return list(self._publishers.get(topic, {}).values())
 
     def _forget_publisher(self, topic: str, node: str) -> None:

@@ -1,9 +1,9 @@
-"""Asks the nodes of the run before whether they are still there, and has those shown that are.
+"""Verifies the nodes restored from the previous run: those that still run are registered again, the others discarded.
 
-rospy tells its name (``getName``); roscpp tells it in the header of a topic that it publishes. A node is gone where
-its port refuses connections, or another node is at it. One that does not answer is asked again for a while. What a
-node registered or withdrew while there was no core is learnt from its own lists (``getPublications``,
-``getSubscriptions``), behind everything else.
+rospy has its name in ``getName``, roscpp in the header of a topic that it publishes. A node is gone if its port
+refuses connections, or another node has the port. One that does not answer is asked again for a while. What a node
+registered or unregistered while there was no core follows from its own lists (``getPublications``,
+``getSubscriptions``), which are compared last.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from rmpa.runtime.event_loop import yield_to_data
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rmpa.ros.master.awaited import NodeRecord
     from rmpa.ros.master.registrations import Registrations
+    from rmpa.ros.master.unverified import NodeRecord
     from rmpa.ros.wire.xmlrpc import RosReply
 
 _log = logging.getLogger(__name__)
@@ -37,8 +37,8 @@ _CALLER_ID: Final = "/rmpa_identify"
 _LISTS: Final = ((RegistrationKind.PUBLISHER, "getPublications"), (RegistrationKind.SUBSCRIBER, "getSubscriptions"))
 
 
-class _Fate(enum.Enum):
-    """What an address says of the nodes that were at it."""
+class _ProbeResult(enum.Enum):
+    """What the address of restored nodes answers."""
 
     UP = "it is still that node"
     GONE = "nobody listens there"
@@ -47,14 +47,14 @@ class _Fate(enum.Enum):
 
 
 @dataclass(slots=True)
-class Taken:
-    """What became of the nodes of the run before.
+class VerificationCounts:
+    """Counts of the restored nodes.
 
     Args:
-        nodes: How many there were.
-        up: Those that answered, and are shown.
-        gone: Those at whose address nobody listens, or another node does.
-        given_up: Those that did not answer for ``limits.TAKE_UP_PATIENCE``.
+        nodes: All.
+        up: Those that answered and are registered again.
+        gone: Those at whose address nothing or another node listens.
+        given_up: Those that did not answer for ``limits.VERIFY_PATIENCE``.
     """
 
     nodes: int = 0
@@ -63,100 +63,101 @@ class Taken:
     given_up: int = 0
 
 
-class TakeUp:
-    """Asks every awaited node of one master.
+class NodeVerification:
+    """Verifies the unverified nodes of one master.
 
     Args:
-        registrations: Of the master.
+        registrations: The master's tables.
         carry_out: Called after each change of them.
     """
 
     def __init__(self, registrations: Registrations, carry_out: Callable[[], None]) -> None:
         self._registrations = registrations
         self._carry_out = carry_out
-        self.taken = Taken()
-        self._slots = asyncio.Semaphore(limits.TAKE_UP_AT_ONCE)
-        self._lists = asyncio.Semaphore(limits.TAKE_UP_LISTS)
+        self.counts = VerificationCounts()
+        self._slots = asyncio.Semaphore(limits.VERIFY_AT_ONCE)
+        self._lists = asyncio.Semaphore(limits.VERIFY_LISTS)
         self._tasks: set[asyncio.Task[None]] = set()
         self._at_start: defaultdict[str, list[str]] = defaultdict(list)
         self._first = 0
         self._queued: set[str] = set()
-        """Addresses that wait for their first question, or have just been asked."""
+        """Addresses that were not asked yet, or have not answered their first question within
+        ``limits.VERIFY_PROMPT``."""
         self._all_asked = asyncio.Event()
         self._published: dict[str, None] = {}
         self._subscribed: list[tuple[str, str]] = []
-        self._announcing: asyncio.TimerHandle | None = None
+        self._notification_timer: asyncio.TimerHandle | None = None
 
     def start(self) -> None:
-        """Ask from now on."""
+        """Begin to ask all of them."""
         loop = asyncio.get_running_loop()
         for node, api in self.silent.items():
             self._at_start[api].append(node)
-        self.taken.nodes = len(self._registrations.awaited)
+        self.counts.nodes = len(self._registrations.unverified)
         self._first = len(self._at_start)
         self._queued = set(self._at_start)
         for api in self._at_start:
-            task = loop.create_task(self._follow(api), name=f"take up {api}")
+            task = loop.create_task(self._verify(api), name=f"verify {api}")
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
 
     async def close(self) -> None:
-        """Ask no more; who has not answered stays awaited."""
+        """Stop; nodes that have not answered stay unverified."""
         tasks = list(self._tasks)
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        if self._announcing is not None:
-            self._announcing.cancel()
+        if self._notification_timer is not None:
+            self._notification_timer.cancel()
 
     @property
     def all_asked(self) -> bool:
-        """Whether each has been asked at least once."""
+        """Whether each node has been asked at least once."""
         return self._all_asked.is_set()
 
     @property
     def silent(self) -> dict[str, str]:
         """Nodes that have not answered yet, and the URIs of their slave APIs."""
-        awaited = self._registrations.awaited
+        awaited = self._registrations.unverified
         return {node: record.api for node in awaited if (record := awaited.get(node)) is not None}
 
     # --- one address ------------------------------------------------------------------------------------------
 
-    async def _follow(self, api: str) -> None:
+    async def _verify(self, api: str) -> None:
         loop = asyncio.get_running_loop()
-        deadline = loop.time() + limits.TAKE_UP_PATIENCE
-        backoff = Backoff(limits.TAKE_UP_RETRY_FIRST, limits.TAKE_UP_RETRY_MAX, random.random)
+        deadline = loop.time() + limits.VERIFY_PATIENCE
+        backoff = Backoff(limits.VERIFY_RETRY_FIRST, limits.VERIFY_RETRY_MAX, random.random)
         first = True
         try:
             while nodes := self._at(api):
-                fate = await self._ask(api, nodes)
-                if fate is _Fate.SILENT and loop.time() > deadline:
-                    self.taken.given_up += len(nodes)
-                    self._give_up(nodes, api, f"it did not answer for {limits.TAKE_UP_PATIENCE:g} s")
-                elif fate is _Fate.UP:
-                    self._take_up(self._at(api))
-                elif fate is not _Fate.SILENT:
-                    self.taken.gone += len(nodes)
-                    self._give_up(nodes, api, fate.value)
+                result = await self._ask(api, nodes)
+                if result is _ProbeResult.SILENT and loop.time() > deadline:
+                    self.counts.given_up += len(nodes)
+                    self._discard(nodes, api, f"it did not answer for {limits.VERIFY_PATIENCE:g} s")
+                elif result is _ProbeResult.UP:
+                    self._confirm(self._at(api))
+                elif result is not _ProbeResult.SILENT:
+                    self.counts.gone += len(nodes)
+                    self._discard(nodes, api, result.value)
                 first = self._asked(first)
-                if fate is not _Fate.SILENT:
-                    await self._compare(api, nodes if fate is _Fate.UP else {})
+                if result is not _ProbeResult.SILENT:
+                    await self._compare(api, nodes if result is _ProbeResult.UP else {})
                     return
                 await asyncio.sleep(backoff.delay())
         except Exception:  # noqa: BLE001 - a task's top
             _log.exception("! the node at %s cannot be taken up", api)
         finally:
             self._asked(first)
-            self._leave_queue(api)
+            self._unqueue(api)
 
     def _at(self, api: str) -> dict[str, NodeRecord]:
-        """The awaited nodes with this slave API: nodelets share one."""
-        awaited = self._registrations.awaited
+        """The unverified nodes with this slave API: nodelets share one."""
+        awaited = self._registrations.unverified
         found = {node: awaited.get(node) for node in self._at_start[api]}
         return {node: record for node, record in found.items() if record is not None and record.api == api}
 
-    async def _ask(self, api: str, nodes: dict[str, NodeRecord]) -> _Fate:
-        """Ask within a place of few; who does not answer soon gives the place to another."""
+    async def _ask(self, api: str, nodes: dict[str, NodeRecord]) -> _ProbeResult:
+        """Ask, with a bound on concurrent questions in which slow nodes do not count for long."""
         await self._slots.acquire()
         held = True
 
@@ -165,59 +166,59 @@ class TakeUp:
             if held:
                 held = False
                 self._slots.release()
-                self._leave_queue(api)
+                self._unqueue(api)
 
-        timer = asyncio.get_running_loop().call_later(limits.TAKE_UP_PROMPT, leave)
+        timer = asyncio.get_running_loop().call_later(limits.VERIFY_PROMPT, leave)
         try:
-            return await _fate(api, nodes)
+            return await _probe(api, nodes)
         finally:
             timer.cancel()
             leave()
 
-    def _leave_queue(self, api: str) -> None:
-        """An address has answered, or hangs; perhaps as the last one of all."""
+    def _unqueue(self, api: str) -> None:
+        """An address has answered, or hangs; behind the last one, notify the subscribers."""
         self._queued.discard(api)
         if not self._queued:
-            self._announce_soon(0.0)
+            self._schedule_notifications(0.0)
 
-    def _take_up(self, nodes: dict[str, NodeRecord]) -> None:
+    def _confirm(self, nodes: dict[str, NodeRecord]) -> None:
         for node in nodes:
-            published, subscribed = self._registrations.take_up(node)
+            published, subscribed = self._registrations.confirm(node)
             self._published.update(dict.fromkeys(published))
             self._subscribed += [(topic, node) for topic in subscribed]
-            self.taken.up += 1
+            self.counts.up += 1
             self._carry_out()
             yield_to_data()
-        self._announce_soon(limits.TAKE_UP_ANNOUNCE if self._queued else 0.0)
+        self._schedule_notifications(limits.VERIFY_ANNOUNCE if self._queued else 0.0)
 
-    def _announce_soon(self, seconds: float) -> None:
-        if not seconds and self._announcing is not None:
-            self._announcing.cancel()
-            self._announcing = None
-        if self._announcing is None and (self._published or self._subscribed):
-            self._announcing = asyncio.get_running_loop().call_later(seconds, self._announce)
+    def _schedule_notifications(self, seconds: float) -> None:
+        if not seconds and self._notification_timer is not None:
+            self._notification_timer.cancel()
+            self._notification_timer = None
+        if self._notification_timer is None and (self._published or self._subscribed):
+            self._notification_timer = asyncio.get_running_loop().call_later(seconds, self._notify_subscribers)
 
-    def _announce(self) -> None:
-        self._announcing = None
+    def _notify_subscribers(self) -> None:
+        self._notification_timer = None
         published, self._published = self._published, {}
         subscribed, self._subscribed = self._subscribed, []
         for topic, node in subscribed:
-            self._registrations.tell(topic, node)
+            self._registrations.notify_subscriber(topic, node)
             self._carry_out()
             yield_to_data()
         for topic in published:
-            self._registrations.announce(topic)
+            self._registrations.notify_new_subscribers(topic)
             self._carry_out()
             yield_to_data()
 
-    def _give_up(self, nodes: dict[str, NodeRecord], api: str, why: str) -> None:
+    def _discard(self, nodes: dict[str, NodeRecord], api: str, why: str) -> None:
         for node in nodes:
             _log.info("= node %s at %s, of the run before, is not taken up: %s", node, api, why)
-            self._registrations.give_up(node)
+            self._registrations.discard(node)
             self._carry_out()
 
     def _asked(self, first: bool) -> bool:
-        """An address has been asked for the first time, perhaps as the last one of all."""
+        """Count an address that has been asked for the first time."""
         if first:
             self._first -= 1
             if not self._first:
@@ -227,87 +228,87 @@ class TakeUp:
 
     def summary(self) -> str:
         """``12 of 15 nodes of the run before are taken up, 1 does not answer yet, 2 are gone``."""
-        taken = self.taken
-        parts = [f"{taken.up} of {taken.nodes} nodes of the run before are taken up"]
-        if silent := len(self._registrations.awaited):
+        counts = self.counts
+        parts = [f"{counts.up} of {counts.nodes} nodes of the run before are taken up"]
+        if silent := len(self._registrations.unverified):
             parts.append(f"{silent} {'does' if silent == 1 else 'do'} not answer yet")
-        if taken.gone:
-            parts.append(f"{taken.gone} {'is' if taken.gone == 1 else 'are'} gone")
-        if taken.given_up:
-            parts.append(f"{taken.given_up} did not answer for {limits.TAKE_UP_PATIENCE:g} s")
+        if counts.gone:
+            parts.append(f"{counts.gone} {'is' if counts.gone == 1 else 'are'} gone")
+        if counts.given_up:
+            parts.append(f"{counts.given_up} did not answer for {limits.VERIFY_PATIENCE:g} s")
         return ", ".join(parts)
 
     # --- what changed while there was no core -----------------------------------------------------------------
 
     async def _compare(self, api: str, nodes: dict[str, NodeRecord]) -> None:
-        """Make the registrations of a node what it says itself."""
+        """Make the registrations of a node equal to its own lists."""
         if len(nodes) != 1:
-            return  # whose of several they are nothing tells
+            return  # the lists of nodelets do not say which node an entry belongs to
         await self._all_asked.wait()
         [node] = nodes
         registrations = self._registrations
         async with self._lists:
             for kind, method in _LISTS:
-                for _ in range(limits.TAKE_UP_COMPARED):
-                    mark = registrations.marks.get(node)
+                for _ in range(limits.VERIFY_COMPARED):
+                    mark = registrations.revisions.get(node)
                     try:
-                        said = _topics(await call_api(api, method, _CALLER_ID))
+                        listed = _topics(await call_api(api, method, _CALLER_ID))
                     except (RmpaError, RosFault) as error:
                         _log.debug("= %s does not tell what it has: %s", node, error)
                         return
-                    if said is None or registrations.node_api(node) != api:
+                    if listed is None or registrations.node_api(node) != api:
                         return
-                    if registrations.marks.get(node) == mark:  # else it has changed since: ask again
-                        self._adjust(kind, node, api, said)
+                    if registrations.revisions.get(node) == mark:  # else it changed meanwhile: ask again
+                        self._adjust(kind, node, api, listed)
                         break
 
-    def _adjust(self, kind: RegistrationKind, node: str, api: str, said: dict[str, str]) -> None:
+    def _adjust(self, kind: RegistrationKind, node: str, api: str, listed: dict[str, str]) -> None:
         registrations = self._registrations
         record = registrations.record(node)
         known = record.of(kind) if record is not None else {}
-        for topic in known.keys() - said.keys():
+        for topic in known.keys() - listed.keys():
             registrations.unregister(kind, topic, node, api)
-        for topic in said.keys() - known.keys():
+        for topic in listed.keys() - known.keys():
             if kind is RegistrationKind.PUBLISHER:
-                registrations.register_publisher(topic, said[topic], node, api)
+                registrations.register_publisher(topic, listed[topic], node, api)
             else:
-                registrations.register_subscriber(topic, said[topic], node, api)
-                registrations.tell(topic, node)
+                registrations.register_subscriber(topic, listed[topic], node, api)
+                registrations.notify_subscriber(topic, node)
         self._carry_out()
 
 
-async def _fate(api: str, nodes: dict[str, NodeRecord]) -> _Fate:
+async def _probe(api: str, nodes: dict[str, NodeRecord]) -> _ProbeResult:
     topics = [topic for record in nodes.values() for topic in record.publishers if topic != "/rosout"]
     try:
         found = await name_at(api, topics)
         if found is None:
-            knows = await _knows(api, nodes)
+            knows = await _has_registrations(api, nodes)
             if knows is None:
-                return _Fate.SILENT
+                return _ProbeResult.SILENT
             if knows:
-                return _Fate.UP
-            # A publisher tells its name, unless it was too busy for that just now.
-            return _Fate.SILENT if topics else _Fate.OTHER
+                return _ProbeResult.UP
+            # A publisher sends its name in a header, unless it is too busy at present.
+            return _ProbeResult.SILENT if topics else _ProbeResult.OTHER
     except UnreachableError as error:
-        return _Fate.GONE if isinstance(error.__cause__, ConnectionRefusedError) else _Fate.SILENT
+        return _ProbeResult.GONE if isinstance(error.__cause__, ConnectionRefusedError) else _ProbeResult.SILENT
     except (RosFault, RemoteProtocolError):
-        return _Fate.OTHER
-    return _Fate.UP if found in nodes else _Fate.OTHER
+        return _ProbeResult.OTHER
+    return _ProbeResult.UP if found in nodes else _ProbeResult.OTHER
 
 
-async def _knows(api: str, nodes: dict[str, NodeRecord]) -> bool | None:
-    """Whether a node that does not tell its name has everything that these had registered, and something of it.
+async def _has_registrations(api: str, nodes: dict[str, NodeRecord]) -> bool | None:
+    """Whether an unnamed node has all topics that these had registered, and at least one.
 
-    ``None`` if the node does not tell what it has either.
+    ``None`` if the node does not answer with its lists either.
     """
     for kind, method in _LISTS:
         had = {topic for record in nodes.values() for topic in record.of(kind)}
         if not had:
             continue
-        said = _topics(await call_api(api, method, _CALLER_ID))
-        if said is None:
+        listed = _topics(await call_api(api, method, _CALLER_ID))
+        if listed is None:
             return None
-        if not had <= said.keys():
+        if not had <= listed.keys():
             return False
     return any(record.publishers or record.subscribers for record in nodes.values())
 

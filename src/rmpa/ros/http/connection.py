@@ -1,0 +1,287 @@
+"""One client of an XML-RPC server: HTTP comes in, one call at a time is answered, everything is bounded."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections import deque
+from typing import TYPE_CHECKING, Final, Protocol
+
+from rmpa.core.sizes import KIB
+from rmpa.ros import limits
+from rmpa.ros.wire.http import CONTINUE, HttpRefusal, HttpRequest, RequestParser, response_head
+from rmpa.ros.wire.xmlrpc import serialize_fault
+from rmpa.runtime import limits as runtime_limits
+from rmpa.runtime.event_loop import yield_to_data
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable
+
+_PIECE: Final = 16 * KIB
+"""Bytes parsed at once: the granularity of the bound on headers; pending data goes first in between."""
+
+
+class ConnectionOwner(Protocol):
+    """What a connection asks of its server."""
+
+    def admit(self, connection: HttpConnection) -> bool:
+        """Whether there is room for a new connection."""
+
+    def remove(self, connection: HttpConnection) -> None:
+        """The connection is closed."""
+
+    def touch(self, connection: HttpConnection) -> None:
+        """The connection is used: it is the last to give way."""
+
+    def reserve(self, connection: HttpConnection, size: int) -> bool:
+        """Whether there is room for a call of ``size`` bytes."""
+
+    def refuse(self, name: str, connection: HttpConnection, text: str) -> None:
+        """Count a refusal by its name, and log it."""
+
+    def answer(self, body: memoryview, connection: HttpConnection) -> bytes | Awaitable[bytes]:
+        """The response to a call's XML, at once or awaited."""
+
+
+class HttpConnection(asyncio.Protocol):
+    """A connection that a server accepted.
+
+    Args:
+        server: Answers the calls.
+
+    Attributes:
+        client: The client's address.
+        begun: The start of the call that is unfinished, or whose answer is not read, by the loop's clock.
+        answered: The time of the last answer, by the loop's clock.
+        gone: Done when the connection is closed.
+    """
+
+    def __init__(self, server: ConnectionOwner) -> None:
+        self._server = server
+        self._loop = asyncio.get_running_loop()
+        self._requests = RequestParser(lambda size: server.reserve(self, size), self._begin)
+        self._waiting: deque[HttpRequest | HttpRefusal] = deque()
+        self._unread = memoryview(b"")
+        self._transport: asyncio.Transport | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._more: asyncio.Handle | None = None
+        self._eof = self._closing = self._writing_paused = self._reading_paused = False
+        self._deadline = 0.0
+        self._timer: asyncio.TimerHandle | None = None
+        self.begun = self._loop.time()
+        self.gone: asyncio.Future[None] = self._loop.create_future()
+        self.client = "?"
+        self.answered: float | None = None
+
+    # --- http.eviction.Client ---------------------------------------------------------------------------------
+
+    @property
+    def idle(self) -> bool:
+        """Whether no request is on its way in and no answer on its way out."""
+        return not (
+            self._requests.receiving or self._waiting or self._task or self._transport is None or self.pending
+        )
+
+    @property
+    def answering(self) -> bool:
+        """Whether a call is being answered."""
+        return self._task is not None
+
+    @property
+    def receiving(self) -> bool:
+        """Whether a request has begun to come and is incomplete."""
+        return self._requests.receiving
+
+    @property
+    def reserved(self) -> int:
+        """Bytes reserved for its call."""
+        return self._requests.body.reserved
+
+    @property
+    def received(self) -> int:
+        """Received bytes of an unfinished call; 0 while an answer is not read."""
+        return len(self._requests.body) if self._requests.receiving else 0
+
+    @property
+    def pending(self) -> int:
+        """Bytes of answers that the client has not read."""
+        return self._transport.get_write_buffer_size() if self._transport is not None else 0
+
+    # --- asyncio's side ---------------------------------------------------------------------------------------
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Ask the server for room."""
+        assert isinstance(transport, asyncio.Transport)  # noqa: S101 - a TCP server's is one; for mypy
+        self._transport = transport
+        peer = transport.get_extra_info("peername")
+        self.client = peer[0] if peer else "?"
+        if not self._server.admit(self):
+            transport.abort()
+            return
+        transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._expect(limits.HTTP_REQUEST_TIMEOUT)
+
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - asyncio's interface
+        """Give up the call that is being answered."""
+        self._server.remove(self)
+        self._requests.close()
+        for pending in (self._timer, self._task, self._more):
+            if pending is not None:
+                pending.cancel()
+        if not self.gone.done():
+            self.gone.set_result(None)
+
+    def data_received(self, data: bytes) -> None:
+        """Parse it, unless a call is being answered, or it is the rest of a refused request."""
+        if not self._closing or self._task is not None:
+            self._unread = memoryview(bytes(self._unread) + data if self._unread else data)
+            if self._more is None:
+                self._advance()
+
+    def eof_received(self) -> bool:
+        """A client may half-close behind its request; it still gets its answer."""
+        self._eof = True
+        if self._more is None:
+            self._advance()
+        return self._task is not None or self._more is not None
+
+    def pause_writing(self) -> None:
+        """The client does not read its answers: take no more calls."""
+        self._writing_paused = True
+        self._adjust_reading()
+
+    def resume_writing(self) -> None:
+        """The client has read its answers."""
+        self._writing_paused = False
+        self._adjust_reading()
+
+    def _adjust_reading(self) -> None:
+        """Read while nothing that was read waits."""
+        pause = self._task is not None or self._more is not None or self._writing_paused
+        if pause is self._reading_paused or self._transport is None or self._transport.is_closing():
+            return
+        self._reading_paused = pause
+        if pause:
+            self._transport.pause_reading()
+        else:
+            self._transport.resume_reading()
+
+    def _expect(self, seconds: float) -> None:
+        """Close the connection unless something happens within this time."""
+        self._deadline = self._loop.time() + seconds
+        if self._timer is None or self._timer.when() > self._deadline:
+            if self._timer is not None:
+                self._timer.cancel()
+            self._timer = self._loop.call_at(self._deadline, self._late)
+
+    def _late(self) -> None:
+        self._timer = None
+        if self._loop.time() < self._deadline:
+            self._timer = self._loop.call_at(self._deadline, self._late)
+        elif self._task is not None:
+            self._expect(limits.HTTP_IDLE_TIMEOUT)
+        else:
+            if self._requests.receiving:
+                self._server.refuse("http.timeout", self, "a request was not finished in time")
+            self.abort()
+
+    # --- requests ---------------------------------------------------------------------------------------------
+
+    def _begin(self) -> None:
+        """The first byte of a request has come."""
+        self._expect(limits.HTTP_REQUEST_TIMEOUT)
+        self.begun = self._loop.time()
+
+    def _advance(self) -> None:
+        """Take the next request; of several that came at once the next ones follow in turn with other clients'."""
+        self._more = None
+        while self._task is None and not self._closing:
+            if self._waiting:
+                self._take(self._waiting.popleft())
+                if not (self.answering or self._closing) and (self._waiting or self._unread):
+                    self._more = self._loop.call_soon(self._advance)
+                    break
+            elif self._unread:
+                piece, self._unread = self._unread[:_PIECE], self._unread[_PIECE:]
+                self._waiting += self._requests.feed(piece)
+                if self._requests.expects_continue and not self._waiting and self._transport is not None:
+                    self._requests.expects_continue = False
+                    self._transport.write(CONTINUE)
+                if not self._waiting:
+                    yield_to_data()
+            elif self._eof:
+                self._waiting += self._requests.feed_eof()
+                if not self._waiting:
+                    self.close_when_answered()
+            else:
+                break
+        self._adjust_reading()
+
+    def _take(self, request: HttpRequest | HttpRefusal) -> None:
+        if isinstance(request, HttpRefusal):
+            self._reject(request)
+            return
+        self._closing = request.close
+        self._server.touch(self)
+        if request.refusal:
+            self._server.refuse("http.too_large", self, request.refusal)
+            self._reply(serialize_fault(-1, request.refusal))
+            return
+        yield_to_data()
+        answer = self._server.answer(request.body, self)
+        yield_to_data()
+        if isinstance(answer, bytes):
+            self._requests.body.answered()
+            self._reply(answer)
+        else:
+            self._task = self._loop.create_task(self._wait(answer))
+
+    async def _wait(self, answer: Awaitable[bytes]) -> None:
+        body = await answer
+        self._task = None
+        self._requests.body.answered()
+        self._reply(body)
+        self._advance()
+
+    # --- answers ----------------------------------------------------------------------------------------------
+
+    def _reply(self, body: bytes) -> None:
+        if self._transport is None or self._transport.is_closing():
+            return
+        self.answered = self._loop.time()
+        self._transport.write(response_head(200, len(body), close=self._closing) + body)
+        if self._closing:
+            self._close()
+        else:
+            self._expect(limits.HTTP_REQUEST_TIMEOUT if self._requests.receiving else limits.HTTP_IDLE_TIMEOUT)
+
+    def _reject(self, refusal: HttpRefusal) -> None:
+        """Answer with an HTTP error, end our half, and read on for a moment: closing would take the answer back."""
+        self._server.refuse(refusal.counter, self, refusal.text)
+        self._closing = True
+        if self._transport is not None and not self._transport.is_closing():
+            body = f"{refusal.text}\n".encode()
+            self._transport.write(response_head(refusal.status, len(body), close=True) + body)
+            self._transport.write_eof()
+            self._requests.receiving = False
+            self._expect(runtime_limits.DRAIN_TIMEOUT)
+
+    # --- the end ----------------------------------------------------------------------------------------------
+
+    def close_when_answered(self) -> None:
+        """Close now, or behind the answer that is on its way."""
+        self._closing = True
+        if self._task is None:
+            self._close()
+
+    def _close(self) -> None:
+        if self._transport is not None:
+            # What is written still leaves, but a client that does not read it cannot hold the socket.
+            self._transport.close()
+            self._expect(limits.HTTP_REQUEST_TIMEOUT)
+
+    def abort(self) -> None:
+        """Close at once."""
+        self._closing = True
+        if self._transport is not None:
+            self._transport.abort()

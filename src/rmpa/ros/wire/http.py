@@ -1,0 +1,251 @@
+"""HTTP/1.1 (RFC 9112) as XML-RPC uses it: bytes in, requests or a response out. httptools (llhttp) does the parsing.
+
+A request is a POST to any path; its body may have a length or come in chunks. Of a response only the body counts.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+from urllib.parse import quote
+
+from httptools import HttpParserError, HttpParserUpgrade, HttpRequestParser, HttpResponseParser
+
+from rmpa.core.errors import LimitExceeded, RemoteProtocolError
+from rmpa.ros import limits
+from rmpa.ros.wire.call_body import CallBody
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rmpa.ros.wire.tcpros import Buffer
+
+_REASONS: Final = {
+    200: b"OK",
+    400: b"Bad Request",
+    405: b"Method Not Allowed",
+    413: b"Content Too Large",
+    415: b"Unsupported Media Type",
+    431: b"Request Header Fields Too Large",
+}
+CONTINUE: Final = b"HTTP/1.1 100 Continue\r\n\r\n"
+
+
+class HttpRequest(NamedTuple):
+    """One XML-RPC call.
+
+    Args:
+        body: The XML; of a call that is too large only its beginning.
+        refusal: The text of the fault for a call that is too large; empty for all others.
+        close: Whether the connection ends with the answer.
+    """
+
+    body: memoryview
+    refusal: str
+    close: bool
+
+
+class HttpRefusal(NamedTuple):
+    """A request that is answered with an HTTP error; nothing behind it is read.
+
+    Args:
+        status: Of the answer.
+        text: Its body.
+        counter: What counts it: ``http.malformed``.
+    """
+
+    status: int
+    text: str
+    counter: str
+
+
+class RequestParser:
+    """Parses what one client sends.
+
+    Args:
+        reserve: ``(bytes) -> whether there is room``: asked once for each large call.
+        on_begin: Called with the first byte of each request.
+
+    Attributes:
+        body: The body of the request that is coming in.
+        receiving: Whether a request has begun and is not complete.
+        expects_continue: The client waits for ``CONTINUE`` before it sends a body; the connection resets it.
+    """
+
+    def __init__(self, reserve: Callable[[int], bool], on_begin: Callable[[], None]) -> None:
+        self.body = CallBody(reserve)
+        self.receiving = False
+        self.expects_continue = False
+        self._on_begin = on_begin
+        self._parser: HttpRequestParser | None = HttpRequestParser(self)
+        self._found: list[HttpRequest | HttpRefusal] = []
+        self._refused = False
+        self._headers: dict[bytes, bytes] = {}
+        self._without_body = 0
+        """Bytes since the last that were a body's: of headers, trailers and the lines between chunks."""
+        self._progress = False
+
+    def feed(self, data: Buffer) -> list[HttpRequest | HttpRefusal]:
+        """Take the next bytes; return the requests that are complete now, a refusal last.
+
+        The size of headers is bounded with the granularity of ``data``: give no more than some KiB at a time.
+        """
+        if self._parser is None or self._refused:
+            return []
+        self._progress = False
+        try:
+            self._parser.feed_data(data)
+        except HttpParserUpgrade:
+            self._refuse(400, "this server speaks HTTP/1.1 only", "http.malformed")
+        except HttpParserError as error:
+            self._refuse(400, str(error), "http.malformed")
+        self._without_body = 0 if self._progress else self._without_body + len(data)
+        if self._without_body > limits.HTTP_HEADERS_MAX:
+            self._refuse(431, f"headers of more than {limits.HTTP_HEADERS_MAX} bytes", "http.malformed")
+        found, self._found = self._found, []
+        return found
+
+    def feed_eof(self) -> list[HttpRequest | HttpRefusal]:
+        """The client sends no more: a refusal if a request is incomplete."""
+        if self.receiving:
+            self._refuse(400, "the connection ended within a request", "http.malformed")
+        found, self._found = self._found, []
+        return found
+
+    def close(self) -> None:
+        """Parse no more: breaks a reference cycle, which would wait for the garbage collector."""
+        self._parser = None
+
+    def _refuse(self, status: int, text: str, counter: str) -> None:
+        if not self._refused:
+            self._refused = True
+            self._found.append(HttpRefusal(status, text, counter))
+
+    # --- called by the parser ---------------------------------------------------------------------------------
+
+    def on_message_begin(self) -> None:
+        """The first byte of a request."""
+        self.receiving = True
+        self._headers = {}
+        self._on_begin()
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        """One header, or one of the trailers."""
+        name = name.lower()
+        # Two Host headers make none of the allowed values.
+        self._headers[name] = b"" if name == b"host" and name in self._headers else value
+
+    def on_headers_complete(self) -> None:
+        """All headers of a request: refuse what cannot be answered before its body comes."""
+        if self._parser is None:
+            return
+        headers = self._headers
+        size = int(headers.get(b"content-length") or 0)
+        method, is_1_1 = self._parser.get_method(), self._parser.get_http_version() == "1.1"
+        if method != b"POST":
+            self._refuse(405, f"{method.decode('ascii')}: XML-RPC is called by POST only", "http.method")
+        elif is_1_1 and not headers.get(b"host"):
+            self._refuse(400, "there must be one Host header", "http.malformed")
+        elif size > limits.HTTP_DISCARDED_MAX:
+            self._refuse(413, f"a body of {size} bytes, above {limits.HTTP_BODY_MAX}", "http.too_large")
+        elif headers.get(b"content-encoding", b"identity").lower() != b"identity":
+            self._refuse(415, "an encoded body; send it as it is", "http.encoding")
+        else:
+            self.body.expect(size)
+            if is_1_1 and headers.get(b"expect", b"").lower() == b"100-continue":
+                if self.body.refused:
+                    self._refuse(413, f"a body of more than {limits.HTTP_BODY_MAX} bytes", "http.too_large")
+                self.expects_continue = not self._refused
+
+    def on_body(self, data: bytes) -> None:
+        """A part of the body."""
+        self._progress = True
+        if not self._refused:
+            self.body.add(data)
+
+    def on_message_complete(self) -> None:
+        """The last byte of a request."""
+        self._progress = True
+        self.receiving = self.expects_continue = False
+        if not self._refused and self._parser is not None:
+            close = self._parser.get_http_version() != "1.1" or not self._parser.should_keep_alive()
+            self._found.append(HttpRequest(*self.body.end(), close))
+
+
+class ResponseParser:
+    """Parses one response; the status is not believed: XmlRpc++ and its copies put anything there.
+
+    Args:
+        uri: The server's, for errors.
+    """
+
+    def __init__(self, uri: str) -> None:
+        self._uri = uri
+        self._events = _ResponseEvents()
+        self._parser = HttpResponseParser(self._events)
+
+    def feed(self, data: bytes) -> bytes | None:
+        """Take the next bytes, or none at the end of the connection; return the body once it is complete.
+
+        Raises:
+            RemoteProtocolError: This is not HTTP, the connection ended too early, or the body is larger than
+                ``limits.HTTP_BODY_MAX``.
+        """
+        events = self._events
+        if not data and not events.until_close:
+            raise RemoteProtocolError("the connection was closed before the response")
+        try:
+            self._parser.feed_data(data)
+        except HttpParserError as error:
+            if not events.complete:  # else it is about what comes behind the response
+                raise RemoteProtocolError(f"{self._uri} does not speak HTTP: {error}") from error
+        if len(events.body) > limits.HTTP_BODY_MAX:
+            raise LimitExceeded("XML-RPC response", len(events.body), limits.HTTP_BODY_MAX)
+        if not events.complete and data:
+            return None
+        # A status of 1xx comes before the response itself.
+        return bytes(events.body) if self._parser.get_status_code() >= 200 else None
+
+
+class _ResponseEvents:
+    """Called by the parser. It does not know the parser: no reference cycle.
+
+    Attributes:
+        body: What has come of it.
+        complete: Whether the last byte has come.
+        until_close: Whether the body ends with the connection: it has neither a length nor chunks.
+    """
+
+    def __init__(self) -> None:
+        self.body = bytearray()
+        self.complete = self.until_close = self._has_length = False
+
+    def on_message_begin(self) -> None:
+        self.complete = self._has_length = False
+
+    def on_header(self, name: bytes, value: bytes) -> None:  # noqa: ARG002 - httptools' interface
+        self._has_length |= name.lower() in {b"content-length", b"transfer-encoding"}
+
+    def on_headers_complete(self) -> None:
+        self.until_close = not self._has_length
+
+    def on_body(self, data: bytes) -> None:
+        self.body += data
+
+    def on_message_complete(self) -> None:
+        self.complete = True
+
+
+def response_head(status: int, size: int, *, close: bool) -> bytes:
+    """The head of a response; XmlRpc++ wants ``Content-length`` with one blank, and no chunks."""
+    kind = b"text/xml" if status == 200 else b"text/plain; charset=utf-8"
+    text = b"HTTP/1.1 %d %s\r\nServer: rmpa\r\nContent-Type: %s\r\nContent-length: %d\r\n%s\r\n"
+    return text % (status, _REASONS[status], kind, size, b"Connection: close\r\n" if close else b"")
+
+
+def post_request(host: str, port: int, path: str, body: bytes) -> bytes:
+    """A whole POST request; the connection ends with its response."""
+    address = f"{host}:{port}".encode("ascii" if host.isascii() else "idna")
+    return (
+        b"POST %s HTTP/1.1\r\nHost: %s\r\nUser-Agent: rmpa\r\nContent-Type: text/xml\r\nContent-length: %d\r\n"
+        b"Connection: close\r\n\r\n%s" % (quote(path, safe="/%:@!$&'()*+,;=~").encode(), address, len(body), body)
+    )

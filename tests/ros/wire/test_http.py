@@ -1,0 +1,142 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from rmpa.core.errors import RemoteProtocolError
+from rmpa.ros import limits
+from rmpa.ros.wire.http import HttpRefusal, HttpRequest, RequestParser, ResponseParser, post_request, response_head
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+ROSCPP = b"POST / HTTP/1.1\r\nUser-Agent: XMLRPC++ 0.7\r\nHost: 10.0.0.1:11311\r\nContent-Type: text/xml\r\n"
+ROSPY = (
+    b"POST /RPC2 HTTP/1.1\r\nHost: x:11311\r\nAccept-Encoding: gzip\r\nContent-Type: text/xml\r\n"
+    b"User-Agent: Python-xmlrpc/3.8\r\n"
+)
+
+
+def parser(*, room: bool = True) -> RequestParser:
+    return RequestParser(lambda _: room, lambda: None)
+
+
+def parse(*parts: bytes) -> Sequence[HttpRequest | HttpRefusal]:
+    made = parser()
+    return [found for part in parts for found in made.feed(part)]
+
+
+@pytest.mark.parametrize("start", [ROSCPP, ROSPY])
+@pytest.mark.parametrize("name", [b"Content-length", b"Content-Length"])
+@pytest.mark.parametrize(("further", "close"), [(b"", False), (b"Connection: close\r\n", True)])
+def test_requests_as_clients_send_them(start: bytes, name: bytes, further: bytes, close: bool) -> None:
+    data = start + further + name + b": 5\r\n\r\n<xml>"
+    wanted = [HttpRequest(memoryview(b"<xml>"), "", close)]
+    assert parse(data) == wanted
+    assert parse(*(bytes([byte]) for byte in data)) == wanted
+
+
+def test_http_1_0_closes_whatever_it_asks_for() -> None:
+    data = b"POST / HTTP/1.0\r\nConnection: keep-alive\r\nContent-length: 1\r\n\r\nx"
+    assert parse(data) == [HttpRequest(memoryview(b"x"), "", True)]
+
+
+def test_several_requests_in_one_piece() -> None:
+    data = ROSPY + b"Content-length: 1\r\n\r\n"
+    requests = [HttpRequest(memoryview(body), "", False) for body in (b"a", b"b")]
+    assert parse(data + b"a" + data + b"b" + data) == requests
+
+
+def test_a_body_in_chunks() -> None:
+    data = ROSPY + b"Transfer-Encoding: chunked\r\n\r\n2\r\nab\r\n1\r\nc\r\n0\r\n\r\n"
+    assert parse(data) == [HttpRequest(memoryview(b"abc"), "", False)]
+
+
+@pytest.mark.parametrize(
+    ("data", "status"),
+    [
+        (b"GET / HTTP/1.1\r\nHost: x\r\n\r\n", 405),
+        (b"POST / HTTP/1.1\r\nContent-length: 1\r\n\r\nx", 400),
+        (b"POST / HTTP/1.1\r\nHost: x\r\nHost: y\r\nContent-length: 1\r\n\r\nx", 400),
+        (b"POST / HTTP/1.1\r\nHost: x\r\nContent-length: 1\r\nContent-length: 1\r\n\r\nx", 400),
+        (b"POST / HTTP/1.1\r\nHost: x\r\nContent-length: -1\r\n\r\n", 400),
+        (b"POST / HTTP/1.1\r\nHost: x\r\nContent-length: 0x1\r\n\r\n", 400),
+        (b"POST / HTTP/1.1\r\nHost: x\r\nContent-length: 1\r\nTransfer-Encoding: chunked\r\n\r\n", 400),
+        (b"POST / HTTP/1.1\r\nHost: x\r\nContent-length: 1\r\nContent-Encoding: gzip\r\n\r\nx", 415),
+        (b"POST / HTTP/1.1\r\nHost: x\r\nContent-length: %d\r\n\r\n" % (limits.HTTP_DISCARDED_MAX + 1), 413),
+        (b"POST / HTTP/1.1\r\nHost: x\r\nConnection: upgrade\r\nUpgrade: h2c\r\n\r\n", 400),
+        (b"POST / HTTP/1.1\r\nHost : x\r\nContent-length: 1\r\n\r\nx", 400),
+        (b"CONNECT x:80 HTTP/1.1\r\nHost: x\r\n\r\n", 405),
+        (b"\x16\x03\x01\x02\x00\x01\x00", 400),
+    ],
+)
+def test_what_cannot_be_answered_is_refused(data: bytes, status: int) -> None:
+    made = parser()
+    *_, refusal = made.feed(data)
+    assert isinstance(refusal, HttpRefusal)
+    assert refusal.status == status
+    assert made.feed(ROSPY + b"Content-length: 1\r\n\r\nx") == [], "nothing behind it is read"
+
+
+@pytest.mark.parametrize(
+    ("start", "statuses"),
+    [
+        (b"X: ", [431]),
+        (b"Transfer-Encoding: chunked\r\n\r\n1;", [431]),
+        (b"Transfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\nX: ", [431]),
+    ],
+)
+def test_headers_trailers_and_chunk_lines_are_bounded(start: bytes, statuses: list[int]) -> None:
+    parts = [ROSPY + start, *[b"x" * 1000] * (limits.HTTP_HEADERS_MAX // 1000 + 1)]
+    assert [found.status for found in parse(*parts) if isinstance(found, HttpRefusal)] == statuses
+
+
+def test_a_client_that_expects_100_continue() -> None:
+    made = parser()
+    assert made.feed(ROSPY + b"Expect: 100-continue\r\nContent-length: 1\r\n\r\n") == []
+    assert made.expects_continue
+    assert made.feed(b"x") == [HttpRequest(memoryview(b"x"), "", False)]
+    large = ROSPY + b"Expect: 100-continue\r\nContent-length: %d\r\n\r\n" % (limits.HTTP_BODY_MAX + 1)
+    assert [found.status for found in parse(large) if isinstance(found, HttpRefusal)] == [413]
+
+
+def test_the_end_within_a_request_is_refused() -> None:
+    made = parser()
+    assert made.feed_eof() == []
+    made.feed(ROSPY)
+    assert [found.status for found in made.feed_eof() if isinstance(found, HttpRefusal)] == [400]
+
+
+def response(*parts: bytes) -> bytes | None:
+    made = ResponseParser("http://x:1/")
+    for part in parts:
+        if (body := made.feed(part)) is not None:
+            return body
+    return None
+
+
+def test_our_responses_and_requests_are_read_by_the_parsers() -> None:
+    for status in (200, 431):
+        assert response(response_head(status, 3, close=True) + b"abc") == b"abc"
+    data = post_request("h", 5, "/a b", b"xyz")
+    assert data.startswith(b"POST /a%20b HTTP/1.1\r\nHost: h:5\r\n")
+    assert parse(data) == [HttpRequest(memoryview(b"xyz"), "", True)]
+
+
+def test_a_status_of_1xx_comes_before_the_response() -> None:
+    head = b"HTTP/1.1 100 Continue\r\n\r\n"
+    whole = head + b"HTTP/1.1 200 OK\r\nContent-length: 2\r\n\r\nok"
+    assert response(whole) == b"ok"
+    assert response(head, whole[len(head) :]) == b"ok"
+    assert response(*(bytes([byte]) for byte in whole)) == b"ok"
+
+
+def test_a_response_without_a_length_ends_with_the_connection() -> None:
+    head = b"HTTP/1.1 200 OK\r\n\r\n"
+    assert response(head + b"ab", b"c") is None
+    assert response(head + b"ab", b"c", b"") == b"abc"
+    with pytest.raises(RemoteProtocolError, match="closed before the response"):
+        response(b"HTTP/1.1 200 OK\r\nContent-length: 5\r\n\r\nab", b"")
+    with pytest.raises(RemoteProtocolError, match="http://x:1/ does not speak HTTP"):
+        response(b"SSH-2.0-OpenSSH\r\n")
