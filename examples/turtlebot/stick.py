@@ -72,9 +72,7 @@ class Recording:
         """The row of this moment, the first one at the first call."""
         now = self._now()
         if self._began is None:
-            self._began = (
-                now - 0.5 / ROWS
-            )  # mid-row: a reader of the same rate gets each row once
+            self._began = now - 0.5 / ROWS  # mid-row: a reader of the same rate gets each row once
         return self.rows[int((now - self._began) * ROWS) % len(self.rows)]
 
 

@@ -14,7 +14,7 @@ import pytest
 from rmpa.agent import Agent
 from rmpa.bridge import limits
 from rmpa.bridge.proxy_names import proxied_node
-from rmpa.config.settings import PolicySettings, Settings
+from rmpa.config.settings import Multicast, PolicySettings, Settings
 from rmpa.core.errors import StartError, UnreachableError
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.ros.http.client import call_api
@@ -74,7 +74,7 @@ def settings(tmp_path: Path) -> Callable[..., Settings]:
             name=name,
             core_port=core_port,
             interfaces=("lo",),
-            group_port=group_port,
+            multicast=Multicast(port=group_port),
             policy=policy or PolicySettings(),
             runtime_dir=str(tmp_path),
         )

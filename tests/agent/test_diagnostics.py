@@ -6,7 +6,7 @@ import asyncio
 import os
 from typing import TYPE_CHECKING
 
-from rmpa.config.settings import Settings
+from rmpa.config.settings import Multicast, Settings
 from rmpa.core.contract import ContractRule
 from rmpa.observe.io.control_client import ControlClient
 from rmpa.observe.io.diagnostics import TOPIC
@@ -26,7 +26,7 @@ def settings(name: str, place: Path, contracts: tuple[ContractRule, ...] = ()) -
         name=name,
         core_port=0,
         interfaces=("lo",),
-        group_port=20000 + os.getpid() % 20000,
+        multicast=Multicast(port=20000 + os.getpid() % 20000),
         runtime_dir=str(place),
         contracts=contracts,
     )

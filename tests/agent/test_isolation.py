@@ -27,7 +27,7 @@ import pytest
 
 from rmpa.agent import Agent
 from rmpa.config import limits as config_limits
-from rmpa.config.settings import PeerRule, PolicySettings, Settings
+from rmpa.config.settings import Multicast, PeerRule, PolicySettings, Settings
 from rmpa.core import limits as core_limits
 from rmpa.core.errors import UnreachableError
 from rmpa.core.guid import Guid
@@ -161,7 +161,9 @@ class World:
 @asynccontextmanager
 async def worlds(tmp_path: Path, master: str = "") -> AsyncIterator[World]:
     group = (config_limits.MULTICAST_GROUP, 20000 + (os.getpid() + 7919) % 20000)
-    settings = Settings(core_port=0, interfaces=("lo",), group_port=group[1], runtime_dir=str(tmp_path))
+    settings = Settings(
+        core_port=0, interfaces=("lo",), multicast=Multicast(port=group[1]), runtime_dir=str(tmp_path)
+    )
     near = replace(settings, name="near")
     if master:
         near = replace(near, core_mode="external", core_master=master)
@@ -330,7 +332,7 @@ async def thousands_of_peers_are_invented(world: World) -> None:
 
     await world.beside(work)
     assert world.near.network.endpoint is not None
-    assert len(world.near.network.endpoint.discovery.peers()) > core_limits.ROSTER_PEERS_MAX / 2
+    assert len(world.near.network.endpoint.discovery.peers()) > core_limits.PEERS_MAX / 2
     assert world.near.network.endpoint.discovery.counters["roster.full"] > 0
     assert world.linked()
 

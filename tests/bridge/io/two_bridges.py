@@ -311,7 +311,7 @@ class World:
             for lane in (end.express, end.bulk):
                 assert lane.outbox.pending_bytes == 0
                 assert not lane._open
-                assert not lane.outbox._special
+                assert not lane.outbox._own_bounds
 
 
 @contextmanager

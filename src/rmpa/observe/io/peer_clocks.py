@@ -32,4 +32,4 @@ class PeerClocks:
             clock = self._clocks[session.peer] = before.get(session.peer) or PeerClock()
             offset, error = session.link.clock_offset, session.link.clock_error
             if offset is not None and error is not None and session.linked:
-                clock.told(offset, error, now)
+                clock.add(offset, error, now)

@@ -18,7 +18,7 @@ from rmpa.core import limits
 from rmpa.core.contract import KEYS, Contract, Contracts
 from rmpa.observe.snapshot import EventInfo, LatencyInfo, RouteInfo, SampleSpread, TopicInfo, UnreachableInfo
 from rmpa.ros.wire.tcpros import LENGTH
-from rmpa.runtime.event_loop import breathing_sorted, yield_to_data, yielding_to_data
+from rmpa.runtime.event_loop import sorted_yielding, yield_to_data, yielding_to_data
 from rmpa.runtime.system_clock import SystemClock
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ class TopicsSection:
         known = {name for name in yielding_to_data(names) if any(name in table for table in tables)}
         unreachable = {info.node: str(info) for info in unreachable_infos(self._core, self._clock.now())}
         found = []
-        for name in breathing_sorted(known):
+        for name in sorted_yielding(known):
             yield_to_data()
             nodes, type_name = tuple(state.publishers.get(name, ())), state.types.get(name, "")
             own, crossing = tuple(node for node in nodes if not is_own(node)), tuple(routes.get(name, ()))
